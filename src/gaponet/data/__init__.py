@@ -1,0 +1,1 @@
+"""Logs to datasets: Log → Sequence → Pair → PairedDataset, and the folder they live in."""

@@ -1,0 +1,81 @@
+"""Log: what came off the wire. Named channels with their own timestamps; nothing interpolated, nothing corrected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gaponet.errors import LogError
+
+Array = np.ndarray
+
+# Channel names and their SI units. ctrl is the commanded joint position.
+CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+REQUIRED = ("ctrl", "qpos")
+
+
+class Channel(NamedTuple):
+    """time (k,) s, strictly increasing; values (k, n) in the order of the log's joint_names."""
+
+    time: Array
+    values: Array
+
+
+@dataclass(frozen=True)
+class Log:
+    """One recording.
+
+    Attributes:
+        robot: Robot name.
+        joint_names: The robot's own names, (n).
+        channels: Of CHANNELS, at least ctrl and qpos.
+        source: File or folder it was read from, for errors and for the manifest.
+        meta: Whatever the format also says (events, gains, firmware).
+    """
+
+    robot: str
+    joint_names: tuple[str, ...]
+    channels: dict[str, Channel]
+    source: str
+    meta: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in REQUIRED:
+            if name not in self.channels:
+                raise LogError(
+                    f"{self.source}: no {name} channel (it has {', '.join(self.channels) or 'none'}); "
+                    "a log needs commanded and measured joint positions"
+                )
+        for name, (time, values) in self.channels.items():
+            self._check(name, np.asarray(time), np.asarray(values))
+
+    def _check(self, name: str, time: Array, values: Array) -> None:
+        if name not in CHANNELS:
+            raise LogError(f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS)}")
+        if values.shape != (len(time), len(self.joint_names)):
+            raise LogError(
+                f"{self.source}: channel {name} has shape {values.shape}, expected "
+                f"({len(time)}, {len(self.joint_names)}) for joints {', '.join(self.joint_names)}"
+            )
+        if len(time) < 2:
+            raise LogError(f"{self.source}: channel {name} has {len(time)} rows; nothing to learn from")
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(time))
+        if bad.size:
+            joint = int(np.flatnonzero(~np.isfinite(values[bad[0]]))[0]) if np.isfinite(time[bad[0]]) else 0
+            raise LogError(
+                f"{self.row(name, int(bad[0]))}: {name} of {self.joint_names[joint]} is not finite; "
+                "repair or cut the row"
+            )
+        back = np.flatnonzero(np.diff(time) <= 0)
+        if back.size:
+            raise LogError(
+                f"{self.row(name, int(back[0]) + 1)}: time does not increase in channel {name} "
+                f"({time[back[0]]:.6f} s, then {time[back[0] + 1]:.6f} s); sort the rows or cut the log there"
+            )
+
+    def row(self, name: str, index: int) -> str:
+        """File and line of a row of a channel, as the reader noted them."""
+        file = self.meta.get("files", {}).get(name, self.source)
+        return f"{file}:{index + int(self.meta.get('first_line', 1))}"

@@ -1,0 +1,83 @@
+"""Pair: a recording and its simulated twin, row by row; PairedDataset: pairs and how to split them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.errors import DatasetError, UsageError
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Twin:
+    """What the nominal simulator did under the same commands from the same start.
+
+    Attributes:
+        model_hash: Of the simulator (sim.model.model_hash).
+        qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of [t-1, t).
+    """
+
+    model_hash: str
+    qpos: Array
+    qvel: Array
+    tau: Array
+
+
+@dataclass(frozen=True)
+class Pair:
+    """real and sim share ctrl, dt and joints; gap = real − sim."""
+
+    real: Sequence
+    sim: Twin
+
+    def __post_init__(self) -> None:
+        if self.sim.qpos.shape != self.real.qpos.shape:
+            raise DatasetError(
+                f"twin of '{self.real.meta.motion}' has shape {self.sim.qpos.shape}, recording {self.real.qpos.shape}; "
+                "run gaponet pair again"
+            )
+
+    @property
+    def gap(self) -> Array:
+        """real.qpos − sim.qpos, (T, n), rad."""
+        return self.real.qpos - self.sim.qpos
+
+
+@dataclass(frozen=True)
+class Split:
+    """Motions for training, validation (choosing) and test (reporting); disjoint by construction and by content."""
+
+    train: tuple[str, ...]
+    val: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+def split_by_motion(motions: list[str], test_share: float = 0.25, val_share: float = 0.125) -> Split:
+    """A fixed rule without a seed: motions in the order of the SHA-256 of their names, test first, then validation.
+
+    Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
+    """
+    names = sorted(set(motions), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+    if len(names) < 3:
+        raise UsageError(f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more")
+    test = max(1, round(len(names) * test_share))
+    val = max(1, round(len(names) * val_share))
+    return Split(tuple(names[test + val :]), tuple(names[test : test + val]), tuple(names[:test]))
+
+
+def require_disjoint(*parts: list[Sequence], key: Callable[[Sequence], str] = Sequence.content_hash) -> None:
+    """Refuse parts of a split that share a recording under two names."""
+    seen: dict[str, int] = {}
+    for i, part in enumerate(parts):
+        for sequence in part:
+            if seen.setdefault(key(sequence), i) != i:
+                raise DatasetError(
+                    f"'{sequence.meta.motion}' is in two parts of the split under different names (same content); "
+                    "remove the duplicate"
+                )

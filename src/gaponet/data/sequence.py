@@ -1,0 +1,182 @@
+"""Sequence: one recording on a uniform grid. `to_sequence` is the only door from Log."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.log import Log
+from gaponet.data.signals import differentiate, resample_linear, resample_zoh
+from gaponet.errors import LogError
+from gaponet.robot import RobotSpec
+
+Array = np.ndarray
+
+ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
+OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
+LEVELS = ("joint", "upper_body", "whole_body")
+
+
+@dataclass(frozen=True)
+class SequenceMeta:
+    """Where a sequence comes from. payload_mass has no default: an empty hand is said as 0.0."""
+
+    robot: str
+    unit_id: str
+    motion: str
+    payload_mass: float  # kg, in each hand named by payload_side
+    payload_side: str = "both"
+    level: str = "whole_body"
+    repetition: int = 0
+    virtual: bool = False
+    source: str = ""
+    source_sha256: str = ""
+    recorded_at: str = ""
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.payload_mass) and 0 <= self.payload_mass <= 100):
+            raise LogError(f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 when empty")
+        if not self.unit_id or not self.motion:
+            raise LogError(f"{self.source}: unit_id and motion must be named")
+        if self.level not in LEVELS:
+            raise LogError(f"{self.source}: level '{self.level}' is not one of {', '.join(LEVELS)}")
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """T rows at a uniform period dt, n joints by name.
+
+    Row t holds the state measured at t·dt and the command applied over [t·dt, (t+1)·dt). The error of step t therefore
+    compares states at t+1. This convention is said here and nowhere else.
+
+    Attributes:
+        meta: Where it comes from.
+        joint_names: (n).
+        dt: s.
+        ctrl, qpos, qvel: (T, n), rad, rad, rad/s, float32.
+        qacc, tau, tau_eq, temperature: (T, n) or None, rad/s², N·m, N·m, °C.
+    """
+
+    meta: SequenceMeta
+    joint_names: tuple[str, ...]
+    dt: float
+    ctrl: Array
+    qpos: Array
+    qvel: Array
+    qacc: Array | None = None
+    tau: Array | None = None
+    tau_eq: Array | None = None
+    temperature: Array | None = None
+
+    def __post_init__(self) -> None:
+        if not 1e-4 <= self.dt <= 1.0:
+            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected 0.0001 to 1")
+        shape = (len(self.ctrl), len(self.joint_names))
+        for name in ARRAYS:
+            value = getattr(self, name)
+            if value is None and name in OPTIONAL:
+                continue
+            value = np.ascontiguousarray(value, np.float32)
+            if value.shape != shape or not np.isfinite(value).all():
+                raise LogError(f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected {shape}")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.ctrl)
+
+    @property
+    def rate(self) -> float:
+        """Hz."""
+        return 1.0 / self.dt
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return len(self) * self.dt
+
+    def content_hash(self) -> str:
+        """Identity of the recording: joints, period, payload, unit and samples; not its name, path or date."""
+        digest = hashlib.sha256()
+        key = (self.meta.robot, self.meta.unit_id, self.meta.payload_mass, self.meta.payload_side)
+        digest.update(repr((key, self.joint_names, round(self.dt, 7))).encode())
+        for name in ("ctrl", "qpos"):
+            digest.update(getattr(self, name).tobytes())
+        return digest.hexdigest()
+
+
+def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None = None) -> Sequence:
+    """Put a log on a uniform grid.
+
+    Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt is
+    the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz). Otherwise measurements are
+    interpolated and commands held on a grid of the state's median period. The manifest says which.
+
+    Args:
+        log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
+        robot: Decides the joint order and the units of oddly logged joints (`log_unit`).
+        meta: Where it comes from.
+        dt: Force this period, s.
+    """
+    time = log.channels["qpos"].time
+    period = np.diff(time)
+    median = float(np.median(period))
+    shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
+    regular = bool(shared and (np.abs(period - median) <= 0.1 * median).all() and dt is None)
+    if regular:
+        dt = round(median, 5)
+        arrays = {name: channel.values for name, channel in log.channels.items()}
+    else:
+        dt = round(median, 5) if dt is None else dt
+        arrays = _resample(log, dt)
+    arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
+    if "qvel" not in arrays:
+        arrays["qvel"] = differentiate(arrays["qpos"], dt)
+    notes = meta.notes | {
+        "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz",
+        "rate_hz": round(1 / median, 3),
+        "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
+        "longest_gap_ms": round(float(period.max()) * 1e3, 3),
+        "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
+    }
+    absent = [name for name in robot.joint_names if name not in log.joint_names]
+    if absent:
+        notes["held_at_home"] = absent
+    converted = {n: u for n, u in zip(robot.joint_names, robot.log_units, strict=True) if u != "rad"}
+    if converted:
+        notes["converted_from"] = converted
+    return Sequence(SequenceMeta(**(asdict(meta) | {"notes": notes})), robot.joint_names, dt, **arrays)
+
+
+def _resample(log: Log, dt: float) -> dict[str, Array]:
+    start = max(c.time[0] for c in log.channels.values())
+    stop = min(c.time[-1] for c in log.channels.values())
+    if stop - start < 2 * dt:
+        raise LogError(f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks")
+    grid = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1)
+    grid = np.minimum(grid, stop)
+    return {
+        name: (resample_zoh if name == "ctrl" else resample_linear)(channel.time, channel.values, grid)
+        for name, channel in log.channels.items()
+    }
+
+
+def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:
+    """Columns in robot order and SI; joints the log lacks stand at home (positions) or at zero."""
+    out = np.zeros((len(values), len(robot.joint_names)))
+    if name in ("ctrl", "qpos"):
+        out += robot.qpos_home
+    out[:, robot.index(log.joint_names)] = values
+    if name not in ("ctrl", "qpos", "qvel"):
+        return out
+    for j, unit in enumerate(robot.log_units):
+        if unit == "rad" or robot.joint_names[j] not in log.joint_names:
+            continue
+        low, high = robot.qpos_range[j]
+        scale = np.pi / 180 if unit == "deg" else high - low
+        out[:, j] = out[:, j] * scale + (low if unit == "fraction" and name != "qvel" else 0.0)
+    return out

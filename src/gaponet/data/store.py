@@ -1,0 +1,231 @@
+"""The dataset folder: Parquet files, one per sequence, and a journal that lists them.
+
+    dataset.json            format version, robot, joint names, units
+    sequences.jsonl         one line per sequence: metadata, hash, delay, offsets; appended, never rewritten in place
+    sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
+    twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
+
+A sequence is written to a temporary file, renamed, then listed: a file that is not listed does not exist, and a line cut
+short by a crash is dropped on opening. Real data is never rewritten; twins can be computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.pair import Pair, Twin
+from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
+from gaponet.errors import DatasetError
+from gaponet.robot import RobotSpec
+
+FORMAT = 1
+UNITS = {
+    "time": "s", "ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "qacc": "rad/s²", "tau": "N·m", "tau_eq": "N·m",
+    "temperature": "°C",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One line of the journal."""
+
+    id: str
+    hash: str
+    dt: float
+    rows: int
+    channels: tuple[str, ...]
+    meta: SequenceMeta
+    findings: dict[str, Any]
+
+
+class Dataset:
+    """A dataset folder opened for reading and appending. Opening reads the journal only, no samples."""
+
+    def __init__(self, path: str | Path) -> None:
+        """Open an existing folder.
+
+        Raises:
+            DatasetError: Not a dataset, written by a newer version, or a listed file is missing.
+        """
+        self.path = Path(path)
+        header = self.path / "dataset.json"
+        if not header.is_file():
+            raise DatasetError(f"{self.path}: not a dataset (no dataset.json); make one with gaponet import or collect")
+        try:
+            self.header = json.loads(header.read_text(encoding="utf-8"))
+            self.robot_name: str = self.header["robot"]
+            self.joint_names = tuple(self.header["joint_names"])
+            version = int(self.header["format"])
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+            raise DatasetError(f"{header}: damaged ({error}); restore it or import again") from None
+        if version > FORMAT:
+            raise DatasetError(f"{header}: format {version} is newer than this gaponet reads ({FORMAT}); upgrade gaponet")
+        self.entries = list(self._journal())
+
+    @classmethod
+    def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
+        """Open the dataset at path, making an empty one where there is none; refuses another robot's."""
+        path = Path(path)
+        if not (path / "dataset.json").is_file():
+            if path.exists() and any(path.iterdir()):
+                raise DatasetError(f"{path}: exists, holds files and is not a dataset; choose an empty folder")
+            (path / "sequences").mkdir(parents=True, exist_ok=True)
+            header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
+            write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
+        dataset = cls(path)
+        dataset.require_robot(robot)
+        return dataset
+
+    def require_robot(self, robot: RobotSpec) -> None:
+        """Refuse a robot whose joints are not the dataset's."""
+        if self.robot_name != robot.name or self.joint_names != robot.joint_names:
+            raise DatasetError(
+                f"{self.path}: holds robot '{self.robot_name}' ({', '.join(self.joint_names)}), not '{robot.name}' "
+                f"({', '.join(robot.joint_names)}); use --robot {self.robot_name} or another dataset folder"
+            )
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def hours(self) -> float:
+        """Recorded time."""
+        return sum(e.rows * e.dt for e in self.entries) / 3600
+
+    def find(self, content_hash: str) -> Entry | None:
+        """The entry with this content, if any."""
+        return next((e for e in self.entries if e.hash == content_hash), None)
+
+    def append(self, sequence: Sequence, findings: dict[str, Any] | None = None) -> Entry:
+        """Add a sequence; one with the same content is refused with its name."""
+        digest = sequence.content_hash()
+        twin = self.find(digest)
+        if twin is not None:
+            raise DatasetError(
+                f"{sequence.meta.source or sequence.meta.motion}: already in {self.path} as '{twin.id}' "
+                "(same samples, unit and payload); nothing to add"
+            )
+        m = sequence.meta
+        name = f"{m.motion}-{m.unit_id}-{m.payload_mass:g}kg-r{m.repetition}"
+        entry = Entry(
+            id=re.sub(r"[^A-Za-z0-9_.-]", "_", name) + f"-{digest[:8]}",
+            hash=digest,
+            dt=sequence.dt,
+            rows=len(sequence),
+            channels=tuple(c for c in ARRAYS if getattr(sequence, c) is not None),
+            meta=m,
+            findings=findings or {},
+        )
+        columns = {c: getattr(sequence, c) for c in entry.channels}
+        _write_table(self._file(entry), columns, sequence.dt, self.joint_names)
+        line = json.dumps(asdict(entry), ensure_ascii=False, allow_nan=False) + "\n"
+        with (self.path / "sequences.jsonl").open("a", encoding="utf-8") as journal:
+            journal.write(line)
+            journal.flush()
+            os.fsync(journal.fileno())
+        self.entries.append(entry)
+        return entry
+
+    def read(self, entry: Entry) -> Sequence:
+        """Load one sequence."""
+        arrays = _read_table(self._file(entry), entry.channels, len(self.joint_names))
+        return Sequence(entry.meta, self.joint_names, entry.dt, **arrays)
+
+    def sequences(self, entries: list[Entry] | None = None) -> list[Sequence]:
+        """Load sequences, all by default."""
+        return [self.read(e) for e in (self.entries if entries is None else entries)]
+
+    def has_twin(self, entry: Entry, model: str) -> bool:
+        """Whether the sequence has been paired with the simulator of this model hash."""
+        return self._twin_file(entry, model).is_file()
+
+    def write_twin(self, entry: Entry, twin: Twin) -> None:
+        """Store the simulated twin of a sequence, replacing an earlier one of the same model."""
+        columns = {"qpos": twin.qpos, "qvel": twin.qvel, "tau": twin.tau}
+        file = self._twin_file(entry, twin.model_hash)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        _write_table(file, columns, entry.dt, self.joint_names)
+
+    def pair(self, entry: Entry, model: str) -> Pair:
+        """A sequence with its simulated twin."""
+        file = self._twin_file(entry, model)
+        if not file.is_file():
+            raise DatasetError(f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet pair {self.path}")
+        arrays = _read_table(file, ("qpos", "qvel", "tau"), len(self.joint_names))
+        return Pair(self.read(entry), Twin(model, **arrays))
+
+    def _file(self, entry: Entry) -> Path:
+        return self.path / "sequences" / f"{entry.id}.parquet"
+
+    def _twin_file(self, entry: Entry, model: str) -> Path:
+        return self.path / "twins" / model / f"{entry.id}.parquet"
+
+    def _journal(self) -> Iterator[Entry]:
+        journal = self.path / "sequences.jsonl"
+        if not journal.is_file():
+            return
+        text = journal.read_text(encoding="utf-8")
+        complete, cut = text[: text.rfind("\n") + 1], text[text.rfind("\n") + 1 :]
+        if cut:  # a crash while appending: the sequence was never listed
+            write_text(journal, complete)
+        for number, line in enumerate(complete.splitlines(), 1):
+            try:
+                fields = json.loads(line)
+                meta = SequenceMeta(**fields.pop("meta"))
+                entry = Entry(**(fields | {"meta": meta, "channels": tuple(fields["channels"])}))
+            except (json.JSONDecodeError, KeyError, TypeError) as error:
+                raise DatasetError(f"{journal}:{number}: damaged line ({error}); delete it and import that log again") from None
+            if not self._file(entry).is_file():
+                raise DatasetError(f"{journal}:{number}: {self._file(entry)} is missing; restore it or delete the line")
+            yield entry
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_table(path: Path, columns: dict[str, np.ndarray], dt: float, joint_names: tuple[str, ...]) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    n = len(joint_names)
+    rows = len(next(iter(columns.values())))
+    arrays = [pa.array(np.arange(rows) * dt, pa.float64())]
+    for values in columns.values():
+        flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
+        arrays.append(pa.FixedSizeListArray.from_arrays(flat, n))
+    table = pa.table(arrays, names=["time", *columns]).replace_schema_metadata(
+        {"joint_names": ",".join(joint_names), "units": json.dumps({c: UNITS[c] for c in ["time", *columns]})}
+    )
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        pq.write_table(table, temporary, compression="zstd", use_dictionary=False)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _read_table(path: Path, columns: tuple[str, ...], n: int) -> dict[str, np.ndarray]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.ParquetFile(path).read(columns=list(columns))
+        arrays = {c: table.column(c).combine_chunks() for c in columns}
+    except (pa.ArrowInvalid, pa.ArrowException, OSError, KeyError) as error:
+        reason = str(error).split("\n")[0].rstrip(".")
+        raise DatasetError(f"{path}: not a readable Parquet file ({reason}); restore it or import the log again") from None
+    return {c: a.flatten().to_numpy(zero_copy_only=False).reshape(-1, n) for c, a in arrays.items()}

@@ -1,0 +1,32 @@
+"""Errors that a user can act on: what is wrong, where, and what to do.
+
+Every error raised on bad input derives from `GAPONetError`; the command line prints its text in one line and exits with 2.
+"""
+
+
+class GAPONetError(Exception):
+    """Base of all errors caused by input, never by a bug in gaponet."""
+
+
+class RobotError(GAPONetError):
+    """A robot folder is missing, incomplete or contradicts its MJCF."""
+
+
+class JointMismatchError(GAPONetError):
+    """Joint names of a log, dataset or model do not match the robot's."""
+
+
+class LogError(GAPONetError):
+    """A log file cannot be read: the message names the file and line."""
+
+
+class DatasetError(GAPONetError):
+    """A dataset folder is missing, damaged or belongs to another robot."""
+
+
+class ModelError(GAPONetError):
+    """A run or model artifact is missing, damaged or does not fit the robot, rate or gains."""
+
+
+class UsageError(GAPONetError):
+    """Options contradict each other or are out of range."""

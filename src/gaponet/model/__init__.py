@@ -1,0 +1,1 @@
+"""The operator: one observation, sensors, branch and trunk, baselines, and the artifact that ships."""

@@ -1,0 +1,65 @@
+"""THE observation: the one definition used by training, the aligned simulator and the robot.
+
+o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
+[s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gaponet.model.config import ModelConfig
+
+Array = np.ndarray
+
+
+class History:
+    """Past frames of num_envs robots and the observation made from them; float32, no allocation per step but the result."""
+
+    def __init__(self, config: ModelConfig, num_envs: int, n: int) -> None:
+        """Empty history: reset every environment before observing."""
+        self.n = n
+        self.payload_max = config.payload_max
+        self.payload_input = config.payload_input
+        self.depth = (config.history - 1) * config.stride + 1
+        self.picked = np.arange(0, self.depth, config.stride)  # newest first
+        self.frames = np.zeros((num_envs, self.depth, 3 * n), np.float32)
+        self.dim = config.observation_dim(n)
+
+    def reset(self, ids: Array | slice, qpos: Array, qvel: Array, u: Array) -> None:
+        """Fill histories from real frames before the start index, never with zeros.
+
+        Args:
+            ids: Environments, (k,).
+            qpos, qvel, u: Frames, (k, depth, n), newest first.
+        """
+        self.frames[ids] = np.concatenate([qpos, qvel, u], axis=-1)
+
+    def push(self, qpos: Array, qvel: Array, u: Array) -> None:
+        """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
+        self.frames[:, 1:] = self.frames[:, :-1]
+        n = self.n
+        self.frames[:, 0, :n] = qpos
+        self.frames[:, 0, n : 2 * n] = qvel
+        self.frames[:, 0, 2 * n :] = u
+
+    def observe(self, qpos: Array, qvel: Array, payload_mass: Array) -> Array:
+        """The observation, (num_envs, dim), float32.
+
+        Args:
+            qpos, qvel: State now, (num_envs, n).
+            payload_mass: (num_envs,) kg.
+        """
+        n, out = self.n, np.empty((len(self.frames), self.dim), np.float32)
+        out[:, :n] = qpos
+        out[:, n : 2 * n] = qvel
+        past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]
+        out[:, 2 * n : 2 * n + 3 * n * len(self.picked)] = past.reshape(len(out), -1)
+        if self.payload_input:
+            out[:, -1] = payload_mass / self.payload_max
+        return out
+
+
+def frames_before(t: Array, depth: int) -> Array:
+    """Row indices of the `depth` frames before rows t, newest first, the first row repeated; (k,) → (k, depth)."""
+    return np.maximum(np.asarray(t)[:, None] - 1 - np.arange(depth), 0)

@@ -1,0 +1,208 @@
+"""A robot: joint names, gains, limits, control period and payload mounts, read from one folder.
+
+A folder holds `robot.toml` (what a log and a controller need to know) and `robot.xml` (MJCF: kinematics, inertia, joint
+friction; its actuators, if any, are replaced by position actuators with the gains of `robot.toml`). A user adds a robot
+by writing such a folder; no code is needed.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.errors import JointMismatchError, RobotError
+
+Array = np.ndarray
+
+BUILTIN = Path(__file__).parent / "robots"
+LOG_UNITS = ("rad", "deg", "fraction")
+
+
+@dataclass(frozen=True)
+class PayloadMount:
+    """Where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`."""
+
+    side: str
+    body: str
+    pos: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """What is known about a robot without stepping it. n joints, always in the order of `joint_names`.
+
+    Attributes:
+        name: Folder name, e.g. "so101".
+        mjcf: Path of the MJCF.
+        joint_names: All actuated joints, (n).
+        operated: The subset that the operator corrects, in the same order.
+        kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
+        effort_limit: Torque limit, (n), N·m.
+        qpos_home: Rest position, (n), rad.
+        log_units: Unit in which public logs hold each joint, (n): rad, deg, or fraction (0..1 of the MJCF range).
+        aliases: Other names of a joint in logs → its name here.
+        payload_mounts: Where payloads go.
+        dt: Control period, s.
+        timestep: Physics step at that control period, s; dt / timestep is an exact integer.
+    """
+
+    name: str
+    description: str
+    mjcf: Path
+    joint_names: tuple[str, ...]
+    operated: tuple[str, ...]
+    kp: Array
+    kd: Array
+    effort_limit: Array
+    qpos_home: Array
+    log_units: tuple[str, ...]
+    aliases: dict[str, str]
+    payload_mounts: tuple[PayloadMount, ...]
+    dt: float
+    timestep: float
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for field in ("kp", "kd", "effort_limit", "qpos_home"):
+            value = np.asarray(getattr(self, field), float)
+            if value.shape != (n,) or not np.isfinite(value).all():
+                raise RobotError(f"{self.name}: {field} must be {n} finite numbers, got shape {value.shape}")
+            value.flags.writeable = False
+            object.__setattr__(self, field, value)
+        if len(set(self.joint_names)) != n:
+            raise RobotError(f"{self.name}: a joint name appears twice in {', '.join(self.joint_names)}")
+        if not self.operated:
+            raise RobotError(f"{self.name}: no joint has operated = true; the operator needs at least one")
+        ratio = self.dt / self.timestep
+        if abs(ratio - round(ratio)) > 1e-9 or ratio < 1:
+            raise RobotError(
+                f"{self.name}: dt / timestep = {self.dt} / {self.timestep} = {ratio:.4g} is not a whole number; "
+                "choose a timestep that divides the control period"
+            )
+
+    @property
+    def decimation(self) -> int:
+        """Physics steps per control period."""
+        return round(self.dt / self.timestep)
+
+    @functools.cached_property
+    def qpos_range(self) -> Array:
+        """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited. Compiles the MJCF on first use."""
+        import mujoco
+
+        model = mujoco.MjModel.from_xml_path(str(self.mjcf))
+        joints = [model.joint(name) for name in self.joint_names]
+        limited = np.array([model.jnt_limited[j.id] for j in joints], bool)[:, None]
+        return np.where(limited, [j.range for j in joints], [-np.inf, np.inf])
+
+    @property
+    def operated_index(self) -> Array:
+        """Positions of the operated joints in `joint_names`, (n_operated,)."""
+        return self.index(self.operated)
+
+    def index(self, names: tuple[str, ...] | list[str]) -> Array:
+        """Positions of `names` in `joint_names`; raises with the valid names on a stranger."""
+        for name in names:
+            if name not in self.joint_names:
+                raise JointMismatchError(self._unknown(name, "a request"))
+        return np.array([self.joint_names.index(name) for name in names], int)
+
+    def resolve(self, name: str, where: str, extra: dict[str, str] | None = None) -> str:
+        """The robot's own name of a joint called `name` in a log.
+
+        Args:
+            name: Name in the log; paths such as /robot/link/joint are reduced to their last part.
+            where: File, for the error.
+            extra: The user's --map, tried first.
+        """
+        short = name.strip().split("/")[-1]
+        for table in (extra or {}, self.aliases):
+            for key in (name.strip(), short):
+                if key in table:
+                    short = table[key]
+        if short not in self.joint_names:
+            raise JointMismatchError(self._unknown(short, where))
+        return short
+
+    def _unknown(self, name: str, where: str) -> str:
+        close = difflib.get_close_matches(name, self.joint_names, n=1, cutoff=0.3)
+        hint = close[0] if close else self.joint_names[0]
+        return (
+            f"{where} names joint '{name}', but robot '{self.name}' has: {', '.join(self.joint_names)}. "
+            f"Map it with --map {name}={hint}"
+        )
+
+
+def available() -> list[str]:
+    """Names of the robots in the package."""
+    return sorted(p.parent.name for p in BUILTIN.glob("*/robot.toml"))
+
+
+def load_robot(name_or_path: str | Path) -> RobotSpec:
+    """Read a robot from the package by name, or from a folder by path.
+
+    Raises:
+        RobotError: With the folder, the field and what to write there.
+    """
+    folder = BUILTIN / str(name_or_path)
+    if not (folder / "robot.toml").is_file():
+        folder = Path(name_or_path)
+    toml = folder / "robot.toml"
+    if not toml.is_file():
+        raise RobotError(
+            f"no robot '{name_or_path}': in the package are {', '.join(available())}; "
+            "or give a folder that holds robot.toml and robot.xml"
+        )
+    try:
+        table = tomllib.loads(toml.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RobotError(f"{toml}: not valid TOML: {error}") from None
+    mjcf = folder / table.get("mjcf", "robot.xml")
+    if not mjcf.is_file():
+        raise RobotError(f"{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = \"...\"")
+    return _spec(table, toml, mjcf)
+
+
+def _spec(table: dict[str, Any], toml: Path, mjcf: Path) -> RobotSpec:
+    joints = table.get("joint")
+    if not isinstance(joints, list) or not joints:
+        raise RobotError(f"{toml}: no [[joint]] entries; add one for each actuated joint, in the log's order")
+    for i, joint in enumerate(joints):
+        _require(joint, {"name": str, "kp": (int, float), "effort_limit": (int, float)}, f"{toml}: [[joint]] {i + 1}")
+        if joint.get("log_unit", "rad") not in LOG_UNITS:
+            raise RobotError(f"{toml}: joint {joint['name']}: log_unit must be one of {', '.join(LOG_UNITS)}")
+    _require(table, {"name": str, "dt": (int, float), "timestep": (int, float)}, str(toml))
+    mounts = table.get("payload_mount", [])
+    for i, mount in enumerate(mounts):
+        _require(mount, {"side": str, "body": str, "pos": list}, f"{toml}: [[payload_mount]] {i + 1}")
+    names = tuple(j["name"] for j in joints)
+    return RobotSpec(
+        name=table["name"],
+        description=table.get("description", table["name"]),
+        mjcf=mjcf,
+        joint_names=names,
+        operated=tuple(j["name"] for j in joints if j.get("operated", True)),
+        kp=np.array([j["kp"] for j in joints]),
+        kd=np.array([j.get("kd", 0.0) for j in joints]),
+        effort_limit=np.array([j["effort_limit"] for j in joints]),
+        qpos_home=np.array([j.get("home", 0.0) for j in joints]),
+        log_units=tuple(j.get("log_unit", "rad") for j in joints),
+        aliases={alias: j["name"] for j in joints for alias in j.get("aliases", [])},
+        payload_mounts=tuple(PayloadMount(m["side"], m["body"], tuple(m["pos"])) for m in mounts),
+        dt=float(table["dt"]),
+        timestep=float(table["timestep"]),
+    )
+
+
+def _require(table: dict[str, Any], fields: dict[str, Any], where: str) -> None:
+    for field, kind in fields.items():
+        if field not in table:
+            raise RobotError(f"{where}: '{field}' is missing; add {field} = ...")
+        if not isinstance(table[field], kind):
+            raise RobotError(f"{where}: '{field}' has the wrong type ({type(table[field]).__name__})")

@@ -1,0 +1,1 @@
+"""Stepping: MJCF to model, many simulations at once, replay of logged commands."""

@@ -1,0 +1,143 @@
+"""RobotSpec → MjModel. The only place that touches MJCF."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import mujoco
+import numpy as np
+
+from gaponet.errors import RobotError, UsageError
+from gaponet.robot import RobotSpec
+
+# Joint friction loss is a soft constraint in MuJoCo: with the default parameters a joint that should stick creeps.
+# These values hold it (tests/sim/test_model.py holds a loaded joint for 60 s), at no cost in speed.
+STIFF_SOLREF = (0.004, 1.0)
+STIFF_SOLIMP = (0.999, 0.9999, 0.001, 0.5, 2.0)
+
+PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
+
+
+def build_model(
+    robot: RobotSpec,
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    dt: float | None = None,
+) -> mujoco.MjModel:
+    """The nominal simulator of a robot with a payload.
+
+    Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has, in the
+    order of `robot.joint_names`. The number of physics steps per control period is the robot's decimation at any dt.
+
+    Args:
+        robot: The robot.
+        payload_mass: Mass in each hand named by `payload_side`, kg.
+        payload_side: "both" (every mount), or the side of one mount.
+        dt: Control period, s; default robot.dt.
+
+    Raises:
+        RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
+        UsageError: Negative payload, unknown side, or a dt that is not positive.
+    """
+    spec = _read(robot)
+    spec.option.timestep = (robot.dt if dt is None else _positive(dt)) / robot.decimation
+    for joint in spec.joints:
+        joint.solref_friction = STIFF_SOLREF
+        joint.solimp_friction = STIFF_SOLIMP
+    _add_actuators(spec, robot)
+    _add_payload(spec, robot, payload_mass, payload_side)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise RobotError(f"{robot.mjcf}: does not compile: {' '.join(str(error).split())}") from None
+    if model.nq != model.nv or model.nq != len(robot.joint_names):
+        known = {j.name for j in spec.joints}
+        raise RobotError(
+            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
+            f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
+        )
+    if not np.array_equal(qpos_address(model, robot), np.arange(model.nq)):
+        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
+    return model
+
+
+def qpos_address(model: mujoco.MjModel, robot: RobotSpec) -> np.ndarray:
+    """Index of each of the robot's joints in qpos, (n,)."""
+    return np.array([model.joint(name).qposadr[0] for name in robot.joint_names])
+
+
+def qpos_range(model: mujoco.MjModel) -> np.ndarray:
+    """Joint limits, (n, 2), rad; ±inf where a joint is unlimited."""
+    limited = model.jnt_limited.astype(bool)[:, None]
+    return np.where(limited, model.jnt_range, [-np.inf, np.inf])
+
+
+def model_hash(robot: RobotSpec) -> str:
+    """What the nominal simulator is, in 12 hex digits: MJCF text, gains, limits, substeps, friction parameters.
+
+    Two runs with the same hash stepped the same physics; reports print it beside every score, since two public MJCFs of
+    one robot can differ by a factor of 50 in gain.
+    """
+    digest = hashlib.sha256()
+    digest.update(robot.mjcf.read_bytes())
+    for part in (robot.kp, robot.kd, robot.effort_limit):
+        digest.update(np.ascontiguousarray(part, np.float64).tobytes())
+    digest.update(repr((robot.joint_names, robot.decimation, STIFF_SOLREF, STIFF_SOLIMP)).encode())
+    return digest.hexdigest()[:12]
+
+
+def _read(robot: RobotSpec) -> mujoco.MjSpec:
+    try:
+        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
+    except ValueError as error:
+        raise RobotError(f"{robot.mjcf}: not valid MJCF: {' '.join(str(error).split())}") from None
+    known = {j.name for j in spec.joints}
+    missing = [name for name in robot.joint_names if name not in known]
+    if missing:
+        raise RobotError(
+            f"{robot.mjcf}: robot.toml names joint '{missing[0]}', the MJCF has: {', '.join(sorted(known))}"
+        )
+    return spec
+
+
+def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    for name, kp, kd, limit in zip(robot.joint_names, robot.kp, robot.kd, robot.effort_limit, strict=True):
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=kp, kv=kd)
+        actuator.forcelimited = True
+        actuator.forcerange = (-limit, limit)
+
+
+def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) -> None:
+    if mass < 0 or not math.isfinite(mass):
+        raise UsageError(f"payload_mass is {mass}; give the mass in kg, 0 for an empty hand")
+    sides = [m.side for m in robot.payload_mounts]
+    if side != "both" and side not in sides:
+        raise UsageError(f"payload side '{side}' is unknown to {robot.name}; use both or one of {', '.join(sides)}")
+    if mass and not sides:
+        raise RobotError(f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg")
+    for mount in robot.payload_mounts:
+        # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch steps them together.
+        carried = mass if side in ("both", mount.side) else 0.0
+        radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
+        parent = spec.body(mount.body)
+        if parent is None:
+            raise RobotError(f"{robot.mjcf}: payload mount '{mount.side}' names body '{mount.body}', which is missing")
+        body = parent.add_body(name=f"payload_{mount.side}", pos=mount.pos)
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(radius, 0, 0), mass=carried, contype=0, conaffinity=0,
+            rgba=(0.8, 0.25, 0.2, 1),
+        )  # fmt: skip
+
+
+def _mjcf_order(model: mujoco.MjModel) -> str:
+    return ", ".join(model.joint(i).name for i in range(model.njnt))
+
+
+def _positive(dt: float) -> float:
+    if not dt > 0:
+        raise UsageError(f"dt is {dt}; the control period in seconds must be positive")
+    return dt

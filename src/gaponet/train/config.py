@@ -1,0 +1,85 @@
+"""How a model is trained, as data: the docstring under a field is its command-line help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gaponet.model.config import ModelConfig
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """r = −position·mean(Δq²) − velocity·mean(Δq̇²) − delta·mean(Δa²) − delta_rate·mean((Δa_t − Δa_{t−1})²)."""
+
+    position: float = 32.83
+    """κ of the paper, 1/rad²."""
+    velocity: float = 0.3283
+    """0.01 κ, s²/rad²."""
+    delta: float = 0.01
+    """Price of a large correction, 1/rad²."""
+    delta_rate: float = 0.1
+    """Price of a jerky correction, 1/rad²."""
+
+
+@dataclass(frozen=True)
+class WarmStartConfig:
+    """Supervised start: regress the inverse labels on states that the policy visits itself."""
+
+    rounds: int = 8
+    """Roll-outs of the present policy; 0 starts PPO from an untrained network."""
+    num_envs: int = 256
+    """Simulations per round."""
+    steps: int = 400
+    """Control periods per round."""
+    batch_size: int = 2048
+    """Samples per gradient step."""
+    gradient_steps: int = 300
+    """Gradient steps per round."""
+    learning_rate: float = 1e-3
+    """Adam step size, decayed to a tenth over the rounds."""
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """PPO of rsl_rl, start values of the method."""
+
+    num_envs: int = 512
+    """Simulations."""
+    num_steps: int = 32
+    """Control periods between updates."""
+    epochs: int = 5
+    """Passes over each batch."""
+    mini_batches: int = 4
+    """Mini-batches per pass."""
+    learning_rate: float = 1e-4
+    """Start value; adapts to desired_kl."""
+    desired_kl: float = 0.008
+    """Step size is halved or doubled to stay near this KL."""
+    gamma: float = 0.99
+    """Discount per control period."""
+    lam: float = 0.95
+    """GAE λ."""
+    clip: float = 0.2
+    """PPO clip range."""
+    init_std: float = 0.05
+    """Exploration σ at start, rad; small after a warm start, or noise shakes joints out of stiction."""
+    critic_hidden: tuple[int, ...] = (256, 128)
+    """Hidden layers of the critic."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything a run needs to be repeated, beside the dataset."""
+
+    model: ModelConfig = field(default_factory=ModelConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    seed: int = 0
+    """Seed of everything random."""
+    episode_s: float = 10.0
+    """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
+    validate_every: int = 10
+    """PPO updates between free runs over the validation motions."""
+    torch_threads: int = 1
+    """Threads of the learner; more of them fight with the simulator's pool."""

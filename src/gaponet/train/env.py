@@ -1,0 +1,143 @@
+"""The training environment: many simulations chase recorded motions; the action is Δa, the reward is staying with them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+
+import numpy as np
+import torch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from gaponet.data.sequence import Sequence
+from gaponet.errors import UsageError
+from gaponet.model.config import ModelConfig
+from gaponet.model.observation import History, frames_before
+from gaponet.robot import RobotSpec
+from gaponet.sim.batch import BatchSim
+from gaponet.train.config import RewardConfig
+
+Array = np.ndarray
+
+
+class DeltaEnv(VecEnv):
+    """num_envs simulations, each following one recording from a random frame on.
+
+    Observation groups: "actor" = [o_t | a_t]; "critic" = that and the recorded states at t and t+1, payload, rate
+    (training only: the recorded state never reaches the actor). An environment keeps its payload and rate for life, in
+    proportion to the frames recorded under them. A motion's end is a time-out, not a failure.
+    """
+
+    def __init__(
+        self,
+        sequences: ListOf[Sequence],
+        robot: RobotSpec,
+        config: ModelConfig,
+        num_envs: int,
+        episode_steps: int,
+        reward: RewardConfig,
+        seed: int = 0,
+        nthread: int = 0,
+    ) -> None:
+        """Sequences shorter than two rows are refused; targets (inverse labels) are attached with set_targets."""
+        if not sequences:
+            raise UsageError("no sequences to train on; the split left the training set empty")
+        self.robot, self.config, self.reward_config = robot, config, reward
+        self.cfg = {"reward": reward, "model": config}
+        self.device = "cpu"
+        self.num_envs = num_envs
+        self.op = robot.operated_index
+        self.num_actions = len(self.op)
+        self.max_episode_length = episode_steps
+        self.rng = np.random.default_rng(seed)
+        self._load(sequences)
+        self.sim = BatchSim(robot, [self.conditions[g] for g in self.group], nthread)
+        self.history = History(config, num_envs, self.num_actions)
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+        self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
+        self.first = np.zeros(num_envs, np.int64)  # first row of its recording
+        self.last = np.zeros(num_envs, np.int64)
+        self.previous = np.zeros((num_envs, self.num_actions), np.float32)
+        self.tracking_error = 0.0
+        self.reset()
+
+    def _load(self, sequences: ListOf[Sequence]) -> None:
+        self.ctrl, self.qpos, self.qvel = (
+            np.concatenate([getattr(s, name) for s in sequences]) for name in ("ctrl", "qpos", "qvel")
+        )
+        length = np.array([len(s) for s in sequences])
+        self.seq_last = np.cumsum(length) - 1
+        self.seq_first = self.seq_last - length + 1
+        keys = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences]
+        self.conditions = list(dict.fromkeys(keys))
+        seq_group = np.array([self.conditions.index(k) for k in keys])
+        frames = np.bincount(seq_group, length)
+        if self.num_envs < len(frames):
+            raise UsageError(f"{self.num_envs} environments for {len(frames)} payload and rate conditions; use more")
+        share = np.cumsum(frames) / frames.sum() * self.num_envs
+        self.group = np.searchsorted(share, np.arange(self.num_envs) + 0.5).astype(int)
+        self.members = [np.flatnonzero(seq_group == g) for g in range(len(frames))]
+        self.weights = [length[m] / length[m].sum() for m in self.members]
+        self.payload = np.array([c[0] for c in self.conditions], np.float32)[self.group]
+        rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
+        self.condition_features = np.stack([self.payload / self.config.payload_max, rate / 100], axis=1)
+
+    def reset(self, ids: Array | None = None) -> None:
+        """Put environments at uniformly drawn recorded frames, with the frames before as history."""
+        ids = np.arange(self.num_envs) if ids is None else ids
+        for g in np.unique(self.group[ids]):
+            mine = ids[self.group[ids] == g]
+            seq = self.rng.choice(self.members[g], size=len(mine), p=self.weights[g])
+            self.first[mine], self.last[mine] = self.seq_first[seq], self.seq_last[seq]
+        self.row[ids] = self.rng.integers(self.first[ids], self.last[ids])
+        t = self.row[ids]
+        self.sim.reset(ids, self.qpos[t], self.qvel[t])
+        before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.history.depth)
+        op = self.op
+        self.history.reset(ids, self.qpos[before][..., op], self.qvel[before][..., op], self.ctrl[before][..., op])
+        self.previous[ids] = 0.0
+        self.episode_length_buf[ids] = 0
+
+    def get_observations(self) -> TensorDict:
+        """Actor and critic observations of the present row."""
+        op = self.op
+        o = self.history.observe(self.sim.qpos[:, op], self.sim.qvel[:, op], self.payload)
+        actor = np.concatenate([o, self.ctrl[self.row][:, op]], axis=1)
+        now, then = self.row, self.row + 1
+        truth = [x[r][:, op] for r in (now, then) for x in (self.qpos, self.qvel)]
+        critic = np.concatenate([actor, *truth, self.condition_features], axis=1, dtype=np.float32)
+        return TensorDict(
+            {"actor": torch.from_numpy(actor), "critic": torch.from_numpy(critic)}, batch_size=[self.num_envs]
+        )
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """Hold clip(a + Δa) for one control period; compare with the recording one row on."""
+        delta = np.clip(actions.numpy(), -self.config.delta_max, self.config.delta_max)
+        self.advance(delta)
+        reward = self._reward(delta)
+        done = (self.row >= self.last) | (self.episode_length_buf.numpy() >= self.max_episode_length)
+        self.previous[:] = delta
+        ids = np.flatnonzero(done)
+        if ids.size:
+            self.reset(ids)
+        dones = torch.from_numpy(done)
+        return self.get_observations(), torch.from_numpy(reward), dones, {"time_outs": dones}
+
+    def advance(self, delta: Array) -> None:
+        """One control period of all simulations, without reward or reset; delta (num_envs, n_operated)."""
+        op, n = self.op, self.sim
+        target = self.ctrl[self.row].astype(float)
+        target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])
+        self.history.push(n.qpos[:, op], n.qvel[:, op], target[:, op])
+        n.step(target)
+        self.row += 1
+        self.episode_length_buf += 1
+
+    def _reward(self, delta: Array) -> Array:
+        c, op = self.reward_config, self.op
+        error = self.sim.qpos[:, op] - self.qpos[self.row][:, op]
+        speed = self.sim.qvel[:, op] - self.qvel[self.row][:, op]
+        self.tracking_error = float(np.abs(error).mean())
+        cost = c.position * (error**2).mean(1) + c.velocity * (speed**2).mean(1)
+        cost += c.delta * (delta**2).mean(1) + c.delta_rate * ((delta - self.previous) ** 2).mean(1)
+        return (-cost).astype(np.float32)
