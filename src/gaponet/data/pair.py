@@ -21,12 +21,14 @@ class Twin:
     Attributes:
         model_hash: Of the simulator (sim.model.model_hash).
         qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of [t-1, t).
+        ctrl: (T, n) rad, targets applied over [t, t+1), where a corrector altered them; not stored.
     """
 
     model_hash: str
     qpos: Array
     qvel: Array
     tau: Array
+    ctrl: Array | None = None
 
 
 @dataclass(frozen=True)

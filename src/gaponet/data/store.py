@@ -103,6 +103,16 @@ class Dataset:
         """The entry with this content, if any."""
         return next((e for e in self.entries if e.hash == content_hash), None)
 
+    def select(self, motions: tuple[str, ...] = ()) -> list[Entry]:
+        """Entries of these motions, all by default; refuses a motion that is not there."""
+        present = {e.meta.motion for e in self.entries}
+        for motion in motions:
+            if motion not in present:
+                raise DatasetError(f"{self.path}: no motion '{motion}'; it holds: {', '.join(sorted(present)) or 'nothing'}")
+        if not self.entries:
+            raise DatasetError(f"{self.path}: holds no sequences yet; import or collect some")
+        return [e for e in self.entries if not motions or e.meta.motion in motions]
+
     def append(self, sequence: Sequence, findings: dict[str, Any] | None = None) -> Entry:
         """Add a sequence; one with the same content is refused with its name."""
         digest = sequence.content_hash()

@@ -60,7 +60,7 @@ class Features(nn.Module):
         q, v, action = x[:, :n], x[:, n : 2 * n], x[:, -n:]
         frames = x[:, 2 * n : 2 * n + 3 * n * self.history].reshape(-1, self.history, 3, n)
         shift = torch.stack([q, torch.zeros_like(q), q], dim=1).unsqueeze(1)  # (B, 1, 3, n)
-        past = (frames - shift).reshape(len(x), -1)
+        past = (frames - shift).flatten(1)
         rest = x[:, 2 * n + 3 * n * self.history : -n]  # payload, if observed
         return torch.cat([q, v, past, rest, action - q], dim=1)
 
@@ -112,6 +112,9 @@ class OperatorNet(nn.Module):
         nn.init.uniform_(self.trunk[-1].bias, -0.003, 0.003)
         self.bias = nn.Parameter(torch.zeros(n))
         self.bounded = Bounded(config.delta_max)
+        # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is unsure
+        # of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
+        self.sample_sensors = False
 
     def forward(self, x: Tensor) -> Tensor:
         """x = [o_t | a_t], (B, observation_dim + n) → Δa, (B, n), rad."""
@@ -119,7 +122,7 @@ class OperatorNet(nn.Module):
         parts = []
         if self.predictor is not None:
             mean, log_var = self.predictor(z)
-            if self.training:  # the operator must not trust a number the predictor is unsure of
+            if self.sample_sensors:
                 mean = mean + torch.randn_like(mean) * (0.5 * log_var).exp()
             parts.append(mean)
         if self.sees_observation:
@@ -135,6 +138,7 @@ class DeltaMLP(nn.Module):
     """Baseline: a plain network on the same features, ASAP's form."""
 
     predictor = None
+    sample_sensors = False
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()

@@ -36,7 +36,9 @@ class WarmStartConfig:
     gradient_steps: int = 300
     """Gradient steps per round."""
     learning_rate: float = 1e-3
-    """Adam step size, decayed to a tenth over the rounds."""
+    """AdamW step size, decayed to a tenth over the rounds."""
+    weight_decay: float = 0.01
+    """AdamW weight decay."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,9 @@ class PPOConfig:
     """GAE λ."""
     clip: float = 0.2
     """PPO clip range."""
-    init_std: float = 0.05
+    critic_warmup: int = 10
+    """Updates of the critic alone, before a warm-started actor moves."""
+    init_std: float = 0.02
     """Exploration σ at start, rad; small after a warm start, or noise shakes joints out of stiction."""
     critic_hidden: tuple[int, ...] = (256, 128)
     """Hidden layers of the critic."""

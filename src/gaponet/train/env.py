@@ -58,7 +58,7 @@ class DeltaEnv(VecEnv):
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
         self.last = np.zeros(num_envs, np.int64)
         self.previous = np.zeros((num_envs, self.num_actions), np.float32)
-        self.tracking_error = 0.0
+        self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
 
     def _load(self, sequences: ListOf[Sequence]) -> None:
@@ -137,7 +137,14 @@ class DeltaEnv(VecEnv):
         c, op = self.reward_config, self.op
         error = self.sim.qpos[:, op] - self.qpos[self.row][:, op]
         speed = self.sim.qvel[:, op] - self.qvel[self.row][:, op]
-        self.tracking_error = float(np.abs(error).mean())
         cost = c.position * (error**2).mean(1) + c.velocity * (speed**2).mean(1)
         cost += c.delta * (delta**2).mean(1) + c.delta_rate * ((delta - self.previous) ** 2).mean(1)
+        self.reward_sum -= float(cost.mean())
+        self.reward_count += 1
         return (-cost).astype(np.float32)
+
+    def mean_reward(self) -> float:
+        """Per step and environment since last asked."""
+        mean = self.reward_sum / max(self.reward_count, 1)
+        self.reward_sum, self.reward_count = 0.0, 0
+        return mean

@@ -1,0 +1,143 @@
+"""gaponet train, gaponet eval, gaponet report."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from gaponet.cli.gap import mrad, names, show_methods
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+from gaponet.robot import load_robot
+from gaponet.train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from gaponet.model.artifact import GapModel
+
+
+def train(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    model: Literal["gaponet", "mlp"] = "gaponet",
+    budget: str = "10m",
+    resume: tyro.conf.FlagCreatePairsOff[bool] = False,
+    robot: str | None = None,
+    holdout_units: tuple[str, ...] = (),
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
+
+    Ctrl-C ends training and leaves a usable run.
+
+    Args:
+        dataset: Dataset folder.
+        out: Run folder.
+        model: gaponet, or the mlp baseline.
+        budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
+        resume: Go on with the run in out.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        holdout_units: Units never trained on; their test motions stay in the test part.
+        config: Everything else.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.store import Dataset
+
+    screen = Out(json)
+    config = replace(config, model=replace(config.model, kind=model))
+    trained = run_training(Dataset(dataset), robot, out, config, budget, resume, holdout_units)
+    card = trained.card
+    val = card["val_mpjae"]
+    screen.say(
+        f"best on validation: {mrad(val['model'])} mrad, nominal {mrad(val['nominal'])} "
+        f"({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in {card['seconds']:.0f} s"
+        + (" (interrupted)" if card["interrupted"] else "")
+    )
+    screen.say(f"model in {trained.path}; next: gaponet eval {out} {dataset}; gaponet report {out}")
+    screen.result({k: card[k] for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "interrupted", "parity_rad", "seed")})
+
+
+def run_training(
+    data: object, robot: str | None, out: Path, config: TrainConfig, budget: str, resume: bool, holdout: tuple[str, ...]
+) -> GapModel:
+    """Train with a progress bar: reward, held-out MPJAE, throughput."""
+    from gaponet.data.store import Dataset
+    from gaponet.train.budget import Budget
+    from gaponet.train.run import Status, Trainer
+
+    assert isinstance(data, Dataset)
+    spec = load_robot(robot or data.robot_name)
+    with bar(f"training {config.model.kind}") as update:
+
+        def show(s: Status) -> None:
+            reward = "" if s.reward != s.reward else f"reward {s.reward:.4f}, "
+            held = "" if s.val_mpjae != s.val_mpjae else f"held-out {s.val_mpjae * 1e3:.2f} mrad"
+            best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
+            update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
+
+        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show)
+        return trainer.run()
+
+
+def evaluate(
+    run: tyro.conf.Positional[Path],
+    dataset: tyro.conf.Positional[Path],
+    also: tuple[Path, ...] = (),
+    motions: str = "",
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it.
+
+    Args:
+        run: Run folder of gaponet train.
+        dataset: The dataset trained on (its test motions are used) or another.
+        also: Further runs to compare, e.g. the MLP's.
+        motions: Only these, separated by commas.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.store import Dataset
+    from gaponet.eval.evaluate import evaluate as run_evaluation
+    from gaponet.eval.evaluate import save
+
+    out, data = Out(json), Dataset(dataset)
+    spec = load_robot(robot or data.robot_name)
+    with bar("evaluating") as update:
+        evaluation = run_evaluation(
+            [run, *also], data, spec, names(motions),
+            lambda method, done, total: update(done, total, method),
+        )  # fmt: skip
+    save(evaluation, run)
+    if not evaluation.result["unseen"]:
+        out.say("[yellow]some of these sequences were used in training: the numbers are not held-out ones[/]")
+    show_methods(out, evaluation.result, spec)
+    out.result(evaluation.result)
+
+
+def report(
+    run: tyro.conf.Positional[Path],
+    dataset: Path | None = None,
+    also: tuple[Path, ...] = (),
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Write one self-contained offline HTML page about a run.
+
+    Args:
+        run: Run folder of gaponet train.
+        dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.
+        also: Further runs to compare, e.g. the MLP's.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    from gaponet.eval.report import write_report
+
+    out = Out(json)
+    with bar("report") as update:
+        path = write_report(run, dataset, also, robot, lambda what, done, total: update(done, total, what))
+    out.say(f"report: {path}")
+    out.result({"report": str(path)})

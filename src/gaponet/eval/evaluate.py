@@ -1,0 +1,139 @@
+"""Nominal, delay + offset, MLP and GAPONet side by side: free runs with the shipped artifact (onnxruntime, not torch)."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset, Entry, write_text
+from gaponet.errors import DatasetError, ModelError, UsageError
+from gaponet.gap import Run, runs, summary
+from gaponet.model.artifact import GapModel
+from gaponet.model.baselines.delay_offset import DelayOffset
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import model_hash
+from gaponet.sim.replay import Corrector, replay
+
+Array = np.ndarray
+ORDER = ("nominal", "delay_offset", "mlp", "gaponet")  # of tables and figures
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Free runs by method, their metrics, and the corrections applied by each learned model."""
+
+    result: dict[str, Any]
+    runs: dict[str, list[Run]]
+    deltas: dict[str, list[Array]]
+
+
+def evaluate(
+    runs_dirs: ListOf[Path],
+    dataset: Dataset,
+    robot: RobotSpec,
+    motions: tuple[str, ...] = (),
+    progress: Callable[[str, int, int], None] = lambda method, done, total: None,
+) -> Evaluation:
+    """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
+
+    Args:
+        runs_dirs: Training runs; the first one's split and delay + offset baseline apply.
+        dataset: The one trained on, or another.
+        robot: The nominal simulator.
+        motions: Only these; default: the test motions of the dataset trained on, everything never trained on of another.
+        progress: Called with method, control steps done, total.
+    """
+    dataset.require_robot(robot)
+    models = {}
+    for path in runs_dirs:
+        model = GapModel.load(path)
+        if model.config.kind in models:
+            raise UsageError(f"{path}: a second {model.config.kind} model; give runs of different kinds")
+        models[model.config.kind] = model
+    entries, unseen = choose(runs_dirs[0], dataset, motions)
+    sequences = dataset.sequences(entries)
+    for model, dt in itertools.product(models.values(), sorted({s.dt for s in sequences})):
+        model.require(robot, dt)
+    done_runs, deltas = {}, {}
+    for name, corrector in _methods(runs_dirs[0], models, robot):
+        twins = replay(sequences, robot, corrector, progress=lambda k, n, name=name: progress(name, k, n))
+        done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
+        if name in models:
+            op = robot.operated_index
+            deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
+    result = {
+        "methods": {name: summary(part, robot) for name, part in done_runs.items()},
+        "ratio_to_nominal": _ratios(done_runs),
+        "dataset": dataset.path.name,
+        "sequences": len(sequences),
+        "motions": sorted({s.meta.motion for s in sequences}),
+        "unseen": unseen,
+        "virtual": any(s.meta.virtual for s in sequences),
+        "robot": robot.name,
+        "simulator_hash": model_hash(robot),
+        "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
+        "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
+    }
+    return Evaluation(result, done_runs, deltas)
+
+
+def choose(run: Path, dataset: Dataset, motions: tuple[str, ...]) -> tuple[list[Entry], bool]:
+    """Entries to evaluate and whether none of them was used in training or for choosing."""
+    split = read_split(run)
+    known = {h for part in ("train", "val") for h in split[part].values()}
+    if motions:
+        entries = dataset.select(motions)
+    else:
+        test = set(split["test"].values())
+        entries = [e for e in dataset.entries if e.hash in test] or [e for e in dataset.entries if e.hash not in known]
+    if not entries:
+        raise DatasetError(f"{dataset.path}: every sequence was used in training; give logs the run never saw, or --motions")
+    return entries, not any(e.hash in known for e in entries)
+
+
+def read_split(run: Path) -> dict[str, dict[str, str]]:
+    """{part: {sequence id: content hash}} of a run."""
+    file = run / "split.json"
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError) as error:
+        raise ModelError(f"{file}: cannot be read ({error}); give a run folder of gaponet train") from None
+
+
+def save(evaluation: Evaluation, run: Path) -> None:
+    """metrics.json in the run folder: the newest evaluation."""
+    from gaponet.cli.out import finite
+
+    write_text(run / "metrics.json", json.dumps(finite(evaluation.result), indent=1, ensure_ascii=False) + "\n")
+
+
+def _methods(run: Path, models: dict[str, GapModel], robot: RobotSpec) -> Iterator[tuple[str, Corrector | None]]:
+    yield "nominal", None
+    file = run / "delay_offset.json"
+    if file.is_file():
+        yield "delay_offset", DelayOffset(**json.loads(file.read_text(encoding="utf-8"))).corrector(robot)
+    for kind in sorted(models, key=ORDER.index):
+        yield kind, models[kind].corrector(robot)
+
+
+def _delta_summary(parts: list[Array], sequences: list[Sequence]) -> dict[str, float]:
+    """Size of the corrections: mean and largest |Δa| rad, mean rate rad/s."""
+    dt = float(np.median([s.dt for s in sequences]))
+    return {
+        "mean": float(np.mean([np.abs(d).mean() for d in parts])),
+        "max": float(max(np.abs(d).max() for d in parts)),
+        "rate": float(np.mean([np.abs(np.diff(d, axis=0)).mean() for d in parts]) / dt),
+    }
+
+
+def _ratios(done: dict[str, list[Run]]) -> dict[str, float]:
+    nominal = np.mean([np.abs(r.error).mean() for r in done["nominal"]])
+    return {name: float(np.mean([np.abs(r.error).mean() for r in part]) / nominal) for name, part in done.items()}

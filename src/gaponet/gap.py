@@ -1,0 +1,122 @@
+"""How far a simulator is from the robot: the metrics, in free run, grouped as people ask for them.
+
+e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's number is
+the mean over its sequences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.robot import RobotSpec
+
+Array = np.ndarray
+
+THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
+HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""
+
+    real: Sequence
+    qpos_real: Array
+    qpos_sim: Array
+
+    @property
+    def error(self) -> Array:
+        """e after each step, (T − 1, n), rad: row 0 is the common start and is no error."""
+        return (self.qpos_sim - self.qpos_real)[1:]
+
+
+def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec) -> list[Run]:
+    """Put recordings and simulated positions (T, n_all) together, operated joints only."""
+    op = robot.operated_index
+    return [Run(s, s.qpos[:, op], np.asarray(q)[:, op]) for s, q in zip(sequences, simulated, strict=True)]
+
+
+def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
+    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon."""
+    names = robot.operated
+    columns = {j: [i] for i, j in enumerate(names)}
+    by = lambda key: {str(k): metrics([r for r in part if key(r) == k]) for k in _keys(part, key)}  # noqa: E731
+    no_wrist = [i for i, j in enumerate(names) if "wrist" not in j]
+    total = metrics(part) | {"mpjae_no_wrist": metrics(part, no_wrist)["mpjae"] if no_wrist else float("nan")}
+    return total | {
+        "by_joint": {j: metrics(part, c) for j, c in columns.items()},
+        "by_motion": by(lambda r: r.real.meta.motion),
+        "by_payload": by(lambda r: f"{r.real.meta.payload_mass:g}"),
+        "by_unit": by(lambda r: r.real.meta.unit_id),
+        "by_horizon": horizon(part),
+    }
+
+
+def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, float]:
+    """Metrics averaged over sequences, over all joints or over some columns.
+
+    Returns:
+        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (median error while still; the rest),
+        iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape %.
+    """
+    rows = [_sequence_metrics(r, columns) for r in part]
+    return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
+
+
+def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
+    c = slice(None) if columns is None else columns
+    error = run.error[:, c].astype(float)
+    size = np.abs(error)
+    real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
+    low, high = np.percentile(size, [25, 75], axis=0)
+    bias = np.median(error, axis=0)
+    out = {
+        "mpjae": size.mean(),
+        "rmse": np.sqrt((error**2).mean(axis=0)).mean(),
+        "q_dis": (size.sum(axis=0) * run.real.dt).mean(),
+        "static": np.abs(bias).mean(),
+        "dynamic": np.abs(error - bias).mean(),
+        "iqr": (high - low).mean(),
+        "range": np.ptp(size, axis=0).mean(),
+        "correlation": _mean_correlation(real, sim),
+        "cosine": (
+            (real * sim).sum(0) / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
+        ).mean(),
+        "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
+    }
+    return out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}
+
+
+def _mean_correlation(real: Array, sim: Array) -> float:
+    """Pearson's r, averaged over joints that moved; 1 where none did."""
+    moved = (np.ptp(real, axis=0) > 0.01) & (np.ptp(sim, axis=0) > 1e-6)
+    values = [np.corrcoef(real[:, j], sim[:, j])[0, 1] for j in np.flatnonzero(moved)]
+    return float(np.mean(values)) if values else 1.0
+
+
+def horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
+    """mpjae at a time after the common start, averaged over sequences that last so long; and over the whole motion.
+
+    The error at a horizon is that of the steps in its last half, so that one frame does not decide.
+    """
+    out = {}
+    for seconds in HORIZONS_S:
+        values = []
+        for run in part:
+            last = max(round(seconds / run.real.dt), 1)
+            if len(run.error) >= last:
+                values.append(np.abs(run.error[last // 2 : last]).mean())
+        if values:
+            out[f"{seconds:g}"] = {"mpjae": float(np.mean(values))}
+    out["whole"] = {"mpjae": float(np.mean([np.abs(r.error).mean() for r in part]))}
+    return out
+
+
+def _keys(part: ListOf[Run], key: Callable[[Run], str]) -> list[str]:
+    return sorted({key(r) for r in part})

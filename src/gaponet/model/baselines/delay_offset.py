@@ -1,0 +1,104 @@
+"""Delay and offset per joint: the cheapest honest correction. u_j(t) = a_j(t − d_j) + o_j."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.robot import RobotSpec
+from gaponet.sim.replay import Progress, replay
+
+Array = np.ndarray
+
+MAX_DELAY = 0.16  # s, in steps of the control period
+PIECE = 20.0  # s, free run per fitting piece
+FRAMES = 40_000  # frames fitted on at most
+
+
+@dataclass(frozen=True)
+class DelayOffset:
+    """Fitted values by operated joint: delay s, offset rad."""
+
+    delay: dict[str, float]
+    offset: dict[str, float]
+
+    def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
+        """For sim.replay."""
+        return DelayOffsetCorrector(self, robot)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+class DelayOffsetCorrector:
+    """Delays targets and adds the offset; before the first command, the first command."""
+
+    def __init__(self, values: DelayOffset, robot: RobotSpec) -> None:
+        self.op = robot.operated_index
+        self.range = robot.qpos_range[self.op]
+        self.delay = np.array([values.delay[j] for j in robot.operated])
+        self.offset = np.array([values.offset[j] for j in robot.operated])
+
+    def reset(self, start: ListOf[Sequence]) -> None:
+        """One simulation per sequence."""
+        self.steps = np.round(self.delay[None, :] / np.array([s.dt for s in start])[:, None]).astype(int)  # (k, n)
+        self.past: list[Array] = []
+
+    def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
+        """Targets of delay steps ago plus offset, (k, n_all) rad."""
+        self.past.append(np.array(target[:, self.op]))
+        if len(self.past) > self.steps.max() + 1:
+            self.past.pop(0)
+        past = np.stack(self.past)  # (depth, k, n), newest last
+        index = np.maximum(len(past) - 1 - self.steps, 0)
+        delayed = np.take_along_axis(past, index[None], axis=0)[0]
+        out = np.array(target, float)
+        out[:, self.op] = np.clip(delayed + self.offset, self.range[:, 0], self.range[:, 1])
+        return out
+
+
+def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FRAMES) -> list[Sequence]:
+    """Cut sequences into pieces that run side by side; evenly thinned to at most `frames` rows."""
+    cut = []
+    for s in sequences:
+        rows = round(seconds / s.dt)
+        for start in range(0, max(len(s) - rows // 2, 1), rows):
+            part = slice(start, start + rows)
+            cut.append(replace(s, **{
+                name: None if value is None else value[part]
+                for name in ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
+                for value in [getattr(s, name)]
+            }))  # fmt: skip
+    keep = max(1, round(len(cut) * sum(map(len, cut)) / max(frames, 1) / len(cut)))
+    return cut[::keep]
+
+
+def fit(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None) -> DelayOffset:
+    """Try every whole-step delay on all joints at once; per joint keep the one with the least error after its offset.
+
+    Joints are fitted as if alone; their coupling is small beside delay and sag.
+    """
+    part = pieces(sequences)
+    op, names = robot.operated_index, robot.operated
+    dt = float(np.median([s.dt for s in part]))
+    delays = dt * np.arange(int(MAX_DELAY / dt) + 1)
+    error, offset = np.empty((len(delays), len(op))), np.empty((len(delays), len(op)))
+    zero = dict.fromkeys(names, 0.0)
+    for i, delay in enumerate(delays):
+        candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
+        twins = replay(part, robot, candidate.corrector(robot), nthread)
+        e = np.concatenate([(s.qpos - t.qpos)[1:, op] for s, t in zip(part, twins, strict=True)])
+        offset[i] = np.median(e, axis=0)
+        error[i] = np.abs(e - offset[i]).mean(axis=0)
+        if progress:
+            progress(i + 1, len(delays))
+    best = error.argmin(axis=0)
+    return DelayOffset(
+        {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},
+        {j: round(float(offset[best[k], k]), 6) for k, j in enumerate(names)},
+    )

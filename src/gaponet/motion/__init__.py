@@ -1,0 +1,1 @@
+"""Commands worth playing: excitation per joint, coordinated upper body, whole body, motion files."""

@@ -1,0 +1,36 @@
+"""Inverse dynamics along a trajectory: which joint torques it takes."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+Array = np.ndarray
+
+
+def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
+    """Torque of every joint without friction, limits and contacts: inertia, armature, Coriolis, gravity, damping, springs.
+
+    Args:
+        model: Nominal simulator with its payload (sim.model.build_model).
+        qpos, qvel, qacc: (T, n), rad, rad/s, rad/s².
+
+    Returns:
+        (T, n), N·m. Joint friction is left out: at rest its value is anything up to the limit.
+    """
+    data = mujoco.MjData(model)
+    flags = model.opt.disableflags
+    model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    tau = np.empty(np.shape(qpos))
+    for t in range(len(tau)):
+        data.qpos, data.qvel, data.qacc = qpos[t], qvel[t], qacc[t]
+        mujoco.mj_inverse(model, data)
+        tau[t] = data.qfrc_inverse
+    model.opt.disableflags = flags
+    return tau
+
+
+def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
+    """Torque that holds each posture still, (T, n), N·m."""
+    zero = np.zeros_like(qpos)
+    return inverse_dynamics(model, qpos, zero, zero)

@@ -1,0 +1,35 @@
+"""How long to train: wall-clock time or control steps."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from gaponet.errors import UsageError
+
+UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Exactly one of seconds and steps is set."""
+
+    seconds: float | None = None
+    steps: int | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Budget:
+        """ "90s", "10m", "2h", or a number of control steps such as "2000000" or "2e6"."""
+        match = re.fullmatch(r"\s*([0-9.]+(?:e[0-9]+)?)\s*([smh]?)\s*", text, re.IGNORECASE)
+        try:
+            number = float(match.group(1)) if match else 0.0
+        except ValueError:
+            number = 0.0
+        if not match or number <= 0:
+            raise UsageError(f"--budget {text}: give a time such as 90s, 10m or 2h, or a number of control steps")
+        unit = match.group(2).lower()
+        return cls(seconds=number * UNITS[unit]) if unit else cls(steps=int(number))
+
+    def spent(self, seconds: float, steps: int) -> float:
+        """Share of the budget used, 1 when it is out."""
+        return seconds / self.seconds if self.seconds is not None else steps / (self.steps or 1)

@@ -1,0 +1,314 @@
+"""One training run, start to artifact: split, sensors, warm start, PPO, the best model on validation, export.
+
+    RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
+    RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
+    RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gaponet.data.pair import require_disjoint, split_by_motion
+from gaponet.data.store import Dataset, Entry, write_text
+from gaponet.errors import ModelError, UsageError
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.baselines import delay_offset
+from gaponet.model.corrector import DeltaCorrector
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import export
+from gaponet.robot import RobotSpec
+from gaponet.sim.replay import replay
+from gaponet.train.budget import Budget
+from gaponet.train.config import TrainConfig
+from gaponet.train.env import DeltaEnv
+from gaponet.train.inverse import inverse_targets
+from gaponet.train.ppo import make_runner, update
+from gaponet.train.warm_start import WarmStart, fit_sensors
+
+Array = np.ndarray
+
+VALIDATION_RUNS = 24  # free runs per validation at most, evenly picked
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a progress bar shows."""
+
+    stage: str
+    fraction: float
+    steps: int
+    seconds: float
+    reward: float
+    val_mpjae: float
+    best_mpjae: float
+    nominal_mpjae: float
+
+    @property
+    def throughput(self) -> float:
+        """Control steps per second, validation and set-up included."""
+        return self.steps / max(self.seconds, 1e-9)
+
+
+class Trainer:
+    """Holds one run; `run()` does it. Ctrl-C ends training and still exports the best model so far."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        robot: RobotSpec,
+        out: Path,
+        config: TrainConfig,
+        budget: Budget,
+        resume: bool = False,
+        holdout_units: tuple[str, ...] = (),
+        show: Callable[[Status], None] = lambda status: None,
+    ) -> None:
+        """Split the dataset and refuse what cannot work, before any time is spent."""
+        dataset.require_robot(robot)
+        if (out / "config.json").exists() and not resume:
+            raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
+        if resume and not (out / "checkpoint.pt").is_file():
+            raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
+        self.dataset, self.robot, self.out, self.config, self.budget, self.show = dataset, robot, out, config, budget, show
+        self.parts = split_entries(dataset, holdout_units)
+        self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
+        require_disjoint(self.train_set, self.val_set, dataset.sequences(self.parts["test"]))
+        self.n = len(robot.operated)
+        torch.manual_seed(config.seed)
+        torch.set_num_threads(config.torch_threads)
+        self.net = build_network(config.model, self.n)
+        self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
+        self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
+        self.sensor_r2 = self.reward = self.val = self.nominal = float("nan")
+        self.runner_state: dict[str, Any] | None = None
+        self.interrupted, self.stage = False, "start"
+        self.began = time.monotonic()
+        if resume:
+            self._load()
+        self._write_config(holdout_units)
+
+    def run(self) -> GapModel:
+        """Train until the budget is out or Ctrl-C; returns the exported best model."""
+        self.nominal = self.validate(None)
+        self.baseline = delay_offset.fit(self.train_set, self.robot)
+        write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
+        try:
+            if not np.isfinite(self.best):
+                self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
+            if self.config.warm_start.rounds > self.rounds_done:
+                self._warm_start()
+            self._ppo()
+        except KeyboardInterrupt:
+            self.interrupted = True
+        return self.finish()
+
+    # ---- stages
+
+    def _warm_start(self) -> None:
+        config = self.config.warm_start
+        env = DeltaEnv(
+            self.train_set, self.robot, self.config.model, config.num_envs, 10**9, self.config.reward, self.config.seed
+        )
+        if self.net.predictor is not None and self.rounds_done == 0:
+            self.stage = "sensors"
+            self._tick()
+            self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed)
+        labels = np.concatenate([inverse_targets(s, self.robot) for s in self.train_set]) - env.ctrl
+        limit = 0.99 * self.config.model.delta_max
+        labels = np.clip(labels[:, self.robot.operated_index], -limit, limit).astype(np.float32)
+        warm = WarmStart(self.net, env, labels, config, self.config.seed)
+        warm.done = self.rounds_done
+        self.stage = "warm start"
+        while warm.done < config.rounds and self._spent() < 1:
+            warm.round(self._tick)
+            self.rounds_done = warm.done
+            self.steps += config.num_envs * config.steps
+            self._consider()
+
+    def _ppo(self) -> None:
+        ppo = self.config.ppo
+        if self._spent() >= 1:
+            return
+        self.stage = "ppo"
+        steps = round(self.config.episode_s / self.train_set[0].dt)
+        env = DeltaEnv(
+            self.train_set, self.robot, self.config.model, ppo.num_envs, steps, self.config.reward, self.config.seed + 1
+        )
+        runner = make_runner(env, self.config)
+        if self.runner_state is not None:
+            runner.alg.load(self.runner_state, None, True)
+        else:
+            runner.alg.actor.mlp.load_state_dict(self.best_state)
+        self.net = runner.alg.actor.mlp
+        if self.net.predictor is not None:
+            self.net.predictor.requires_grad_(False)
+        trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
+        while self._spent() < 1:
+            for p in trained:  # first let the critic learn what the policy is worth
+                p.requires_grad_(self.updates >= ppo.critic_warmup)
+            update(runner)
+            self.updates += 1
+            self.steps += ppo.num_envs * ppo.num_steps
+            self.reward = env.mean_reward()
+            self._tick()
+            if self.updates % self.config.validate_every == 0:
+                self.runner_state = runner.alg.save()
+                self._consider()
+        self.runner_state = runner.alg.save()
+        self._consider()
+
+    def finish(self) -> GapModel:
+        """Export the best model and write its card."""
+        self.stage = "export"
+        self._tick()
+        net = build_network(self.config.model, self.n)
+        net.load_state_dict(self.best_state)
+        net.eval()
+        env = DeltaEnv(self.train_set, self.robot, self.config.model, max(64, len(self._conditions())), 10, self.config.reward)
+        export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
+        return GapModel.load(self.out)
+
+    # ---- validation, checkpoints, card
+
+    def validate(self, net: torch.nn.Module | None) -> float:
+        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator."""
+        picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
+        corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
+        twins = replay(picked, self.robot, corrector)
+        op = self.robot.operated_index
+        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
+
+    def _consider(self) -> None:
+        """Validate the present network, keep it if it is the best, write progress and checkpoint."""
+        self.val = self.validate(self.net)
+        if self.val < self.best:
+            self.best, self.best_state = self.val, copy.deepcopy(self.net.state_dict())
+        line = {
+            "stage": self.stage, "steps": self.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
+            "val_mpjae": self.val, "nominal_mpjae": self.nominal,
+        }  # fmt: skip
+        with (self.out / "progress.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps({k: v if v == v else None for k, v in line.items()}) + "\n")
+        self._save()
+        self._tick()
+
+    def seconds(self) -> float:
+        """Trained so far, earlier parts of a resumed run included."""
+        return self.earlier + time.monotonic() - self.began
+
+    def _spent(self) -> float:
+        return self.budget.spent(self.seconds(), self.steps)
+
+    def _tick(self) -> None:
+        self.show(
+            Status(self.stage, min(self._spent(), 1.0), self.steps, self.seconds(), self.reward, self.val, self.best,
+                   self.nominal)
+        )  # fmt: skip
+
+    def _save(self) -> None:
+        state = {
+            "net": self.net.state_dict(), "best_state": self.best_state, "best": self.best, "val": self.val,
+            "steps": self.steps, "seconds": self.seconds(), "rounds_done": self.rounds_done, "updates": self.updates,
+            "sensor_r2": self.sensor_r2, "runner": self.runner_state, "rng": torch.get_rng_state(),
+        }  # fmt: skip
+        temporary = self.out / ".checkpoint.pt.tmp"
+        torch.save(state, temporary)
+        os.replace(temporary, self.out / "checkpoint.pt")
+
+    def _load(self) -> None:
+        try:
+            state = torch.load(self.out / "checkpoint.pt", weights_only=True)
+            self.net.load_state_dict(state["net"])
+        except (RuntimeError, KeyError, EOFError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
+        self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
+        self.steps, self.earlier = state["steps"], state["seconds"]
+        self.rounds_done, self.updates, self.sensor_r2 = state["rounds_done"], state["updates"], state["sensor_r2"]
+        self.runner_state = state["runner"]
+        torch.set_rng_state(state["rng"])
+
+    def _write_config(self, holdout_units: tuple[str, ...]) -> None:
+        self.out.mkdir(parents=True, exist_ok=True)
+        config = asdict(self.config) | {
+            "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
+            "dataset": self.dataset.path.name, "dataset_hash": dataset_hash(self.dataset.entries),
+        }  # fmt: skip
+        write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
+        split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
+        write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
+
+    def _conditions(self) -> set[tuple[float, str, float]]:
+        return {(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.train_set}
+
+    def _card(self) -> dict[str, Any]:
+        seen = self.train_set
+        return make_card(
+            self.config.model,
+            self.robot,
+            dt=sorted({s.dt for s in seen}),
+            payload_seen=sorted({s.meta.payload_mass for s in seen}),
+            units=sorted({s.meta.unit_id for s in seen}),
+            virtual=any(s.meta.virtual for s in seen),
+            dataset_hash=dataset_hash(self.dataset.entries),
+            hours=round(sum(s.duration for s in seen) / 3600, 3),
+            motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
+            val_mpjae={"model": self.best, "nominal": self.nominal},
+            sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
+            seed=self.config.seed,
+            steps=self.steps,
+            seconds=round(self.seconds(), 1),
+            interrupted=self.interrupted,
+            versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch", "rsl-rl-lib")}
+            | {"python": platform.python_version()},
+        )
+
+
+def torch_infer(net: torch.nn.Module) -> Callable[[Array], Array]:
+    """A network as a function of numpy arrays, for validation while training."""
+    net.eval()
+
+    def infer(x: Array) -> Array:
+        with torch.inference_mode():
+            return net(torch.from_numpy(x)).numpy()
+
+    return infer
+
+
+def split_entries(dataset: Dataset, holdout_units: tuple[str, ...] = ()) -> dict[str, list[Entry]]:
+    """Entries per part: the fixed split by motion; units held out appear in the test part only, with its motions."""
+    units = {e.meta.unit_id for e in dataset.entries}
+    strangers = [u for u in holdout_units if u not in units]
+    if strangers:
+        raise UsageError(f"unit '{strangers[0]}' is not in {dataset.path}; it holds {', '.join(sorted(units))}")
+    split = split_by_motion([e.meta.motion for e in dataset.entries])
+    parts = {
+        part: [
+            e for e in dataset.entries
+            if e.meta.motion in getattr(split, part) and (part == "test" or e.meta.unit_id not in holdout_units)
+        ]
+        for part in ("train", "val", "test")
+    }  # fmt: skip
+    for part, entries in parts.items():
+        if not entries:
+            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {', '.join(holdout_units)}")
+    return parts
+
+
+def dataset_hash(entries: list[Entry]) -> str:
+    """Identity of a set of recordings, in any order; 12 hex digits."""
+    return hashlib.sha256("".join(sorted(e.hash for e in entries)).encode()).hexdigest()[:12]

@@ -1,0 +1,79 @@
+"""Fit the sensor predictor to what the simulator really answers, at visited and at random states."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaponet.model.deeponet import OperatorNet
+from gaponet.model.sensor import ProbeOracle
+from gaponet.robot import RobotSpec
+from gaponet.sim.batch import Condition
+
+Array = np.ndarray
+
+STATES = 4096
+STEPS = 800
+BATCH = 256
+POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: half of the states are moved off the recorded ones by these
+
+
+def sensor_labels(
+    net: OperatorNet, robot: RobotSpec, x: Array, qpos: Array, qvel: Array, conditions: list[Condition], seed: int
+) -> tuple[Tensor, Tensor]:
+    """Standardised features and oracle answers for states the policy visited, half of them perturbed.
+
+    Args:
+        net: Its config says the probes.
+        robot: The simulator asked.
+        x: [o_t | a_t] at those states, (k, dim).
+        qpos, qvel: All joints, (k, n_all).
+        conditions: Payload and period of each state.
+        seed: Of the perturbations.
+    """
+    rng = np.random.default_rng(seed)
+    op, n = robot.operated_index, net.n
+    q, v, x = qpos.copy(), qvel.copy(), x.copy()
+    noisy = rng.random(len(q)) < 0.5
+    q[np.ix_(noisy, op)] += rng.normal(0, POSITION_NOISE, (noisy.sum(), n))
+    v[np.ix_(noisy, op)] += rng.normal(0, VELOCITY_NOISE, (noisy.sum(), n))
+    x[:, :n], x[:, n : 2 * n] = q[:, op], v[:, op]
+    answers = ProbeOracle(robot, net.config, conditions)(q, v)
+    with torch.inference_mode():
+        features = net.features(torch.from_numpy(x.astype(np.float32)))
+    return features.clone(), torch.from_numpy(answers.reshape(len(q), -1))
+
+
+def fit_predictor(net: OperatorNet, features: Tensor, answers: Tensor, seed: int) -> float:
+    """Gaussian likelihood on three quarters of the states; returns R² on the rest, averaged over sensor values.
+
+    The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
+    """
+    predictor = net.predictor
+    assert predictor is not None
+    generator = torch.Generator().manual_seed(seed)
+    held = len(features) // 4
+    train_x, train_s = features[held:], answers[held:]
+    predictor.outputs.fit(train_s, floor=1e-6)
+    target = predictor.outputs(train_s)
+    parameters = list(predictor.parameters())
+    for p in parameters:
+        p.requires_grad_(True)
+    optimiser = torch.optim.Adam(parameters, lr=1e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
+    for _ in range(STEPS):
+        batch = torch.randint(0, len(train_x), (BATCH,), generator=generator)
+        mean, log_var = predictor(train_x[batch])
+        loss = 0.5 * ((mean - target[batch]) ** 2 * (-log_var).exp() + log_var).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    for p in parameters:
+        p.requires_grad_(False)
+    with torch.inference_mode():
+        truth = predictor.outputs(answers[:held])
+        residual = ((predictor(features[:held])[0] - truth) ** 2).mean(0)
+        spread = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
+        return float((1 - residual / spread).mean())
