@@ -12,7 +12,9 @@ from gaponet.cli.progress import bar
 from gaponet.robot import RobotSpec, load_robot
 
 
-def pair(dataset: tyro.conf.Positional[Path], robot: str | None = None, json: tyro.conf.FlagCreatePairsOff[bool] = False) -> None:
+def pair(
+    dataset: tyro.conf.Positional[Path], robot: str | None = None, json: tyro.conf.FlagCreatePairsOff[bool] = False
+) -> None:
     """Replay every sequence in the nominal simulator and keep the twin beside it.
 
     Args:
@@ -97,7 +99,7 @@ def show_methods(out: Out, result: dict[str, Any], robot: RobotSpec) -> None:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """"a, b" → ("a", "b")."""
+    """ "a, b" → ("a", "b")."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 

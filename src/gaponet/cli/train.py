@@ -57,7 +57,9 @@ def train(
         + (" (interrupted)" if card["interrupted"] else "")
     )
     screen.say(f"model in {trained.path}; next: gaponet eval {out} {dataset}; gaponet report {out}")
-    screen.result({k: card[k] for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "interrupted", "parity_rad", "seed")})
+    screen.result(
+        {k: card[k] for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "interrupted", "parity_rad", "seed")}
+    )
 
 
 def run_training(

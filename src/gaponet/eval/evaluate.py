@@ -1,4 +1,4 @@
-"""Nominal, delay + offset, MLP and GAPONet side by side: free runs with the shipped artifact (onnxruntime, not torch)."""
+"""Nominal, delay + offset, MLP and GAPONet side by side: free runs with the shipped artifact (ONNX, not torch)."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
+SHOWN = 8  # sequences whose trajectories are kept for the report
 ORDER = ("nominal", "delay_offset", "mlp", "gaponet")  # of tables and figures
 
 
@@ -48,11 +50,11 @@ def evaluate(
         runs_dirs: Training runs; the first one's split and delay + offset baseline apply.
         dataset: The one trained on, or another.
         robot: The nominal simulator.
-        motions: Only these; default: the test motions of the dataset trained on, everything never trained on of another.
+        motions: Only these; default: the test motions of the dataset trained on, all that was never trained on of another.
         progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)
-    models = {}
+    models: dict[str, GapModel] = {}
     for path in runs_dirs:
         model = GapModel.load(path)
         if model.config.kind in models:
@@ -62,9 +64,10 @@ def evaluate(
     sequences = dataset.sequences(entries)
     for model, dt in itertools.product(models.values(), sorted({s.dt for s in sequences})):
         model.require(robot, dt)
-    done_runs, deltas = {}, {}
+    done_runs: dict[str, list[Run]] = {}
+    deltas: dict[str, list[Array]] = {}
     for name, corrector in _methods(runs_dirs[0], models, robot):
-        twins = replay(sequences, robot, corrector, progress=lambda k, n, name=name: progress(name, k, n))
+        twins = replay(sequences, robot, corrector, progress=partial(progress, name))
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             op = robot.operated_index
@@ -95,7 +98,9 @@ def choose(run: Path, dataset: Dataset, motions: tuple[str, ...]) -> tuple[list[
         test = set(split["test"].values())
         entries = [e for e in dataset.entries if e.hash in test] or [e for e in dataset.entries if e.hash not in known]
     if not entries:
-        raise DatasetError(f"{dataset.path}: every sequence was used in training; give logs the run never saw, or --motions")
+        raise DatasetError(
+            f"{dataset.path}: every sequence was used in training; give logs the run never saw, or --motions"
+        )
     return entries, not any(e.hash in known for e in entries)
 
 
@@ -109,10 +114,29 @@ def read_split(run: Path) -> dict[str, dict[str, str]]:
 
 
 def save(evaluation: Evaluation, run: Path) -> None:
-    """metrics.json in the run folder: the newest evaluation."""
+    """metrics.json and trajectories.npz in the run folder: the newest evaluation, all that the report needs."""
     from gaponet.cli.out import finite
 
-    write_text(run / "metrics.json", json.dumps(finite(evaluation.result), indent=1, ensure_ascii=False) + "\n")
+    reals = evaluation.runs["nominal"]
+    picked = sorted({round(i) for i in np.linspace(0, len(reals) - 1, min(SHOWN, len(reals)))})
+    shown = [reals[i].real.meta for i in picked]
+    result = evaluation.result | {
+        "shown": [
+            {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].real.dt}
+            for i, m in zip(picked, shown, strict=True)
+        ]
+    }
+    arrays = {}
+    for row, i in enumerate(picked):
+        arrays[f"{row}/recorded"] = reals[i].qpos_real
+        for name, part in evaluation.runs.items():
+            arrays[f"{row}/{name}"] = part[i].qpos_sim
+        for name, delta in evaluation.deltas.items():
+            arrays[f"{row}/delta/{name}"] = delta[i]
+    temporary = run / ".trajectories.npz"
+    np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})
+    temporary.replace(run / "trajectories.npz")
+    write_text(run / "metrics.json", json.dumps(finite(result), indent=1, ensure_ascii=False) + "\n")
 
 
 def _methods(run: Path, models: dict[str, GapModel], robot: RobotSpec) -> Iterator[tuple[str, Corrector | None]]:

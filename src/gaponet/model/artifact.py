@@ -53,6 +53,7 @@ def infer_session(path: Path) -> Infer:
     """An ONNX file as a function of numpy arrays, on one thread."""
     try:
         import onnxruntime as ort
+        from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
     except ImportError:
         raise ModelError("onnxruntime is not installed; run: pip install 'gaponet[deploy]'") from None
     options = ort.SessionOptions()
@@ -60,8 +61,10 @@ def infer_session(path: Path) -> Infer:
     options.log_severity_level = 3
     try:
         session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except (RuntimeError, ValueError) as error:
-        raise ModelError(f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again") from None
+    except (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.Fail, ort_errors.NoSuchFile) as error:
+        raise ModelError(
+            f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
+        ) from None
     return lambda x: session.run(None, {"x": x})[0]
 
 
@@ -93,7 +96,7 @@ class GapModel:
         try:
             card = json.loads((folder / CARD).read_text(encoding="utf-8"))
             known = {f.name for f in fields(ModelConfig)}
-            shape = {k: tuple(v) if isinstance(v, list) else v for k, v in card["model"].items()}
+            shape: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in card["model"].items()}
             version = int(card["format"])
         except (json.JSONDecodeError, KeyError, ValueError, AttributeError) as error:
             raise ModelError(f"{folder / CARD}: damaged ({error}); restore it or train again") from None

@@ -13,13 +13,17 @@ from torch import Tensor, nn
 from gaponet.model.config import ModelConfig
 
 
-def dense(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
-    """Linear layers with ELU between."""
+def dense(inputs: int, hidden: Sequence[int], outputs: int, last: float | None = None) -> nn.Sequential:
+    """Linear layers with ELU between; the last one starts within ±`last` where that is given."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(inputs, width), nn.ELU()]
         inputs = width
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+    head = nn.Linear(inputs, outputs)
+    if last is not None:
+        nn.init.uniform_(head.weight, -last, last)
+        nn.init.uniform_(head.bias, -last, last)
+    return nn.Sequential(*layers, head)
 
 
 class Standardise(nn.Module):
@@ -65,7 +69,8 @@ class Features(nn.Module):
         return torch.cat([q, v, past, rest, action - q], dim=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.standardise(self.relative(x))
+        """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
+        return self.standardise(self.relative(x)).clamp(-5.0, 5.0)
 
 
 class SensorPredictor(nn.Module):
@@ -107,9 +112,7 @@ class OperatorNet(nn.Module):
         self.sees_observation = seen > 0
         self.branch = dense(sensed + seen, config.branch_hidden, n * config.num_basis)
         self.query_dim = 2 * n + int(config.payload_input)
-        self.trunk = dense(self.query_dim, config.trunk_hidden, n * config.num_basis)
-        nn.init.uniform_(self.trunk[-1].weight, -0.003, 0.003)
-        nn.init.uniform_(self.trunk[-1].bias, -0.003, 0.003)
+        self.trunk = dense(self.query_dim, config.trunk_hidden, n * config.num_basis, last=0.003)
         self.bias = nn.Parameter(torch.zeros(n))
         self.bounded = Bounded(config.delta_max)
         # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is unsure
@@ -144,9 +147,7 @@ class DeltaMLP(nn.Module):
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
-        self.net = dense(self.features.dim, config.mlp_hidden, n)
-        nn.init.uniform_(self.net[-1].weight, -0.003, 0.003)
-        nn.init.zeros_(self.net[-1].bias)
+        self.net = dense(self.features.dim, config.mlp_hidden, n, last=0.003)
         self.bounded = Bounded(config.delta_max)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -49,7 +49,9 @@ def export(net: OperatorNet | DeltaMLP, folder: Path, card: dict[str, Any], samp
         with torch.inference_mode():
             difference = float(np.abs(frozen(torch.from_numpy(samples)).numpy() - answer).max())
         if not difference <= PARITY:
-            raise ModelError(f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written")
+            raise ModelError(
+                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written"
+            )
         temporary.replace(folder / WEIGHTS)
         write_card(folder / CARD, card | {"parity_rad": difference})
     finally:

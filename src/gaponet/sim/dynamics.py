@@ -5,7 +5,13 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import build_model
+
 Array = np.ndarray
+
+CUTOFF = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 
 
 def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
@@ -34,3 +40,24 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
     """Torque that holds each posture still, (T, n), N·m."""
     zero = np.zeros_like(qpos)
     return inverse_dynamics(model, qpos, zero, zero)
+
+
+def equivalent_torque(
+    robot: RobotSpec, qpos: Array, dt: float, payload_mass: float, payload_side: str = "both", cutoff: float = CUTOFF
+) -> tuple[Array, Array]:
+    """What the nominal, payload-carrying model would have needed to move as recorded.
+
+    Args:
+        robot: The nominal model.
+        qpos: Recorded, (T, n) rad.
+        dt: s.
+        payload_mass, payload_side: kg in each hand named.
+        cutoff: Of the zero-phase filter before differentiating, Hz.
+
+    Returns:
+        Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.
+    """
+    smooth = lowpass(qpos.astype(float), dt, cutoff)
+    qvel = differentiate(smooth, dt)
+    qacc = differentiate(qvel, dt)
+    return inverse_dynamics(build_model(robot, payload_mass, payload_side, dt), smooth, qvel, qacc), qacc

@@ -24,6 +24,7 @@ def build_model(
     payload_mass: float = 0.0,
     payload_side: str = "both",
     dt: float | None = None,
+    locked: tuple[str, ...] = (),
 ) -> mujoco.MjModel:
     """The nominal simulator of a robot with a payload.
 
@@ -35,6 +36,8 @@ def build_model(
         payload_mass: Mass in each hand named by `payload_side`, kg.
         payload_side: "both" (every mount), or the side of one mount.
         dt: Control period, s; default robot.dt.
+        locked: Joints clamped at home; the model has no degree of freedom for them. On a fixed base, limbs that stand
+            still cost time and change nothing (`idle_joints` finds them).
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
@@ -45,26 +48,43 @@ def build_model(
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
-    _add_actuators(spec, robot)
+    _lock(spec, robot, locked)
+    _add_actuators(spec, robot, locked)
     _add_payload(spec, robot, payload_mass, payload_side)
     try:
         model = spec.compile()
     except ValueError as error:
         raise RobotError(f"{robot.mjcf}: does not compile: {' '.join(str(error).split())}") from None
-    if model.nq != model.nv or model.nq != len(robot.joint_names):
+    if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         known = {j.name for j in spec.joints}
         raise RobotError(
             f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
             f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
         )
-    if not np.array_equal(qpos_address(model, robot), np.arange(model.nq)):
+    if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
         raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
     return model
 
 
-def qpos_address(model: mujoco.MjModel, robot: RobotSpec) -> np.ndarray:
-    """Index of each of the robot's joints in qpos, (n,)."""
-    return np.array([model.joint(name).qposadr[0] for name in robot.joint_names])
+def qpos_address(model: mujoco.MjModel, robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:
+    """Index of each of the robot's free joints in qpos, (n − locked,)."""
+    return np.array([model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked])
+
+
+def idle_joints(robot: RobotSpec, moved: tuple[str, ...]) -> tuple[str, ...]:
+    """Joints of the limbs on which no joint moves: with a fixed base they share no dynamics with the rest.
+
+    Args:
+        robot: The robot.
+        moved: Names of the joints that a command moves, or holds away from home.
+
+    Returns:
+        Names in the robot's order, to be given to build_model as `locked`.
+    """
+    model = build_model(robot)
+    limb = {name: int(model.dof_treeid[model.joint(name).dofadr[0]]) for name in robot.joint_names}
+    busy = {limb[name] for name in moved}
+    return tuple(name for name in robot.joint_names if limb[name] not in busy)
 
 
 def qpos_range(model: mujoco.MjModel) -> np.ndarray:
@@ -101,10 +121,25 @@ def _read(robot: RobotSpec) -> mujoco.MjSpec:
     return spec
 
 
-def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
+    for name in locked:
+        joint = spec.joint(name)
+        angle = robot.qpos_home[robot.joint_names.index(name)]
+        turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
+        mujoco.mju_axisAngle2Quat(turn, np.array(joint.axis), angle)
+        mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
+        mujoco.mju_rotVecQuat(offset, np.array(joint.pos) - offset, np.array(joint.parent.quat))
+        mujoco.mju_mulQuat(quat, np.array(joint.parent.quat), turn)
+        joint.parent.pos, joint.parent.quat = np.array(joint.parent.pos) + offset, quat
+        spec.delete(joint)
+
+
+def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for name, kp, kd, limit in zip(robot.joint_names, robot.kp, robot.kd, robot.effort_limit, strict=True):
+        if name in locked:
+            continue
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=kp, kv=kd)
         actuator.forcelimited = True

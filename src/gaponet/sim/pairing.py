@@ -21,9 +21,12 @@ def pair_dataset(dataset: Dataset, robot: RobotSpec, progress: Progress | None =
     total, done = sum(e.rows - 1 for e in todo), 0
     for start in range(0, len(todo), BATCH):
         part = todo[start : start + BATCH]
-        twins = replay(
-            dataset.sequences(part), robot, progress=lambda k, _, d=done: progress and progress(d + k, total)
-        )
+
+        def tell(k: int, of: int, before: int = done) -> None:
+            if progress is not None:
+                progress(before + k, total)
+
+        twins = replay(dataset.sequences(part), robot, progress=tell)
         for entry, twin in zip(part, twins, strict=True):
             dataset.write_twin(entry, twin)
         done += sum(e.rows - 1 for e in part)

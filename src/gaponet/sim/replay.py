@@ -49,10 +49,16 @@ def replay(
     """
     order = sorted(range(len(sequences)), key=lambda i: -len(sequences[i]))
     total = sum(len(s) - 1 for s in sequences)
-    done, twins = 0, {}
+    done = 0
+    twins: dict[int, Twin] = {}
     for chunk in _chunks(order, 256):
         part = [sequences[i] for i in chunk]
-        runs = _free_run(part, robot, corrector, nthread, lambda k, d=done: progress and progress(d + k, total))
+
+        def tell(k: int, before: int = done) -> None:
+            if progress is not None:
+                progress(before + k, total)
+
+        runs = _free_run(part, robot, corrector, nthread, tell)
         twins |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [twins[i] for i in range(len(sequences))]
@@ -69,7 +75,7 @@ def _free_run(
     robot: RobotSpec,
     corrector: Corrector | None,
     nthread: int,
-    progress: Callable[[int], object],
+    progress: Callable[[int], None],
 ) -> list[Twin]:
     """Sequences in order of falling length: those still running are always a prefix."""
     lengths = np.array([len(s) for s in sequences])

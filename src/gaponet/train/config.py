@@ -31,6 +31,8 @@ class WarmStartConfig:
     """Simulations per round."""
     steps: int = 400
     """Control periods per round."""
+    disturbance: float = 0.01
+    """Noise on the applied corrections, white and slow, σ in rad."""
     batch_size: int = 2048
     """Samples per gradient step."""
     gradient_steps: int = 300

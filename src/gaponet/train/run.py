@@ -1,8 +1,8 @@
 """One training run, start to artifact: split, sensors, warm start, PPO, the best model on validation, export.
 
-    RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
-    RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
-    RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
+RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
+RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
+RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
 """
 
 from __future__ import annotations
@@ -83,7 +83,14 @@ class Trainer:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
             raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
-        self.dataset, self.robot, self.out, self.config, self.budget, self.show = dataset, robot, out, config, budget, show
+        self.dataset, self.robot, self.out, self.config, self.budget, self.show = (
+            dataset,
+            robot,
+            out,
+            config,
+            budget,
+            show,
+        )
         self.parts = split_entries(dataset, holdout_units)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(self.train_set, self.val_set, dataset.sequences(self.parts["test"]))
@@ -178,7 +185,9 @@ class Trainer:
         net = build_network(self.config.model, self.n)
         net.load_state_dict(self.best_state)
         net.eval()
-        env = DeltaEnv(self.train_set, self.robot, self.config.model, max(64, len(self._conditions())), 10, self.config.reward)
+        env = DeltaEnv(
+            self.train_set, self.robot, self.config.model, max(64, len(self._conditions())), 10, self.config.reward
+        )
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
         return GapModel.load(self.out)
 
@@ -246,7 +255,7 @@ class Trainer:
         self.out.mkdir(parents=True, exist_ok=True)
         config = asdict(self.config) | {
             "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
-            "dataset": self.dataset.path.name, "dataset_hash": dataset_hash(self.dataset.entries),
+            "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}

@@ -43,6 +43,7 @@ class WarmStart:
         env.reset()
         net.eval()
         xs, ys = [], []
+        disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
         for _ in range(self.config.steps):
             x = env.get_observations()["actor"]
             y = self.labels[env.row]
@@ -53,12 +54,25 @@ class WarmStart:
             else:
                 with torch.inference_mode():
                     delta = net(x).numpy()
-            env.advance(delta)
+            env.advance(delta + self._disturb(disturbance))
             ended = np.flatnonzero(env.row >= env.last)
             if ended.size:
                 env.reset(ended)
         self.pool_x.append(torch.cat(xs))
         self.pool_y.append(torch.cat(ys))
+
+    def _disturb(self, slow: Array) -> Array:
+        """Noise on the applied correction, white plus slow steps (updated in place); a quarter of the robots has none.
+
+        A policy that sees its own past targets can learn to lean on them; disturbed, it learns what the label is
+        whatever they were, and does not amplify its own noise on poses that it has not seen.
+        """
+        sigma, rng, shape = self.config.disturbance, self.env.rng, slow.shape
+        change = rng.random(shape) < 0.02
+        slow[change] = rng.normal(0, sigma, change.sum())
+        noise = slow + rng.normal(0, sigma, shape).astype(np.float32)
+        noise[: len(noise) // 4] = 0.0
+        return noise
 
     def round(self, tick: Callable[[], None]) -> float:
         """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad."""
@@ -89,7 +103,10 @@ class WarmStart:
 def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int) -> float:
     """Standardise on the environment's recorded start states, fit the predictor there; returns held-out R²."""
     rng = np.random.default_rng(seed)
-    xs, qs, vs, groups = [], [], [], []
+    xs: list[Array] = []
+    qs: list[Array] = []
+    vs: list[Array] = []
+    groups: list[Array] = []
     while sum(map(len, xs)) < STATES:
         env.reset()
         xs.append(env.get_observations()["actor"].numpy())

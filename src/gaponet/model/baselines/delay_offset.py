@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -67,18 +67,14 @@ def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FR
     cut = []
     for s in sequences:
         rows = round(seconds / s.dt)
-        for start in range(0, max(len(s) - rows // 2, 1), rows):
-            part = slice(start, start + rows)
-            cut.append(replace(s, **{
-                name: None if value is None else value[part]
-                for name in ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
-                for value in [getattr(s, name)]
-            }))  # fmt: skip
-    keep = max(1, round(len(cut) * sum(map(len, cut)) / max(frames, 1) / len(cut)))
-    return cut[::keep]
+        for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
+            cut.append(s.rows(slice(start, start + rows)))
+    return cut[:: max(1, round(sum(map(len, cut)) / frames))]
 
 
-def fit(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None) -> DelayOffset:
+def fit(
+    sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None
+) -> DelayOffset:
     """Try every whole-step delay on all joints at once; per joint keep the one with the least error after its offset.
 
     Joints are fitted as if alone; their coupling is small beside delay and sag.

@@ -1,0 +1,37 @@
+# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Two pools of busy-waiting threads on two cores cost a factor of five.
+export OMP_WAIT_POLICY := PASSIVE
+
+.PHONY: setup demo test check clean
+
+setup: $(VENV)/.done
+
+# torch first and alone, pinned: a CPU build where one can be found, so that nothing pulls gigabytes of CUDA.
+# For a GPU: make setup TORCH="torch==2.13.0"
+TORCH ?= torch==2.13.0+cpu
+$(VENV)/.done: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -c "import torch" 2>/dev/null || PIP_CONSTRAINT= $(BIN)/pip install -q "$(TORCH)" 2>/dev/null \
+	  || PIP_CONSTRAINT= $(BIN)/pip install -q "torch==2.13.0" --index-url https://download.pytorch.org/whl/cpu 2>/dev/null \
+	  || PIP_CONSTRAINT= $(BIN)/pip install -q "torch==2.13.0"
+	$(BIN)/pip install -q -e ".[dev]"
+	touch $@
+
+demo: setup
+	$(BIN)/gaponet demo
+
+test: setup
+	$(BIN)/python -m pytest
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf $(VENV) demo_run .pytest_cache .ruff_cache .mypy_cache

@@ -1,0 +1,82 @@
+"""gaponet demo: logs → dataset → gap → training → evaluation → report, in one command."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+
+import tyro
+
+from gaponet.cli.gap import gap
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+from gaponet.cli.train import evaluate, run_training
+from gaponet.errors import UsageError
+from gaponet.model.config import ModelConfig
+from gaponet.robot import load_robot
+from gaponet.train.config import TrainConfig
+
+
+def demo(
+    data: Path | None = None,
+    robot: str = "h1_2",
+    out: Path = Path("demo_run"),
+    budget: str = "150s",
+    mlp_budget: str = "75s",
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Show the whole way in minutes: on your logs, or on an embedded VIRTUAL robot where there are none.
+
+    Args:
+        data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
+        robot: Robot name or folder.
+        out: Folder for dataset, runs and report; an earlier demo's there is replaced.
+        budget: Training time of GAPONet.
+        mlp_budget: Training time of the MLP baseline.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.store import Dataset
+    from gaponet.eval.report import write_report
+
+    screen, began = Out(json), time.monotonic()
+    _clear(out)
+    holdout = _make_dataset(out / "dataset", data, robot, screen)
+    dataset = Dataset(out / "dataset")
+    gap(out / "dataset", robot)
+    for config, limit in ((TrainConfig(), budget), (TrainConfig(model=ModelConfig(kind="mlp")), mlp_budget)):
+        run_training(dataset, robot, out / config.model.kind, config, limit, False, holdout)
+    evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
+    with bar("report") as update:
+        path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))
+    screen.say(f"\nreport: [bold]{path}[/]  ({time.monotonic() - began:.0f} s in all)")
+
+
+def _clear(out: Path) -> None:
+    """Remove an earlier demo; refuse a folder that is something else."""
+    if not out.exists():
+        return
+    strangers = {p.name for p in out.iterdir()} - {"dataset", "gaponet", "mlp"}
+    if strangers:
+        raise UsageError(
+            f"{out}: holds {', '.join(sorted(strangers)[:3])}, so it is no earlier demo; choose another --out"
+        )
+    shutil.rmtree(out)
+
+
+def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
+    """Import logs or collect from the virtual fleet; returns the units to hold out of training."""
+    if data is not None:
+        from gaponet.cli.data import import_logs
+
+        import_logs(data, robot, unit_id="lab", payload_mass=0.0, out=path)
+        return ()
+    if load_robot(robot).name != "h1_2":
+        raise UsageError(f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR")
+    from gaponet.cli.collect import collect
+
+    screen.say(
+        "No --data given: collecting from [bold]VIRTUAL[/] H1-2 robots; nothing below says anything about real ones."
+    )
+    collect(robot=robot, fleet="default", recipe="demo", out=path)
+    return ("virtual-4",)

@@ -1,0 +1,269 @@
+"""One self-contained offline HTML page about a run: what was trained on what, how well it does, what to beware of."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.data.store import Dataset, write_text
+from gaponet.errors import DatasetError, ModelError
+from gaponet.model.artifact import GapModel
+from gaponet.robot import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = np.ndarray
+Tell = Callable[[str, float, float], None]
+
+CSS = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 1080px; margin: 2rem auto; padding: 0 1rem }
+h1 { font-size: 1.7rem; margin-bottom: .2rem }
+h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+table { border-collapse: collapse; margin: .6rem 0 }
+th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #eee }
+th { background: #fafafa }
+th:first-child, td:first-child, .facts td { text-align: left; vertical-align: top }
+.facts td:first-child { color: #666; white-space: nowrap }
+tr.best td { font-weight: 600 }
+.tag { display: inline-block; padding: .1rem .6rem; border-radius: 1rem; color: #fff; font: 600 .85rem system-ui }
+.real { background: #1b7f3b }
+.virtual { background: #7b3fa0 }
+.warn { background: #fff4e0; border-left: 4px solid #d99000; padding: .4rem .8rem; margin: .3rem 0 }
+.lead { font-size: 1.1rem }
+.row { display: flex; flex-wrap: wrap; gap: 1rem }
+figure { margin: 1rem 0 }
+figcaption { color: #666; font-size: .88rem }
+svg, img { max-width: 100%; height: auto }
+code { background: #f4f4f4; padding: 0 .25rem }
+"""
+
+
+def write_report(
+    run: Path,
+    dataset: Path | None = None,
+    also: tuple[Path, ...] = (),
+    robot: str | None = None,
+    progress: Tell = lambda what, done, total: None,
+) -> Path:
+    """Write RUN/report.html from the run's newest evaluation, evaluating first where there is none.
+
+    Args:
+        run: Run folder.
+        dataset: Evaluate on this dataset first; default the newest evaluation, or the test motions of the training set.
+        also: Further runs to compare (only when evaluating).
+        robot: Robot name or folder, if not the package's.
+        progress: Called with what is being done.
+    """
+    model = GapModel.load(run)
+    spec = load_robot(robot or model.card["robot"])
+    if dataset is not None or also or not (run / "trajectories.npz").is_file():
+        _evaluate(run, dataset, also, spec, progress)
+    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
+    with np.load(run / "trajectories.npz") as file:
+        arrays = {k: file[k] for k in file.files}
+    config = _json(run / "config.json")
+    lines = (run / "progress.jsonl").read_text(encoding="utf-8").splitlines()
+    curve = [json.loads(line) for line in lines if line.strip()]
+    progress("drawing", 0, 1)
+    page = _page(model.card, config, metrics, arrays, curve, spec)
+    path = run / "report.html"
+    write_text(path, page)
+    progress("drawing", 1, 1)
+    return path
+
+
+def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec, progress: Tell) -> None:
+    from gaponet.eval.evaluate import evaluate, save
+
+    place = dataset or run / _json(run / "config.json")["dataset"]
+    try:
+        data = Dataset(place)
+    except DatasetError as error:
+        raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
+    save(evaluate([run, *also], data, robot, progress=progress), run)
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, json.JSONDecodeError) as error:
+        raise ModelError(f"{path}: cannot be read ({error}); give a complete run folder of gaponet train") from None
+
+
+def _page(
+    card: dict[str, Any],
+    config: dict[str, Any],
+    metrics: dict[str, Any],
+    arrays: dict[str, Array],
+    curve: list[dict[str, Any]],
+    robot: RobotSpec,
+) -> str:
+    from gaponet.eval import figures as draw
+
+    methods, kind = metrics["methods"], card["model"]["kind"]
+    name = draw.NAMES[kind]
+    tag = (
+        '<span class="tag virtual">VIRTUAL robot</span>'
+        if metrics["virtual"]
+        else '<span class="tag real">real robot</span>'
+    )
+    ratio = metrics["ratio_to_nominal"]
+    body = [
+        f"<h1>{html.escape(robot.description)}: {name}</h1><p>{tag} {_facts_line(card, metrics)}</p>",
+        f'<p class="lead">{_verdict(name, kind, methods, ratio)}</p>',
+        *(f'<div class="warn">{html.escape(text)}</div>' for text in warnings(card, metrics)),
+        "<h2>Errors, whole-motion free run on held-out recordings</h2>" if metrics["unseen"]
+        else "<h2>Errors, whole-motion free run (some recordings were used in training)</h2>",
+        _totals(methods, draw.NAMES, ratio),
+        '<div class="row">', _figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+        _figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
+    ]  # fmt: skip
+    if len(methods["nominal"]["by_payload"]) > 1:
+        body.append(_figure(draw.by_payload(methods), "Payload in each hand."))
+    body += ["</div>", "<h2>Trajectories</h2>"]
+    for row, shown in enumerate(metrics["shown"]):
+        errors = np.abs(arrays[f"{row}/nominal"] - arrays[f"{row}/recorded"]).mean(axis=0)
+        worst = sorted(np.argsort(-errors)[:3].tolist())
+        fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(methods), shown["dt"])
+        unit = f"unit {shown['unit_id']}, {shown['payload_mass']:g} kg"
+        body.append(_figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({html.escape(unit)}): the 20 s with most motion, "
+                                 "the three joints with the largest nominal error; Δa is the learned correction."))  # fmt: skip
+    body += [
+        "<h2>Training</h2>", '<div class="row">',
+        _figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
+        _training_table(card, config), "</div>",
+        "<h2>By motion</h2>", _by_motion(methods, draw.NAMES),
+        "<h2>What exactly</h2>", _facts(card, metrics),
+    ]  # fmt: skip
+    title = f"{robot.name} {name}"
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f"<style>{CSS}</style></head><body>{''.join(body)}</body></html>\n"
+    )
+
+
+def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
+    """What a careful colleague would say about these numbers."""
+    out, methods, kind = [], metrics["methods"], card["model"]["kind"]
+    own = methods[kind]["mpjae"]
+    if metrics["virtual"]:
+        out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
+    if not metrics["unseen"]:
+        out.append("Some recordings were used in training or for choosing the model: not a held-out result.")
+    for other in ("nominal", "delay_offset", "mlp"):
+        if other in methods and other != kind and own >= methods[other]["mpjae"]:
+            out.append(f"The model does not beat {other.replace('_', ' + ')}: do not deploy it.")
+    seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
+    outside = [p for p in asked if not min(seen) <= p <= max(seen)]
+    if outside:
+        out.append(f"Payloads {outside} kg lie outside those trained on ({min(seen):g} to {max(seen):g} kg).")
+    if len(card["units"]) == 1:
+        out.append(
+            f"Trained on one unit ({card['units'][0]}): another unit's zero offsets and friction are unknown to it."
+        )
+    if card.get("interrupted"):
+        out.append("Training was interrupted before its budget was out.")
+    worse = [j for j, m in methods[kind]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
+    if worse:
+        out.append(f"Worse than the nominal simulator on: {', '.join(worse)}.")
+    return out
+
+
+def _verdict(name: str, kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
+    own, base = methods[kind]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
+    change = (1 - ratio[kind]) * 100
+    text = f"{name} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change:.0f} % less error"
+    others = [f"{n} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
+    return text + (f" ({', '.join(o.replace('_', ' + ') for o in others)} mrad)." if others else ".")
+
+
+def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> str:
+    return (
+        f"{metrics['sequences']} recordings, {len(metrics['motions'])} motions; trained {card['hours']:.2f} h of logs, "
+        f"{card['steps']:,} control steps; simulator <code>{metrics['simulator_hash']}</code>, kp "
+        f"{', '.join(f'{v:g}' for v in sorted(set(card['kp'])))} N·m/rad"
+    )
+
+
+def _facts_table(rows: list[list[str]]) -> str:
+    body = "".join(f"<tr><td>{html.escape(k)}</td><td>{html.escape(v)}</td></tr>" for k, v in rows)
+    return f'<table class="facts">{body}</table>'
+
+
+def _table(head: list[str], rows: list[list[str]], best: int | None = None) -> str:
+    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
+    body = "".join(
+        f"<tr{' class=best' if i == best else ''}>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>"
+        for i, row in enumerate(rows)
+    )
+    return f"<table><tr>{cells}</tr>{body}</table>"
+
+
+def _totals(methods: dict[str, Any], names: dict[str, str], ratio: dict[str, float]) -> str:
+    head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static, mrad", "dynamic, mrad",
+            "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
+    rows = [
+        [names[n], f"{m['mpjae'] * 1e3:.2f}", f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['q_dis']:.3f}",
+         f"{m['static'] * 1e3:.2f}", f"{m['dynamic'] * 1e3:.2f}", f"{m['large_0.05'] * 100:.1f} %",
+         f"{m['large_0.1'] * 100:.2f} %", f"{m['correlation']:.4f}"]
+        for n, m in methods.items()
+    ]  # fmt: skip
+    return _table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
+
+
+def _by_motion(methods: dict[str, Any], names: dict[str, str]) -> str:
+    head = ["motion, MPJAE in mrad", *(names[n] for n in methods)]
+    keys = methods["nominal"]["by_motion"]
+    return _table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
+
+
+def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
+    r2 = card.get("sensor_r2")
+    rows = [
+        ["trained on", f"{len(card['motions']['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
+        ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
+        ["validated on", ", ".join(card["motions"]["val"][:6]) + (" …" if len(card["motions"]["val"]) > 6 else "")],
+        ["observation", f"{card['model']['history']} past frames, payload {'in' if card['model']['payload_input'] else 'out'}"],
+        ["sensor predictor R²", "–" if r2 is None else f"{r2:.3f} on held-out states"],
+        ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
+        ["PPO", f"{config['ppo']['num_envs']} environments, {config['ppo']['epochs']} epochs, σ {config['ppo']['init_std']:g} rad"],
+        ["seed", str(card["seed"])],
+        ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
+    ]  # fmt: skip
+    return _facts_table(rows)
+
+
+def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> str:
+    rows = [
+        ["robot, joints", f"{card['robot']}: {', '.join(card['joint_names'])}"],
+        ["simulator", f"{metrics['simulator_hash']}; kp {card['kp']}, kd {card['kd']}"],
+        ["dataset", f"{metrics['dataset']} (trained on {card['dataset_hash']})"],
+        ["rate", ", ".join(f"{1 / dt:.2f} Hz" for dt in card["dt"])],
+        ["largest |Δa|", f"limit {card['model']['delta_max']} rad; seen "
+         + ", ".join(f"{n} {d['max']:.3f}" for n, d in metrics["delta"].items())],
+        ["artifacts", ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in metrics["artifacts"].items())],
+        ["versions", ", ".join(f"{k} {v}" for k, v in card["versions"].items())],
+    ]  # fmt: skip
+    return _facts_table(rows)
+
+
+def _figure(fig: Figure, caption: str) -> str:
+    """Inline SVG where it is small, PNG where a plot has many points."""
+    buffer = io.BytesIO()
+    fig.savefig(buffer, format="svg")
+    data = buffer.getvalue().decode()
+    if len(data) > 400_000:
+        buffer = io.BytesIO()
+        fig.savefig(buffer, format="png", dpi=150)
+        image = f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+    else:
+        image = data[data.index("<svg") :]
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"

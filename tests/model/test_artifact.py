@@ -1,0 +1,94 @@
+"""What ships answers as what was trained, and refuses what it was not made for."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from arm import TOML, recordings, write_arm
+
+from gaponet.errors import ModelError
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import export
+from gaponet.sim.replay import replay
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def artifact(robot, tmp_path_factory):
+    torch.manual_seed(0)
+    config = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+    net = build_network(config, 2)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    folder = tmp_path_factory.mktemp("run") / "model"
+    samples = np.random.default_rng(0).normal(size=(32, config.observation_dim(2) + 2)).astype(np.float32)
+    difference = export(net, folder, make_card(config, robot, dt=[0.02]), samples)
+    return folder, net, samples, difference
+
+
+def test_onnx_equals_torch(artifact):
+    folder, net, samples, difference = artifact
+    assert difference <= 1e-5
+    with torch.inference_mode():
+        expected = net(torch.from_numpy(samples)).numpy()
+    np.testing.assert_allclose(GapModel.load(folder).infer(samples), expected, atol=1e-5)
+
+
+def test_export_refuses_to_write_what_differs(artifact, robot, tmp_path, monkeypatch):
+    _, net, samples, _ = artifact
+    monkeypatch.setattr("gaponet.model.export.PARITY", -1.0)
+    with pytest.raises(ModelError, match="ONNX and torch differ by"):
+        export(net, tmp_path / "out", {}, samples)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_corrected_replay_applies_the_artifacts_corrections(artifact, robot):
+    model = GapModel.load(artifact[0].parent)
+    sequences = recordings(robot, 2, rows=30)
+    twins = replay(sequences, robot, model.corrector(robot))
+    first = np.abs(twins[0].ctrl - sequences[0].ctrl)[:-1]
+    assert 0 < first.max() <= model.config.delta_max + 1e-6
+
+
+def test_another_rate_is_refused(artifact, robot):
+    model = GapModel.load(artifact[0])
+    model.require(robot, 0.02006)  # the clock of a real 50 Hz loop
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 100\.0 Hz"):
+        model.require(robot, 0.01)
+
+
+def test_other_gains_are_refused(artifact, tmp_path):
+    stiff = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
+    with pytest.raises(ModelError, match="gains or limits changed"):
+        GapModel.load(artifact[0]).require(stiff)
+
+
+def test_another_joint_set_is_refused(artifact, robot):
+    with pytest.raises(ModelError, match="made for arm with joints shoulder, elbow"):
+        GapModel.load(artifact[0]).require(dataclasses.replace(robot, operated=("elbow",)))
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "newer", "onnx"])
+def test_a_damaged_artifact_says_what_to_do(artifact, tmp_path, damage):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for file in artifact[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    card = folder / "card.json"
+    if damage == "missing":
+        card.unlink()
+    elif damage == "cut":
+        card.write_text(card.read_text()[:100])
+    elif damage == "newer":
+        card.write_text(json.dumps(json.loads(card.read_text()) | {"format": 99}))
+    else:
+        (folder / "model.onnx").write_bytes(b"nothing")
+    with pytest.raises(ModelError, match=r"give a run folder|restore it|upgrade|train or copy it again"):
+        GapModel.load(folder)

@@ -1,0 +1,61 @@
+"""Networks: shapes, bounds, what they can and cannot see."""
+
+import pytest
+import torch
+
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+
+
+def x(config, n, batch=7, scale=1.0):
+    torch.manual_seed(0)
+    return scale * torch.randn(batch, config.observation_dim(n) + n)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(sensors="off"), ModelConfig(branch_history=False, history=2),
+     ModelConfig(payload_input=False, stride=2)],
+    ids=["gaponet", "mlp", "sensors-off", "sensors-only", "no-payload"],
+)  # fmt: skip
+def test_corrections_are_bounded_whatever_comes_in(config):
+    net = build_network(config, 3)
+    for p in net.parameters():
+        p.data.mul_(5)
+    delta = net(x(config, 3, scale=1e6))
+    assert delta.shape == (7, 3)
+    assert delta.abs().max() <= config.delta_max
+
+
+def test_an_untrained_operator_hardly_corrects():
+    config = ModelConfig()
+    assert build_network(config, 5)(x(config, 5)).abs().max() < 0.05
+
+
+def test_one_branch_net_serves_all_joints_and_the_size_is_the_papers():
+    net = build_network(ModelConfig(payload_input=False), 10)
+    assert net.branch[-1].out_features == 10 * 16
+    assert net.branch[0].in_features == 20 * 2 * 10 + 140
+    assert net.trunk[-1].out_features == 10 * 16
+
+
+def test_features_do_not_change_when_all_positions_shift_but_the_pose_itself():
+    config, n = ModelConfig(payload_input=False), 2
+    features = build_network(config, n).features
+    a = x(config, n)
+    b = a.clone()
+    positions = [0, 1] + [4 + 6 * k + i for k in range(4) for i in (0, 1, 4, 5)] + [-2, -1]
+    b[:, positions] += 0.7
+    difference = (features.relative(b) - features.relative(a)).abs().max(dim=0).values
+    assert torch.allclose(difference[:2], torch.tensor(0.7))
+    assert difference[2:].max() < 1e-5
+
+
+def test_sampling_sensors_changes_the_answer_and_the_mean_does_not():
+    config = ModelConfig()
+    net = build_network(config, 2)
+    torch.nn.init.normal_(net.trunk[-1].weight)
+    data = x(config, 2)
+    assert torch.equal(net(data), net(data))
+    net.sample_sensors = True
+    assert not torch.equal(net(data), net(data))

@@ -1,0 +1,48 @@
+"""Twins: free runs under recorded commands."""
+
+import numpy as np
+from arm import commands, record, recordings, write_arm
+
+from gaponet.data.store import Dataset
+from gaponet.sim.model import model_hash
+from gaponet.sim.pairing import pair_dataset
+from gaponet.sim.replay import replay
+
+
+def test_the_twin_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):
+    robot = write_arm(tmp_path)
+    # Rows are stored as float32; a start that float32 holds exactly starts the twin exactly.
+    sequences = [
+        record(robot, np.round(commands(rows, seed) * 256) / 256, f"m{seed}") for seed, rows in enumerate((60, 90))
+    ]
+    for sequence, twin in zip(sequences, replay(sequences, robot), strict=True):
+        np.testing.assert_array_equal(sequence.qpos, twin.qpos)
+        np.testing.assert_array_equal(sequence.qvel, twin.qvel)
+
+
+def test_sequences_of_any_length_and_payload_run_side_by_side(tmp_path):
+    robot = write_arm(tmp_path)
+    sequences = [record(robot, commands(rows, rows), f"m{rows}", payload=rows / 500) for rows in (40, 120, 80)]
+    together = replay(sequences, robot)
+    for sequence, twin in zip(sequences, together, strict=True):
+        alone = replay([sequence], robot)[0]
+        np.testing.assert_array_equal(twin.qpos, alone.qpos)
+        assert twin.qpos.shape == sequence.qpos.shape
+
+
+def test_the_recording_after_the_first_row_is_not_looked_at(tmp_path):
+    robot = write_arm(tmp_path)
+    weak, strong = (record(robot, commands(50, 3), "m", kp=kp) for kp in (0.5, 2.0))
+    np.testing.assert_array_equal(replay([weak], robot)[0].qpos, replay([strong], robot)[0].qpos)
+
+
+def test_pairing_is_done_once_per_simulator(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    dataset = Dataset.create(tmp_path / "data", robot)
+    for sequence in recordings(robot, 3, kp=0.7):
+        dataset.append(sequence)
+    assert pair_dataset(dataset, robot) == 3
+    assert pair_dataset(dataset, robot) == 0
+    pair = dataset.pair(dataset.entries[0], model_hash(robot))
+    np.testing.assert_array_equal(pair.gap[0], 0)
+    assert np.abs(pair.gap).max() > 0.01

@@ -1,0 +1,82 @@
+"""The training environment against the row convention and the replay."""
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.model.config import ModelConfig
+from gaponet.sim.replay import replay
+from gaponet.train.config import RewardConfig
+from gaponet.train.env import DeltaEnv
+
+
+@pytest.fixture
+def robot(tmp_path):
+    return write_arm(tmp_path)
+
+
+def make(robot, sequences, num_envs=8, steps=1000, **reward):
+    return DeltaEnv(
+        sequences, robot, ModelConfig(history=2), num_envs, steps, RewardConfig(**reward), seed=0, nthread=1
+    )
+
+
+def test_without_correction_the_environment_is_the_replay(robot):
+    sequences = recordings(robot, 2, rows=60, kp=0.6)
+    env = make(robot, sequences)
+    for i in range(env.num_envs):  # put everyone at a motion's first row
+        env.row[i] = env.first[i]
+    env.sim.reset(slice(None), env.qpos[env.row], env.qvel[env.row])
+    first = env.first.copy()
+    for _ in range(59):
+        env.advance(np.zeros((env.num_envs, 2)))
+    twins = replay(sequences, robot)
+    for i in range(env.num_envs):
+        twin = twins[int(np.flatnonzero(env.seq_first == first[i])[0])]
+        np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), twin.qpos[59])
+
+
+def test_the_reward_compares_states_one_row_on(robot):
+    env = make(robot, recordings(robot, 2, rows=60, kp=0.6), velocity=0.0, delta=0.0, delta_rate=0.0)
+    row = env.row.copy()
+    _, reward, dones, _ = env.step(torch.zeros(env.num_envs, 2))
+    alive = ~dones.numpy()
+    error = env.sim.qpos[alive] - env.qpos[row[alive] + 1]
+    np.testing.assert_allclose(reward.numpy()[alive], -32.83 * (error**2).mean(axis=1), rtol=1e-5)
+
+
+def test_a_robot_without_a_gap_earns_no_penalty(robot):
+    env = make(robot, recordings(robot, 2, rows=60))
+    for _ in range(10):
+        _, reward, _, _ = env.step(torch.zeros(env.num_envs, 2))
+    assert reward.min() > -1e-4
+
+
+def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
+    env = make(robot, recordings(robot, 4, rows=60))
+    masses = {env.conditions[g][0] for g in env.group}
+    assert masses == {0.0, 0.2}
+    for i in range(env.num_envs):
+        member = np.flatnonzero(env.seq_first == env.first[i])[0]
+        assert member in env.members[env.group[i]]
+
+
+def test_a_motions_end_is_a_time_out(robot):
+    env = make(robot, recordings(robot, 2, rows=5))
+    seen = 0
+    for _ in range(6):
+        _, _, dones, extras = env.step(torch.zeros(env.num_envs, 2))
+        assert torch.equal(dones, extras["time_outs"])
+        seen += int(dones.sum())
+    assert seen >= env.num_envs
+
+
+def test_the_actor_never_sees_the_recorded_state(robot):
+    sequences = recordings(robot, 2, rows=60, kp=0.6)
+    env = make(robot, sequences)
+    before = env.get_observations()
+    env.qpos = env.qpos + 1.0
+    after = env.get_observations()
+    assert torch.equal(before["actor"], after["actor"])
+    assert not torch.equal(before["critic"], after["critic"])

@@ -1,0 +1,130 @@
+"""Training runs, small: what is kept, what is refused, what survives an interruption."""
+
+import json
+
+import numpy as np
+import pytest
+from arm import recordings, write_arm
+
+from gaponet.data.pair import require_disjoint
+from gaponet.data.store import Dataset
+from gaponet.errors import DatasetError, UsageError
+from gaponet.eval.evaluate import evaluate
+from gaponet.model.config import ModelConfig
+from gaponet.train.budget import Budget
+from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.train.run import Trainer, split_entries
+
+SMALL = TrainConfig(
+    model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
+    warm_start=WarmStartConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
+    ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1),
+    validate_every=4,
+)
+STEPS = Budget(steps=3 * 16 * 60 + 8 * 16 * 16)
+
+
+def dataset(folder, robot, **how):
+    data = Dataset.create(folder, robot)
+    for sequence in recordings(robot, 8, **how):
+        data.append(sequence)
+    return data
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def trained(robot, tmp_path_factory):
+    place = tmp_path_factory.mktemp("trained")
+    data = dataset(place / "data", robot, kp=0.5, delay=2)
+    return data, place / "run", Trainer(data, robot, place / "run", SMALL, STEPS).run()
+
+
+def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(trained, robot):
+    data, run, _ = trained
+    result = evaluate([run], data, robot).result
+    assert result["unseen"]
+    assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
+    assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+def test_the_card_says_what_the_model_is(trained):
+    card = trained[2].card
+    assert card["joint_names"] == ["shoulder", "elbow"]
+    assert card["payload_seen"] == [0.0, 0.2]
+    assert card["virtual"] is True
+    assert card["parity_rad"] <= 1e-5
+    assert card["val_mpjae"]["model"] < card["val_mpjae"]["nominal"]
+
+
+def test_the_kept_model_is_the_best_on_validation(trained):
+    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
+    assert trained[2].card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
+    assert {line["stage"] for line in lines} == {"start", "warm start", "ppo"}
+
+
+def test_parts_of_the_split_share_no_content(trained):
+    parts = split_entries(trained[0])
+    hashes = [{e.hash for e in entries} for entries in parts.values()]
+    assert sum(map(len, hashes)) == len(set().union(*hashes)) == 8
+
+
+def test_one_recording_under_two_names_in_two_parts_is_refused(robot):
+    a, b = recordings(robot, 1), recordings(robot, 1)
+    with pytest.raises(DatasetError, match="two parts of the split"):
+        require_disjoint(a, b)
+
+
+def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):
+    data = dataset(tmp_path / "data", robot)
+    Trainer(data, robot, tmp_path / "run", SMALL, STEPS).run()
+    assert evaluate([tmp_path / "run"], data, robot).result["delta"]["gaponet"]["max"] < 0.005
+
+
+def test_ctrl_c_leaves_a_usable_run_that_resumes(robot, tmp_path):
+    data = dataset(tmp_path / "data", robot, kp=0.5)
+    calls = 0
+
+    def interrupt(status):
+        nonlocal calls
+        calls += status.stage == "warm start"
+        if status.stage == "warm start" and calls == 150:
+            raise KeyboardInterrupt
+
+    model = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, show=interrupt).run()
+    assert model.card["interrupted"]
+    assert np.isfinite(evaluate([tmp_path / "run"], data, robot).result["methods"]["gaponet"]["mpjae"])
+    with pytest.raises(UsageError, match="--resume"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+    again = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, resume=True).run()
+    assert not again.card["interrupted"]
+    assert again.card["steps"] > model.card["steps"]
+    assert again.card["val_mpjae"]["model"] <= model.card["val_mpjae"]["model"]
+
+
+def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for unit, kp in (("a", 0.6), ("b", 0.8)):
+        for sequence in recordings(robot, 6, rows=40, kp=kp, unit=unit):
+            data.append(sequence)
+    parts = split_entries(data, ("b",))
+    assert {e.meta.unit_id for e in parts["train"] + parts["val"]} == {"a"}
+    assert {e.meta.unit_id for e in parts["test"]} == {"a", "b"}
+    with pytest.raises(UsageError, match="unit 'c' is not in"):
+        split_entries(data, ("c",))
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds", "steps"), [("90s", 90, None), ("10m", 600, None), ("2e6", None, 2_000_000)]
+)
+def test_budgets(text, seconds, steps):
+    assert Budget.parse(text) == Budget(seconds, steps)
+
+
+@pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s"])
+def test_a_budget_that_makes_no_sense_is_refused(text):
+    with pytest.raises(UsageError, match="--budget"):
+        Budget.parse(text)
