@@ -29,13 +29,20 @@ def probe_offsets(config: ModelConfig, n: int) -> Array:
 class ProbeOracle:
     """Forks the simulator m times per state. For labels, tests and the upper bound; never used on a robot."""
 
-    def __init__(self, robot: RobotSpec, config: ModelConfig, conditions: list[Condition], nthread: int = 0) -> None:
-        """One state slot per entry of `conditions`."""
+    def __init__(
+        self,
+        robot: RobotSpec,
+        config: ModelConfig,
+        conditions: list[Condition],
+        nthread: int = 0,
+        locked: tuple[str, ...] = (),
+    ) -> None:
+        """One state slot per entry of `conditions`; states are of the joints that are not locked."""
         self.offsets = probe_offsets(config, len(robot.operated))
-        self.operated = robot.operated_index
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
-        self.sim = BatchSim(robot, [c for c in conditions for _ in range(m)], nthread)
+        self.sim = BatchSim(robot, [c for c in conditions for _ in range(m)], nthread, locked)
+        self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
 
     def __call__(self, qpos: Array, qvel: Array) -> Array:
         """Sensor values in delta form.

@@ -20,16 +20,19 @@ class BatchSim:
     loop of mj_step over one MjData each, at any number of threads.
     """
 
-    def __init__(self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0) -> None:
-        """One simulation per entry of `conditions`; nthread 0 uses all cores."""
+    def __init__(
+        self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = ()
+    ) -> None:
+        """One simulation per entry of `conditions`; nthread 0 uses all cores; n counts the joints that are not locked."""
         self.robot = robot
-        self.models = {c: build_model(robot, c[0], c[1], c[2]) for c in dict.fromkeys(conditions)}
+        self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
+        self.models = {c: build_model(robot, c[0], c[1], c[2], locked) for c in dict.fromkeys(conditions)}
         first = self.models[conditions[0]]
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
         if len(self.models) > 1:
             self.batch.set_models([self.models[c] for c in conditions])
         self.num_envs = len(conditions)
-        self.n = len(robot.joint_names)
+        self.n = len(self.joint_names)
         self.qpos: Array = self.batch.bind("qpos")
         self.qvel: Array = self.batch.bind("qvel")
         self.ctrl: Array = self.batch.bind("ctrl")

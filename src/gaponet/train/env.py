@@ -15,6 +15,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.observation import History, frames_before
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
+from gaponet.sim.model import idle_joints
 from gaponet.train.config import RewardConfig
 
 Array = np.ndarray
@@ -46,12 +47,11 @@ class DeltaEnv(VecEnv):
         self.cfg = {"reward": reward, "model": config}
         self.device = "cpu"
         self.num_envs = num_envs
-        self.op = robot.operated_index
-        self.num_actions = len(self.op)
+        self.num_actions = len(robot.operated)
         self.max_episode_length = episode_steps
         self.rng = np.random.default_rng(seed)
         self._load(sequences)
-        self.sim = BatchSim(robot, [self.conditions[g] for g in self.group], nthread)
+        self.sim = BatchSim(robot, [self.conditions[g] for g in self.group], nthread, self.locked)
         self.history = History(config, num_envs, self.num_actions)
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
@@ -62,8 +62,15 @@ class DeltaEnv(VecEnv):
         self.reset()
 
     def _load(self, sequences: ListOf[Sequence]) -> None:
+        # Limbs that no command moves are clamped: on a fixed base they change nothing but the time it takes.
+        away = np.stack([np.abs(s.ctrl - self.robot.qpos_home).max(axis=0) for s in sequences]).max(axis=0) > 1e-6
+        moved = {j for j, far in zip(self.robot.joint_names, away, strict=True) if far} | set(self.robot.operated)
+        self.locked = idle_joints(self.robot, tuple(moved))
+        free = [j for j in self.robot.joint_names if j not in self.locked]
+        self.op = np.array([free.index(j) for j in self.robot.operated])
         self.ctrl, self.qpos, self.qvel = (
-            np.concatenate([getattr(s, name) for s in sequences]) for name in ("ctrl", "qpos", "qvel")
+            np.concatenate([getattr(s, name)[:, self.robot.index(free)] for s in sequences])
+            for name in ("ctrl", "qpos", "qvel")
         )
         length = np.array([len(s) for s in sequences])
         self.seq_last = np.cumsum(length) - 1

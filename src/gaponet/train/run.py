@@ -35,7 +35,7 @@ from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
 from gaponet.train.config import TrainConfig
 from gaponet.train.env import DeltaEnv
-from gaponet.train.inverse import inverse_targets
+from gaponet.train.inverse import inverse_labels
 from gaponet.train.ppo import make_runner, update
 from gaponet.train.warm_start import WarmStart, fit_sensors
 
@@ -134,9 +134,8 @@ class Trainer:
             self.stage = "sensors"
             self._tick()
             self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed)
-        labels = np.concatenate([inverse_targets(s, self.robot) for s in self.train_set]) - env.ctrl
         limit = 0.99 * self.config.model.delta_max
-        labels = np.clip(labels[:, self.robot.operated_index], -limit, limit).astype(np.float32)
+        labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed)
         warm.done = self.rounds_done
         self.stage = "warm start"

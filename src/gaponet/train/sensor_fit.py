@@ -20,7 +20,14 @@ POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: half of the states are
 
 
 def sensor_labels(
-    net: OperatorNet, robot: RobotSpec, x: Array, qpos: Array, qvel: Array, conditions: list[Condition], seed: int
+    net: OperatorNet,
+    robot: RobotSpec,
+    x: Array,
+    qpos: Array,
+    qvel: Array,
+    conditions: list[Condition],
+    locked: tuple[str, ...],
+    seed: int,
 ) -> tuple[Tensor, Tensor]:
     """Standardised features and oracle answers for states the policy visited, half of them perturbed.
 
@@ -28,18 +35,20 @@ def sensor_labels(
         net: Its config says the probes.
         robot: The simulator asked.
         x: [o_t | a_t] at those states, (k, dim).
-        qpos, qvel: All joints, (k, n_all).
+        qpos, qvel: All joints that are not locked, (k, n_free).
         conditions: Payload and period of each state.
+        locked: Joints clamped in the simulator.
         seed: Of the perturbations.
     """
     rng = np.random.default_rng(seed)
-    op, n = robot.operated_index, net.n
+    oracle, n = ProbeOracle(robot, net.config, conditions, locked=locked), net.n
+    op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     noisy = rng.random(len(q)) < 0.5
     q[np.ix_(noisy, op)] += rng.normal(0, POSITION_NOISE, (noisy.sum(), n))
     v[np.ix_(noisy, op)] += rng.normal(0, VELOCITY_NOISE, (noisy.sum(), n))
     x[:, :n], x[:, n : 2 * n] = q[:, op], v[:, op]
-    answers = ProbeOracle(robot, net.config, conditions)(q, v)
+    answers = oracle(q, v)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
     return features.clone(), torch.from_numpy(answers.reshape(len(q), -1))
