@@ -1,0 +1,99 @@
+"""The commands as a user types them: pair, gap, train, eval, report."""
+
+import json
+import re
+
+import pytest
+from arm import recordings, write_arm
+
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+
+TRAIN = (
+    "--budget 3500 --warm-start.rounds 2 --warm-start.num-envs 16 --warm-start.steps 60 --warm-start.gradient-steps 60 "
+    "--ppo.num-envs 16 --ppo.num-steps 16 --ppo.epochs 1"
+).split()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A user's robot folder, a dataset, and two trained runs."""
+    folder = tmp_path_factory.mktemp("story")
+    robot = write_arm(folder / "arm")
+    dataset = Dataset.create(folder / "data", robot)
+    for sequence in recordings(robot, 8, rows=120, kp=0.5, delay=2):
+        dataset.append(sequence)
+    for kind in ("gaponet", "mlp"):
+        where = [str(folder / "data"), "--out", str(folder / kind), "--robot", str(folder / "arm"), "--model", kind]
+        assert main(["train", *where, *TRAIN]) == 0
+    return folder
+
+
+def run(place, capsys, *words):
+    capsys.readouterr()
+    code = main([*words, "--robot", str(place / "arm"), "--json"])
+    captured = capsys.readouterr()
+    assert code == 0, captured.err
+    return json.loads(captured.out), captured.err
+
+
+def test_gap_prints_one_object_with_every_grouping(place, capsys):
+    result, err = run(place, capsys, "gap", str(place / "data"))
+    nominal = result["methods"]["nominal"]
+    assert list(result["methods"]) == ["nominal"]
+    assert nominal["mpjae"] > 0.001
+    for group in ("by_joint", "by_motion", "by_payload", "by_unit", "by_horizon"):
+        assert nominal[group]
+    assert "MPJAE" in err  # people read it on stderr
+
+
+def test_eval_puts_all_methods_side_by_side(place, capsys):
+    result, _ = run(place, capsys, "eval", str(place / "gaponet"), str(place / "data"), "--also", str(place / "mlp"))
+    assert list(result["methods"]) == ["nominal", "delay_offset", "mlp", "gaponet"]
+    assert result["unseen"] is True
+    assert result["virtual"] is True
+
+
+def test_eval_of_a_training_motion_says_that_it_is_one(place, capsys):
+    split = json.loads((place / "gaponet" / "split.json").read_text())
+    motion = next(iter(split["train"])).split("-")[0]
+    result, err = run(place, capsys, "eval", str(place / "gaponet"), str(place / "data"), "--motions", motion)
+    assert result["unseen"] is False
+    assert "not held-out" in err
+
+
+def test_the_report_is_one_offline_page(place, capsys):
+    result, _ = run(place, capsys, "report", str(place / "gaponet"), "--also", str(place / "mlp"))
+    page = (place / "gaponet" / "report.html").read_text(encoding="utf-8")
+    assert result["report"].endswith("report.html")
+    assert "VIRTUAL robot" in page
+    assert "these numbers say nothing about real hardware" in page
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
+    assert "http" not in re.sub(r"http://www\.w3\.org|xmlns[^ >]*|http://purl\.org|https://matplotlib\.org", "", page)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["gap", "{}/nowhere"], "not a dataset"),
+        (["gap", "{}/data", "--motions", "dance"], "no motion 'dance'"),
+        (["eval", "{}/data", "{}/data"], "give a run folder"),
+        (["eval", "{}/gaponet", "{}/data", "--also", "{}/gaponet"], "a second gaponet model"),
+        (["train", "{}/data", "--out", "{}/gaponet"], "--resume"),
+        (["train", "{}/data", "--out", "{}/new", "--budget", "soon"], "--budget soon"),
+        (["train", "{}/data", "--out", "{}/new", "--resume"], "nothing to resume"),
+        (["report", "{}/data"], "give a run folder"),
+        (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)  # fmt: skip
+def test_mistakes_get_one_line_and_exit_code_2(place, capsys, words, complaint):
+    words = [w.format(place) for w in words]
+    if "--robot" not in words:
+        words += ["--robot", str(place / "arm")]
+    capsys.readouterr()
+    assert main(words) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert complaint in last
+    assert "Traceback" not in last
+    assert not (place / "new").exists()
