@@ -1,6 +1,6 @@
 """gaponet: close the gap between simulated and real motors from joint logs.
 
-`import gaponet` loads numpy alone; the simulator, torch and every file format are imported by the function that uses them.
+`import gaponet` loads numpy alone; simulator, torch and file formats are imported by the functions that use them.
 """
 
 from gaponet.errors import GAPONetError

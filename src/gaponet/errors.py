@@ -1,6 +1,6 @@
 """Errors that a user can act on: what is wrong, where, and what to do.
 
-Every error raised on bad input derives from `GAPONetError`; the command line prints its text in one line and exits with 2.
+Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line and exits with 2.
 """
 
 

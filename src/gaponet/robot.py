@@ -121,11 +121,11 @@ class RobotSpec:
             where: File, for the error.
             extra: The user's --map, tried first.
         """
-        short = name.strip().split("/")[-1]
+        full, short = name.strip(), name.strip().split("/")[-1]
         for table in (extra or {}, self.aliases):
-            for key in (name.strip(), short):
-                if key in table:
-                    short = table[key]
+            mapped = table.get(full, table.get(short))
+            if mapped is not None:
+                full = short = mapped
         if short not in self.joint_names:
             raise JointMismatchError(self._unknown(short, where))
         return short
@@ -165,7 +165,7 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
         raise RobotError(f"{toml}: not valid TOML: {error}") from None
     mjcf = folder / table.get("mjcf", "robot.xml")
     if not mjcf.is_file():
-        raise RobotError(f"{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = \"...\"")
+        raise RobotError(f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."')
     return _spec(table, toml, mjcf)
 
 

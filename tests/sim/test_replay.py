@@ -3,10 +3,12 @@
 import numpy as np
 from arm import commands, record, recordings, write_arm
 
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset
+from gaponet.robot import load_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.pairing import pair_dataset
-from gaponet.sim.replay import replay
+from gaponet.sim.replay import idle_limbs, replay
 
 
 def test_the_twin_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):
@@ -46,3 +48,15 @@ def test_pairing_is_done_once_per_simulator(tmp_path):
     pair = dataset.pair(dataset.entries[0], model_hash(robot))
     np.testing.assert_array_equal(pair.gap[0], 0)
     assert np.abs(pair.gap).max() > 0.01
+
+
+def test_clamping_idle_limbs_changes_nothing_for_the_others():
+    robot = load_robot("h1_2")
+    ctrl = np.tile(robot.qpos_home, (40, 1))
+    ctrl[:, robot.index(["left_elbow_joint"])] = 0.4 * np.sin(np.arange(40) / 6)[:, None]
+    meta = SequenceMeta("h1_2", "a", "elbow", 1.0)
+    sequence = Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl))
+    assert idle_limbs([sequence], robot) == tuple(j for j in robot.joint_names if "hip" in j or "knee" in j or "ankle" in j)
+    whole, arms = (replay([sequence], robot, lock_idle=lock)[0] for lock in (False, True))
+    op = robot.operated_index
+    np.testing.assert_allclose(whole.qpos[:, op], arms.qpos[:, op], atol=1e-6)

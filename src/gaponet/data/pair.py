@@ -20,7 +20,8 @@ class Twin:
 
     Attributes:
         model_hash: Of the simulator (sim.model.model_hash).
-        qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of [t-1, t).
+        qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of
+            [t-1, t).
         ctrl: (T, n) rad, targets applied over [t, t+1), where a corrector altered them; not stored.
     """
 

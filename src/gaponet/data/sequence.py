@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -99,6 +99,11 @@ class Sequence:
         """s."""
         return len(self) * self.dt
 
+    def rows(self, part: slice) -> Sequence:
+        """The same recording, only these rows."""
+        cut = {name: value[part] for name in ARRAYS if (value := getattr(self, name)) is not None}
+        return replace(self, **cut)
+
     def content_hash(self) -> str:
         """Identity of the recording: joints, period, payload, unit and samples; not its name, path or date."""
         digest = hashlib.sha256()
@@ -112,13 +117,13 @@ class Sequence:
 def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None = None) -> Sequence:
     """Put a log on a uniform grid.
 
-    Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt is
-    the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz). Otherwise measurements are
+    Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
+    is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz). Otherwise measurements are
     interpolated and commands held on a grid of the state's median period. The manifest says which.
 
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
-        robot: Decides the joint order and the units of oddly logged joints (`log_unit`).
+        robot: Decides the joint order.
         meta: Where it comes from.
         dt: Force this period, s.
     """
@@ -134,8 +139,11 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
         dt = round(median, 5) if dt is None else dt
         arrays = _resample(log, dt)
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
-    if "qvel" not in arrays:
-        arrays["qvel"] = differentiate(arrays["qpos"], dt)
+    converted = log.meta.get("converted_from", {})
+    odd = [j for j, name in enumerate(robot.joint_names) if "qvel" not in arrays or converted.get(name) == "fraction"]
+    if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
+        qvel = differentiate(arrays["qpos"], dt)
+        arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
     notes = meta.notes | {
         "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz",
         "rate_hz": round(1 / median, 3),
@@ -146,7 +154,6 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     absent = [name for name in robot.joint_names if name not in log.joint_names]
     if absent:
         notes["held_at_home"] = absent
-    converted = {n: u for n, u in zip(robot.joint_names, robot.log_units, strict=True) if u != "rad"}
     if converted:
         notes["converted_from"] = converted
     return Sequence(SequenceMeta(**(asdict(meta) | {"notes": notes})), robot.joint_names, dt, **arrays)
@@ -156,7 +163,9 @@ def _resample(log: Log, dt: float) -> dict[str, Array]:
     start = max(c.time[0] for c in log.channels.values())
     stop = min(c.time[-1] for c in log.channels.values())
     if stop - start < 2 * dt:
-        raise LogError(f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks")
+        raise LogError(
+            f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks"
+        )
     grid = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1)
     grid = np.minimum(grid, stop)
     return {
@@ -166,17 +175,9 @@ def _resample(log: Log, dt: float) -> dict[str, Array]:
 
 
 def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:
-    """Columns in robot order and SI; joints the log lacks stand at home (positions) or at zero."""
+    """Columns in robot order; joints the log lacks stand at home (positions) or at zero."""
     out = np.zeros((len(values), len(robot.joint_names)))
     if name in ("ctrl", "qpos"):
         out += robot.qpos_home
     out[:, robot.index(log.joint_names)] = values
-    if name not in ("ctrl", "qpos", "qvel"):
-        return out
-    for j, unit in enumerate(robot.log_units):
-        if unit == "rad" or robot.joint_names[j] not in log.joint_names:
-            continue
-        low, high = robot.qpos_range[j]
-        scale = np.pi / 180 if unit == "deg" else high - low
-        out[:, j] = out[:, j] * scale + (low if unit == "fraction" and name != "qvel" else 0.0)
     return out

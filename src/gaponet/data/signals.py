@@ -6,6 +6,8 @@ import numpy as np
 
 Array = np.ndarray
 
+FAST = 0.3  # rad/s of fast_speed from which a lag is mostly delay; below, it is mostly stiction
+
 
 def resample_linear(time: Array, values: Array, grid: Array) -> Array:
     """Interpolate measurements onto a grid; for states, which are continuous, never for commands.
@@ -65,8 +67,8 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
         max_delay: Longest lag tried, s.
 
     Returns:
-        (n,) s; NaN for a joint that was not commanded to move (range below 0.02 rad) or does not follow (correlation
-        below 0.3).
+        (n,) s; NaN for a joint that was not commanded to move (range below 0.02 rad), does not follow (correlation
+        below 0.3) or follows best at the longest lag tried, which then is no maximum: slow motions through stiction.
     """
     kernel = np.hanning(7)[1:-1, None] / np.hanning(7).sum()
     smooth = lambda x: np.apply_along_axis(lambda c: np.convolve(c, kernel[:, 0], "same"), 0, np.diff(x, axis=0))  # noqa: E731
@@ -76,14 +78,19 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
     best = score.argmax(axis=0)
     delay = np.full(ctrl.shape[1], np.nan)
     for j, s in enumerate(best):
-        if np.ptp(ctrl[:, j]) < 0.02 or not score[s, j] > 0.3:
+        if np.ptp(ctrl[:, j]) < 0.02 or not score[s, j] > 0.3 or s == len(score) - 1:
             continue
         offset = 0.0
-        if 0 < s < len(score) - 1:
+        if s > 0:
             a, b, c = score[s - 1 : s + 2, j]
             offset = 0.5 * (a - c) / (a - 2 * b + c) if a - 2 * b + c < 0 else 0.0
         delay[j] = (s + offset) * dt
     return delay
+
+
+def fast_speed(ctrl: Array, dt: float) -> Array:
+    """How fast a joint is commanded when it is commanded fast: 95th percentile of the speed, (T, n) → (n), rad/s."""
+    return np.percentile(np.abs(differentiate(ctrl, dt)), 95, axis=0)
 
 
 def _correlation(a: Array, b: Array) -> Array:

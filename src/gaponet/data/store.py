@@ -1,12 +1,13 @@
 """The dataset folder: Parquet files, one per sequence, and a journal that lists them.
 
     dataset.json            format version, robot, joint names, units
-    sequences.jsonl         one line per sequence: metadata, hash, delay, offsets; appended, never rewritten in place
+    sequences.jsonl         one line per sequence: metadata, hash, delays; appended, never rewritten in place
+    offsets.json            static offsets of each unit as fitted at import (data.offsets); recorded, never applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
     twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
 
-A sequence is written to a temporary file, renamed, then listed: a file that is not listed does not exist, and a line cut
-short by a crash is dropped on opening. Real data is never rewritten; twins can be computed again.
+A sequence is written to a temporary file, renamed, then listed: a file that is not listed does not exist, and a line
+cut short by a crash is dropped on opening. Real data is never rewritten; twins can be computed again.
 """
 
 from __future__ import annotations
@@ -67,22 +68,36 @@ class Dataset:
         except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{header}: damaged ({error}); restore it or import again") from None
         if version > FORMAT:
-            raise DatasetError(f"{header}: format {version} is newer than this gaponet reads ({FORMAT}); upgrade gaponet")
+            raise DatasetError(
+                f"{header}: format {version} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
+            )
         self.entries = list(self._journal())
 
     @classmethod
     def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
         """Open the dataset at path, making an empty one where there is none; refuses another robot's."""
-        path = Path(path)
-        if not (path / "dataset.json").is_file():
-            if path.exists() and any(path.iterdir()):
-                raise DatasetError(f"{path}: exists, holds files and is not a dataset; choose an empty folder")
-            (path / "sequences").mkdir(parents=True, exist_ok=True)
+        dataset = cls.peek(path, robot)
+        if dataset is None:
+            path = Path(path)
+            path.mkdir(parents=True, exist_ok=True)
             header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
             write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
-        dataset = cls(path)
-        dataset.require_robot(robot)
+            dataset = cls(path)
         return dataset
+
+    @classmethod
+    def peek(cls, path: str | Path, robot: RobotSpec) -> Dataset | None:
+        """The robot's dataset at path, or None where one can be made; refuses anything else and changes nothing."""
+        path = Path(path)
+        if (path / "dataset.json").is_file():
+            dataset = cls(path)
+            dataset.require_robot(robot)
+            return dataset
+        if path.is_dir() and any(not child.name.startswith(".") for child in path.iterdir()):
+            raise DatasetError(f"{path}: exists, holds files and is not a dataset; choose an empty folder")
+        if path.exists() and not path.is_dir():
+            raise DatasetError(f"{path}: is a file; choose a folder for the dataset")
+        return None
 
     def require_robot(self, robot: RobotSpec) -> None:
         """Refuse a robot whose joints are not the dataset's."""
@@ -108,7 +123,9 @@ class Dataset:
         present = {e.meta.motion for e in self.entries}
         for motion in motions:
             if motion not in present:
-                raise DatasetError(f"{self.path}: no motion '{motion}'; it holds: {', '.join(sorted(present)) or 'nothing'}")
+                raise DatasetError(
+                    f"{self.path}: no motion '{motion}'; it holds: {', '.join(sorted(present)) or 'nothing'}"
+                )
         if not self.entries:
             raise DatasetError(f"{self.path}: holds no sequences yet; import or collect some")
         return [e for e in self.entries if not motions or e.meta.motion in motions]
@@ -134,6 +151,7 @@ class Dataset:
             findings=findings or {},
         )
         columns = {c: getattr(sequence, c) for c in entry.channels}
+        self._file(entry).parent.mkdir(exist_ok=True)
         _write_table(self._file(entry), columns, sequence.dt, self.joint_names)
         line = json.dumps(asdict(entry), ensure_ascii=False, allow_nan=False) + "\n"
         with (self.path / "sequences.jsonl").open("a", encoding="utf-8") as journal:
@@ -167,7 +185,9 @@ class Dataset:
         """A sequence with its simulated twin."""
         file = self._twin_file(entry, model)
         if not file.is_file():
-            raise DatasetError(f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet pair {self.path}")
+            raise DatasetError(
+                f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet pair {self.path}"
+            )
         arrays = _read_table(file, ("qpos", "qvel", "tau"), len(self.joint_names))
         return Pair(self.read(entry), Twin(model, **arrays))
 
@@ -191,7 +211,9 @@ class Dataset:
                 meta = SequenceMeta(**fields.pop("meta"))
                 entry = Entry(**(fields | {"meta": meta, "channels": tuple(fields["channels"])}))
             except (json.JSONDecodeError, KeyError, TypeError) as error:
-                raise DatasetError(f"{journal}:{number}: damaged line ({error}); delete it and import that log again") from None
+                raise DatasetError(
+                    f"{journal}:{number}: damaged line ({error}); delete it and import that log again"
+                ) from None
             if not self._file(entry).is_file():
                 raise DatasetError(f"{journal}:{number}: {self._file(entry)} is missing; restore it or delete the line")
             yield entry
@@ -237,5 +259,7 @@ def _read_table(path: Path, columns: tuple[str, ...], n: int) -> dict[str, np.nd
         arrays = {c: table.column(c).combine_chunks() for c in columns}
     except (pa.ArrowInvalid, pa.ArrowException, OSError, KeyError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
-        raise DatasetError(f"{path}: not a readable Parquet file ({reason}); restore it or import the log again") from None
+        raise DatasetError(
+            f"{path}: not a readable Parquet file ({reason}); restore it or import the log again"
+        ) from None
     return {c: a.flatten().to_numpy(zero_copy_only=False).reshape(-1, n) for c, a in arrays.items()}

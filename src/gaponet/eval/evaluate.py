@@ -67,7 +67,7 @@ def evaluate(
     done_runs: dict[str, list[Run]] = {}
     deltas: dict[str, list[Array]] = {}
     for name, corrector in _methods(runs_dirs[0], models, robot):
-        twins = replay(sequences, robot, corrector, progress=partial(progress, name))
+        twins = replay(sequences, robot, corrector, progress=partial(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             op = robot.operated_index

@@ -42,6 +42,6 @@ def move_time(distance: Array, speed: float, least: float = 0.5) -> Array:
 
 
 def fade(steps: int, dt: float, ramp: float) -> Array:
-    """A window (steps,) that rises from 0 to 1 within `ramp` s, stays, and falls back: makes an oscillation start at rest."""
+    """A window (steps,) that rises from 0 to 1 within `ramp` s, stays, and falls back: oscillations start at rest."""
     time = np.arange(steps) * dt
     return blend(time / ramp) * blend((time[-1] - time) / ramp)

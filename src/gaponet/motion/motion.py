@@ -46,7 +46,7 @@ class Motion:
         return len(self.ctrl) * self.dt
 
     def sample(self, dt: float) -> Array:
-        """Targets at a control period, (T', n): exact rows where dt is a multiple of the grid, else linear between them."""
+        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else linear between rows."""
         stride = dt / self.dt
         if abs(stride - round(stride)) < 1e-9:
             return self.ctrl[:: round(stride)].copy()

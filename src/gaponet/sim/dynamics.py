@@ -6,8 +6,6 @@ import mujoco
 import numpy as np
 
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.robot import RobotSpec
-from gaponet.sim.model import build_model
 
 Array = np.ndarray
 
@@ -15,7 +13,7 @@ CUTOFF = 6.0  # Hz: above the joints' bandwidth, below encoder steps at 50 Hz
 
 
 def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Array) -> Array:
-    """Torque of every joint without friction, limits and contacts: inertia, armature, Coriolis, gravity, damping, springs.
+    """Torque of every joint by inertia, armature, Coriolis, gravity, damping and springs; no limits, no contacts.
 
     Args:
         model: Nominal simulator with its payload (sim.model.build_model).
@@ -42,16 +40,13 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
     return inverse_dynamics(model, qpos, zero, zero)
 
 
-def equivalent_torque(
-    robot: RobotSpec, qpos: Array, dt: float, payload_mass: float, payload_side: str = "both", cutoff: float = CUTOFF
-) -> tuple[Array, Array]:
+def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
     """What the nominal, payload-carrying model would have needed to move as recorded.
 
     Args:
-        robot: The nominal model.
+        model: Nominal simulator with the recording's payload (sim.model.build_model).
         qpos: Recorded, (T, n) rad.
         dt: s.
-        payload_mass, payload_side: kg in each hand named.
         cutoff: Of the zero-phase filter before differentiating, Hz.
 
     Returns:
@@ -60,4 +55,4 @@ def equivalent_torque(
     smooth = lowpass(qpos.astype(float), dt, cutoff)
     qvel = differentiate(smooth, dt)
     qacc = differentiate(qvel, dt)
-    return inverse_dynamics(build_model(robot, payload_mass, payload_side, dt), smooth, qvel, qacc), qacc
+    return inverse_dynamics(model, smooth, qvel, qacc), qacc

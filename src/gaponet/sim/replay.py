@@ -12,7 +12,7 @@ from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
-from gaponet.sim.model import model_hash
+from gaponet.sim.model import idle_joints, model_hash
 
 Array = np.ndarray
 Progress = Callable[[int, int], None]  # control steps done, total
@@ -34,6 +34,7 @@ def replay(
     corrector: Corrector | None = None,
     nthread: int = 0,
     progress: Progress | None = None,
+    lock_idle: bool = False,
 ) -> list[Twin]:
     """Step every sequence's commands from its first recorded state; the recording is not looked at again.
 
@@ -43,6 +44,7 @@ def replay(
         corrector: Alters targets on the way; None for the nominal simulator.
         nthread: Threads, 0 for all cores.
         progress: Called now and then.
+        lock_idle: Clamp limbs that no command moves: faster, the same for all others to rounding, home for those.
 
     Returns:
         One twin per sequence, in order.
@@ -58,10 +60,18 @@ def replay(
             if progress is not None:
                 progress(before + k, total)
 
-        runs = _free_run(part, robot, corrector, nthread, tell)
+        locked = idle_limbs(part, robot) if lock_idle else ()
+        runs = _free_run(part, robot, corrector, nthread, tell, locked)
         twins |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [twins[i] for i in range(len(sequences))]
+
+
+def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
+    """Joints of limbs that no command of these sequences moves away from home and that have no operated joint."""
+    away = np.stack([np.abs(s.ctrl - robot.qpos_home).max(axis=0) for s in sequences]).max(axis=0) > 1e-6
+    moved = {name for name, far in zip(robot.joint_names, away, strict=True) if far} | set(robot.operated)
+    return idle_joints(robot, tuple(moved))
 
 
 def _chunks(order: list[int], size: int) -> Iterator[list[int]]:
@@ -76,16 +86,20 @@ def _free_run(
     corrector: Corrector | None,
     nthread: int,
     progress: Callable[[int], None],
+    locked: tuple[str, ...],
 ) -> list[Twin]:
     """Sequences in order of falling length: those still running are always a prefix."""
     lengths = np.array([len(s) for s in sequences])
-    sim = BatchSim(robot, [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences], nthread)
-    ctrl = np.zeros((lengths[0], len(sequences), sim.n))
+    sim = BatchSim(robot, [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences], nthread, locked)
+    free = robot.index(sim.joint_names)
+    ctrl = np.zeros((lengths[0], len(sequences), len(robot.joint_names)))
     out = np.zeros((4, *ctrl.shape))
+    out[0] = robot.qpos_home
     for i, s in enumerate(sequences):
         ctrl[: len(s), i] = s.ctrl
-    sim.reset(slice(None), np.stack([s.qpos[0] for s in sequences]), np.stack([s.qvel[0] for s in sequences]))
-    out[0, 0], out[1, 0] = sim.qpos, sim.qvel
+    first = [np.stack([getattr(s, name)[0, free] for s in sequences]) for name in ("qpos", "qvel")]
+    sim.reset(slice(None), first[0], first[1])
+    out[0, 0][:, free], out[1, 0][:, free] = sim.qpos, sim.qvel
     if corrector is not None:
         corrector.reset(sequences)
     running = (lengths[None, :] > np.arange(1, lengths[0])[:, None]).sum(axis=1)  # at each step
@@ -93,9 +107,11 @@ def _free_run(
     for t, k in enumerate(running):
         target = ctrl[t]
         if corrector is not None:
-            target = corrector.correct(t, target, sim.qpos, sim.qvel)
-        sim.step(target, None if k == sim.num_envs else everyone[:k])
-        out[0, t + 1], out[1, t + 1], out[2, t + 1], out[3, t] = sim.qpos, sim.qvel, sim.torque, target
+            target = corrector.correct(t, target, out[0, t], out[1, t])
+        sim.step(target[:, free], None if k == sim.num_envs else everyone[:k])
+        for channel, now in enumerate((sim.qpos, sim.qvel, sim.torque)):
+            out[channel, t + 1][:, free] = now
+        out[3, t] = target
         finished += int(k)
         if t % 200 == 0 or t == len(running) - 1:
             progress(finished)

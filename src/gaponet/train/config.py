@@ -31,9 +31,9 @@ class WarmStartConfig:
     """Simulations per round."""
     steps: int = 400
     """Control periods per round."""
-    disturbance: float = 0.01
+    disturbance: float = 0.003
     """Noise on the applied corrections, white and slow, σ in rad."""
-    batch_size: int = 2048
+    batch_size: int = 1024
     """Samples per gradient step."""
     gradient_steps: int = 300
     """Gradient steps per round."""

@@ -15,7 +15,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.observation import History, frames_before
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
-from gaponet.sim.model import idle_joints
+from gaponet.sim.replay import idle_limbs
 from gaponet.train.config import RewardConfig
 
 Array = np.ndarray
@@ -63,9 +63,7 @@ class DeltaEnv(VecEnv):
 
     def _load(self, sequences: ListOf[Sequence]) -> None:
         # Limbs that no command moves are clamped: on a fixed base they change nothing but the time it takes.
-        away = np.stack([np.abs(s.ctrl - self.robot.qpos_home).max(axis=0) for s in sequences]).max(axis=0) > 1e-6
-        moved = {j for j, far in zip(self.robot.joint_names, away, strict=True) if far} | set(self.robot.operated)
-        self.locked = idle_joints(self.robot, tuple(moved))
+        self.locked = idle_limbs(sequences, self.robot)
         free = [j for j in self.robot.joint_names if j not in self.locked]
         self.op = np.array([free.index(j) for j in self.robot.operated])
         self.ctrl, self.qpos, self.qvel = (

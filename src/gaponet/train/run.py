@@ -196,7 +196,7 @@ class Trainer:
         """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator."""
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
-        twins = replay(picked, self.robot, corrector)
+        twins = replay(picked, self.robot, corrector, lock_idle=True)
         op = self.robot.operated_index
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 

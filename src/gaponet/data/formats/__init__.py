@@ -1,32 +1,51 @@
-"""One file per log format. A reader takes a path and yields Logs; it is imported when its format is asked for."""
+"""One file per log format. A reader takes a path and yields Logs; it is imported when its format is asked for.
+
+A format is a module with
+
+    OPTIONS                 options of `read` beside joint_map that it understands
+    find(path)              the recordings under a path: files or folders, sorted
+    read(path, robot, joint_map=None, **options)    yields (motion name, Log), in the order of find
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import numpy as np
+
 from gaponet.data.log import Log
-from gaponet.errors import LogError
+from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
+
+Array = np.ndarray
 
 FORMATS = {
     "sage": "SAGE folder: control.csv and state_motor.csv beside each other",
-    "table": "CSV or Parquet with named columns",
+    "table": "CSV or Parquet with named columns, a file or a folder of files",
 }
+TABLES = (".csv", ".parquet")
 
 
 def detect(path: Path) -> str:
     """The format of a file or folder."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    if path.is_dir() and next(path.rglob("control.csv"), None):
+    if path.is_dir() and any(next(path.rglob(name), None) for name in ("control.csv", "state_motor.csv")):
         return "sage"
-    if path.suffix.lower() in (".csv", ".parquet"):
+    files = [path] if path.is_file() else path.iterdir()
+    if any(f.is_file() and f.suffix.lower() in TABLES for f in files):
         return "table"
     known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())
     raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+
+
+def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
+    """The recordings under a path, without reading them."""
+    return _reader(path, fmt).find(path)
 
 
 def read_logs(path: Path, robot: RobotSpec, fmt: str | None = None, **options: Any) -> Iterator[tuple[str, Log]]:
@@ -36,14 +55,47 @@ def read_logs(path: Path, robot: RobotSpec, fmt: str | None = None, **options: A
         path: File or folder.
         robot: Whose joint names and units apply.
         fmt: One of FORMATS; default by looking.
-        options: joint_map {log name: robot name}; for tables also columns, position_unit and time_unit.
+        options: joint_map {log name: robot name}. For tables also columns (a TOML file that maps column names),
+            position_unit and time_unit. None counts as not given; one that the format does not know is refused.
     """
+    reader = _reader(path, fmt)
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if name != "joint_map" and name not in reader.OPTIONS:
+            flag, kind = name.replace("_", "-"), reader.__name__.rsplit(".", 1)[-1]
+            raise UsageError(f"--{flag} means nothing to the {kind} format, which fixes it itself; leave it out")
+    yield from reader.read(path, robot, **given)
+
+
+def _reader(path: Path, fmt: str | None) -> ModuleType:
     fmt = fmt or detect(path)
     if fmt not in FORMATS:
         raise LogError(f"unknown format '{fmt}'; use one of {', '.join(FORMATS)}")
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    yield from import_module(f"gaponet.data.formats.{fmt}").read(path, robot, **options)
+    return import_module(f"gaponet.data.formats.{fmt}")
+
+
+def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec) -> Array:
+    """Positions or velocities in the unit of the log → rad or rad/s.
+
+    Args:
+        name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
+        values: (k, n), columns in the order of joint_names.
+        joint_names: The robot's own names, (n).
+        units: Of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
+        robot: Whose joint ranges give a fraction its meaning.
+    """
+    if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
+        return values
+    out = np.array(values, float)
+    for column, (joint, unit) in enumerate(zip(joint_names, units, strict=True)):
+        if unit == "deg":
+            out[:, column] *= np.pi / 180
+        if unit == "fraction":
+            low, high = robot.qpos_range[robot.joint_names.index(joint)]
+            out[:, column] = out[:, column] * (high - low) + (0.0 if name == "qvel" else low)
+    return out
 
 
 def refuse_degrees(log: Log, robot: RobotSpec) -> Log:
@@ -54,11 +106,8 @@ def refuse_degrees(log: Log, robot: RobotSpec) -> Log:
     for name in ("ctrl", "qpos"):
         values = log.channels[name].values
         for column, joint in enumerate(log.joint_names):
-            j = robot.joint_names.index(joint)
-            if robot.log_units[j] != "rad":
-                continue
             row = int(abs(values[:, column]).argmax())
-            value, (low, high) = values[row, column], robot.qpos_range[j]
+            value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
             if abs(value) > 3.3 and not low - 1.0 <= value <= high + 1.0:
                 raise LogError(
                     f"{log.row(name, row)}: {name} of {joint} is {value:.3f}, outside its range "

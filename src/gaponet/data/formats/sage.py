@@ -1,19 +1,20 @@
 """SAGE folders: {real,sim}/{robot}/{source}/{motion}/{control,state_motor,event}.csv and joint_list.txt.
 
-Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds, simulated
-ones seconds; the reader decides by the period and refuses one that is neither.
+Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds,
+simulated ones seconds; the reader decides by the period and refuses one that is neither. Joints stand in the unit that
+the robot's `log_unit` says (SO-101's gripper: 0..1 of its range).
 """
 
 from __future__ import annotations
 
-import io
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from gaponet.data.formats import refuse_degrees
+from gaponet.data.formats import refuse_degrees, to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
@@ -21,66 +22,109 @@ from gaponet.robot import RobotSpec
 Array = np.ndarray
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
+OPTIONS: tuple[str, ...] = ()
+DIGITS = b"0123456789.+-eE \r"  # what numbers are made of; the rest of a row is its skeleton
+NUMBER = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
+
+
+def find(path: Path) -> list[Path]:
+    """Real motion folders under path; simulated ones are skipped."""
+    folders = sorted({f.parent for name in ("control.csv", "state_motor.csv") for f in path.rglob(name)})
+    return [f for f in folders if f.relative_to(path).parts[:1] != ("sim",)]
 
 
 def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) -> Iterator[tuple[str, Log]]:
-    """Yield (motion, Log) for every real motion folder under path; simulated ones are skipped."""
-    folders = sorted(p.parent for p in path.rglob("control.csv"))
-    folders = [f for f in folders if f.relative_to(path).parts[:1] != ("sim",)]
+    """Yield (motion, Log) for every real motion folder under path."""
+    folders = find(path)
     if not folders:
         raise LogError(f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder")
     for folder in folders:
-        yield folder.name, refuse_degrees(_read_motion(folder, robot, joint_map), robot)
+        yield os.path.basename(os.path.abspath(folder)), refuse_degrees(_read_motion(folder, robot, joint_map), robot)
 
 
 def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
     list_file = folder / "joint_list.txt"
     if not list_file.is_file():
         raise LogError(f"{list_file}: missing; one joint name a line, in the order of the columns")
-    raw_names = [line.strip() for line in list_file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    raw_names = [line.strip() for line in _text(list_file).splitlines() if line.strip()]
+    if not raw_names:
+        raise LogError(f"{list_file}: empty; one joint name a line, in the order of the columns")
     names = tuple(robot.resolve(name, str(list_file), joint_map) for name in raw_names)
     if len(set(names)) != len(names):
         raise LogError(f"{list_file}: two names map to one joint: {', '.join(names)}; mend --map")
     control, state = folder / "control.csv", folder / "state_motor.csv"
-    ctrl_time, ctrl = _read_csv(control, len(names), required=("positions",))
-    state_time, values = _read_csv(state, len(names), required=("positions",))
+    ctrl_time, ctrl = _read_csv(control, len(names))
+    state_time, values = _read_csv(state, len(names))
+    units = [robot.log_units[robot.joint_names.index(name)] for name in names]
     channels = {COLUMNS[k]: Channel(state_time, v) for k, v in values.items() if k in COLUMNS}
     channels["ctrl"] = Channel(ctrl_time, ctrl["positions"])
-    files = dict.fromkeys(channels, str(state)) | {"ctrl": str(control)}
     return Log(
-        robot.name, names, channels, str(folder),
-        {"files": files, "first_line": 2, "raw_joint_names": raw_names, "events": _events(folder / "event.csv")},
-    )  # fmt: skip
+        robot.name,
+        names,
+        {k: Channel(c.time, to_radians(k, c.values, names, units, robot)) for k, c in channels.items()},
+        str(folder),
+        {
+            "files": dict.fromkeys(channels, str(state)) | {"ctrl": str(control)},
+            "first_line": 2,
+            "converted_from": {n: u for n, u in zip(names, units, strict=True) if u != "rad"},
+            "events": _events(folder / "event.csv"),
+        },
+    )
 
 
-def _read_csv(file: Path, n: int, required: tuple[str, ...]) -> tuple[Array, dict[str, Array]]:
+def _read_csv(file: Path, n: int) -> tuple[Array, dict[str, Array]]:
     """Time (k,) in seconds and {column: (k, n)}."""
     if not file.is_file():
         raise LogError(f"{file}: missing; a SAGE motion needs control.csv and state_motor.csv")
-    text = file.read_text(encoding="utf-8")
-    header, _, body = text.partition("\n")
+    first, _, body = file.read_bytes().partition(b"\n")
+    header = first.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
     columns = [c.strip().lower() for c in header.split(",")]
     lists = columns[2:]
     if columns[:2] != ["type", "timestamp"]:
-        raise LogError(f"{file}:1: header is '{header.strip()}', expected type,timestamp,positions,...")
-    for name in required:
-        if name not in lists:
-            raise LogError(f"{file}:1: column '{name}' is missing; the header has: {', '.join(columns)}")
-    if not body.strip():
+        raise LogError(f"{file}:1: header is '{header[:60]}', expected type,timestamp,positions,...")
+    if "positions" not in lists:
+        raise LogError(f"{file}:1: column 'positions' is missing; the header has: {', '.join(columns)}")
+    body = body.rstrip()
+    if not body:
         raise LogError(f"{file}: holds no rows; delete the motion folder or record it again")
-    _check_rows(file, body, n, len(lists))
-    table = np.loadtxt(io.StringIO(re.sub(r'["\[\]]', "", body)), delimiter=",", usecols=range(1, 2 + n * len(lists)),
-                       ndmin=2)  # fmt: skip
+    table = _parse(file, body, n, len(lists))
     time = table[:, 0] * _seconds(file, table[:, 0])
     return time, {name: table[:, 1 + i * n : 1 + (i + 1) * n] for i, name in enumerate(lists)}
 
 
-def _check_rows(file: Path, body: str, n: int, k: int) -> None:
-    """Every row is TYPE,time and k lists of n numbers; refuse the first that is not, by line."""
-    number = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
-    row = re.compile(rf'[A-Za-z_]+,{number}(?:,"\[{number}(?:,{number}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
-    for i, line in enumerate(body.splitlines()):
-        if line and not row.fullmatch(line):
+def _parse(file: Path, body: bytes, n: int, k: int) -> Array:
+    """Numbers of all rows, (rows, 1 + k n). The whole body is looked at once; lines singly only to name a bad one."""
+    import pyarrow as pa
+    import pyarrow.csv as csv
+
+    skeletons = set(body.translate(None, DIGITS).split(b"\n"))
+    numbers = b'"[' + b"," * (n - 1) + b']"'
+    kinds = {s.partition(b",")[0] for s in skeletons}
+    if not skeletons <= {b",".join([kind, b"", *[numbers] * k]) for kind in kinds if kind}:
+        _refuse_row(file, body, n, k)
+    names = [str(i) for i in range(2 + n * k)]
+    try:
+        table = csv.read_csv(
+            pa.py_buffer(body.translate(None, b'"[]\r')),
+            read_options=csv.ReadOptions(column_names=names, use_threads=False),
+            parse_options=csv.ParseOptions(ignore_empty_lines=False),
+            convert_options=csv.ConvertOptions(
+                include_columns=names[1:], column_types=dict.fromkeys(names[1:], pa.float64()), null_values=[""]
+            ),
+        )
+    except pa.ArrowInvalid as error:
+        _refuse_row(file, body, n, k)
+        raise LogError(f"{file}: not readable: {error}; record the motion again") from None
+    if any(column.null_count for column in table.columns):
+        _refuse_row(file, body, n, k)
+    return np.column_stack([column.to_numpy() for column in table.columns])
+
+
+def _refuse_row(file: Path, body: bytes, n: int, k: int) -> None:
+    """Raise for the first line that is not TYPE,time and k lists of n numbers; return where all are."""
+    row = re.compile(rf'[A-Za-z_]+,{NUMBER}(?:,"\[{NUMBER}(?:,{NUMBER}){{{n - 1}}}\]"){{{k}}}', re.IGNORECASE)
+    for i, line in enumerate(body.decode("utf-8", errors="replace").split("\n")):
+        if not row.fullmatch(line.rstrip("\r")):
             shown = line if len(line) < 60 else line[:57] + "..."
             raise LogError(
                 f"{file}:{i + 2}: expected TYPE,timestamp and {k} list(s) of {n} numbers, got '{shown}'; "
@@ -95,13 +139,22 @@ def _seconds(file: Path, time: Array) -> float:
         return 1.0
     if 1e2 <= period <= 1e6:
         return 1e-6
-    if period <= 0:
-        return 1e-6  # Log refuses the row where time goes back
+    if not period > 0:
+        return 1e-6  # Log refuses the row where time goes back or is not a number
     raise LogError(f"{file}: the median period is {period:g}, neither microseconds nor seconds; mend the timestamps")
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise LogError(
+            f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"
+        ) from None
 
 
 def _events(file: Path) -> list[list[str]]:
     if not file.is_file():
         return []
-    rows = [line.split(",") for line in file.read_text(encoding="utf-8").splitlines()[1:] if line.strip()]
+    rows = [line.split(",") for line in _text(file).splitlines()[1:] if line.strip()]
     return [[r[1].strip(), r[2].strip()] for r in rows if len(r) >= 3]

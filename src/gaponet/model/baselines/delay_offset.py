@@ -16,7 +16,7 @@ Array = np.ndarray
 
 MAX_DELAY = 0.16  # s, in steps of the control period
 PIECE = 20.0  # s, free run per fitting piece
-FRAMES = 40_000  # frames fitted on at most
+FRAMES = 20_000  # frames fitted on at most
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def fit(
     zero = dict.fromkeys(names, 0.0)
     for i, delay in enumerate(delays):
         candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
-        twins = replay(part, robot, candidate.corrector(robot), nthread)
+        twins = replay(part, robot, candidate.corrector(robot), nthread, lock_idle=True)
         e = np.concatenate([(s.qpos - t.qpos)[1:, op] for s, t in zip(part, twins, strict=True)])
         offset[i] = np.median(e, axis=0)
         error[i] = np.abs(e - offset[i]).mean(axis=0)

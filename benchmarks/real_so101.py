@@ -1,0 +1,137 @@
+"""The README's table and picture: real SO-101 logs, 3 seeds, whole-motion free run on 10 motions never used for choosing.
+
+    python benchmarks/real_so101.py LOGS WORK [--budget 8m] [--mlp-budget 4m] [--seeds 0 1 2]
+
+Calls the commands a user would call; writes docs/results/real_so101.{json,md,svg,png}. Runs that exist in WORK are kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+
+from gaponet.eval.figures import COLOURS, NAMES, STYLE, figure
+
+DOCS = Path(__file__).parents[1] / "docs" / "results"
+ENVIRONMENT = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}
+
+
+def gaponet(*words: object) -> dict[str, Any]:
+    """Run a command with --json and return its object."""
+    command = [sys.executable, "-m", "gaponet.cli.main", *map(str, words), "--json"]
+    print("gaponet", *words, flush=True)
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    return json.loads(done.stdout)
+
+
+def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int]) -> list[dict[str, Any]]:
+    """One evaluation per seed, MLP and GAPONet side by side."""
+    data = work / "data"
+    if not data.exists():
+        gaponet("import", logs, "--robot", "so101", "--unit-id", "lab", "--payload-mass", 0, "--out", data)
+    for seed in seeds:
+        for kind, budget in budgets.items():
+            if not (work / f"{kind}-{seed}" / "model" / "card.json").exists():
+                gaponet("train", data, "--out", work / f"{kind}-{seed}", "--model", kind, "--seed", seed, "--budget", budget)
+    return [gaponet("eval", work / f"gaponet-{s}", data, "--also", work / f"mlp-{s}") for s in seeds]
+
+
+def spread(results: list[dict[str, Any]], *path: str) -> tuple[float, float]:
+    """Mean and standard deviation over seeds of one number of a method."""
+    values = []
+    for value in (r["methods"] for r in results):
+        for key in path:
+            value = value[key]
+        values.append(value)
+    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Markdown, method by method."""
+    nominal = spread(results, "nominal", "mpjae")[0]
+    rows = ["| method | MPJAE, mrad | of nominal | Q_dis, rad·s | share ≥ 0.05 rad |", "| --- | ---: | ---: | ---: | ---: |"]
+    for name in results[0]["methods"]:
+        mean, std = spread(results, name, "mpjae")
+        text = f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std else f"{mean * 1e3:.2f}"
+        large = spread(results, name, "large_0.05")[0] * 100
+        rows.append(f"| {NAMES[name]} | {text} | {mean / nominal:.2f} | {spread(results, name, 'q_dis')[0]:.2f} | {large:.1f} % |")
+    return "\n".join(rows)
+
+
+def draw(results: list[dict[str, Any]], run: Path) -> None:
+    """Error by joint with spread over seeds; one joint of one held-out motion beside it."""
+    with mpl.rc_context(STYLE | {"font.size": 10}):  # type: ignore[arg-type]
+        fig = figure(10.5, 3.6)
+        left, right = fig.subplots(1, 2, width_ratios=[1, 1.15])
+        methods = list(results[0]["methods"])
+        joints = list(results[0]["methods"]["nominal"]["by_joint"])
+        width = 0.8 / len(methods)
+        for i, name in enumerate(methods):
+            values = np.array([spread(results, name, "by_joint", j, "mpjae") for j in joints]) * 1e3
+            x = np.arange(len(joints)) + (i - (len(methods) - 1) / 2) * width
+            left.bar(x, values[:, 0], width * 0.92, yerr=values[:, 1] if values[:, 1].any() else None, color=COLOURS[name],
+                     error_kw={"lw": 0.8}, label=NAMES[name])  # fmt: skip
+        left.set_xticks(np.arange(len(joints)), [j.replace("_", "\n") for j in joints])
+        left.grid(axis="x", visible=False)
+        left.set_ylabel("MPJAE, mrad")
+        left.set_title("Real SO-101, 10 held-out motions, whole-motion free run")
+        _trajectory(right, run, joints)
+        handles, labels = left.get_legend_handles_labels()
+        fig.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        for suffix in ("svg", "png"):
+            fig.savefig(DOCS / f"real_so101.{suffix}", dpi=160)
+
+
+def _trajectory(ax: Any, run: Path, joints: list[str]) -> None:
+    shown = json.loads((run / "metrics.json").read_text())["shown"]
+    row = next((i for i, s in enumerate(shown) if s["motion"] == "dual_joint_elbow_wrist"), 0)
+    with np.load(run / "trajectories.npz") as arrays:
+        j = joints.index("elbow_flex")
+        n = round(25 / shown[row]["dt"])
+        time = np.arange(n) * shown[row]["dt"]
+        part = slice(n // 2, n // 2 + n)
+        for name in ("nominal", "delay_offset", "gaponet"):
+            ax.plot(time, arrays[f"{row}/{name}"][part, j], color=COLOURS[name])
+        ax.plot(time, arrays[f"{row}/recorded"][part, j], color=COLOURS["recorded"], ls=(0, (4, 1.5)), lw=1)
+    ax.set_title(f"elbow_flex in {shown[row]['motion']} (dashed: the robot)")
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("position, rad")
+
+
+def main() -> None:
+    """Measure, write, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--budget", default="8m")
+    parser.add_argument("--mlp-budget", default="4m")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    args = parser.parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    results = measure(args.logs, args.work, {"gaponet": args.budget, "mlp": args.mlp_budget}, args.seeds)
+    DOCS.mkdir(parents=True, exist_ok=True)
+    first = results[0]
+    text = (
+        f"# Real SO-101\n\nWhole-motion free run on {first['sequences']} held-out motions, mean ± std over seeds "
+        f"{args.seeds}; training budgets {args.budget} (GAPONet) and {args.mlp_budget} (MLP) of wall-clock time on 2 cores; "
+        f"{date.today()}.\nSimulator {first['simulator_hash']}. Regenerate: "
+        f"`python benchmarks/real_so101.py LOGS WORK --budget {args.budget} --mlp-budget {args.mlp_budget}`.\n\n"
+        f"{table(results)}\n\nHeld-out motions: {', '.join(first['motions'])}.\n\n![](real_so101.svg)\n"
+    )
+    (DOCS / "real_so101.md").write_text(text, encoding="utf-8")
+    (DOCS / "real_so101.json").write_text(json.dumps(dict(zip(map(str, args.seeds), results, strict=True)), indent=1) + "\n")
+    draw(results, args.work / f"gaponet-{args.seeds[0]}")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""`gaponet collect`: play a recipe on a virtual fleet and record it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import tyro
+
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+
+
+def collect(
+    out: Path,
+    robot: str = "h1_2",
+    fleet: str = "default",
+    recipe: str = "small",
+    payloads: tuple[float, ...] = (),
+    units: tuple[str, ...] = (),
+    seed: int = 0,
+    nproc: int = 0,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset.
+
+    Run again after an interruption: what is there is kept, what is missing is recorded, and the result is the same.
+
+    Args:
+        out: Dataset folder.
+        robot: A robot of the package, or a folder with robot.toml.
+        fleet: Virtual units: default, shifted, or a .toml file.
+        recipe: demo (under a minute), small (about two), simlifter (an hour), arm (any robot), or a .toml file.
+        payloads: kg per hand instead of the recipe's.
+        units: Units of the fleet instead of the recipe's.
+        seed: Of motions, noise and start states.
+        nproc: Processes; 0 for one per core.
+        json: Print one JSON object on stdout.
+    """
+    import gaponet.collect as recording
+    from gaponet.robot import load_robot
+    from gaponet.virtual.fleet import load_fleet
+
+    spec, screen = load_robot(robot), Out(json)
+    plan = recording.load_recipe(recipe)
+    plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
+    with bar("virtual recordings") as update:
+        done = recording.collect(
+            spec,
+            load_fleet(fleet, spec),
+            plan,
+            out,
+            seed,
+            nproc,
+            lambda k, total, seconds: update(k, total, f"{k} of {total}, {seconds / 3600:.2f} h recorded"),
+        )
+    screen.table(
+        f"{done.out}: recorded on VIRTUAL robots (fleet {fleet})",
+        ["", ""],
+        [
+            ["sequences written", str(done.written)],
+            ["already there", str(done.present)],
+            ["recorded time", f"{done.hours:.2f} h"],
+            ["wall time", f"{done.wall_s:.0f} s ({done.times_real_time:.0f} × real time)"],
+        ],
+    )
+    screen.result(
+        {
+            "dataset": done.out,
+            "virtual": True,
+            "written": done.written,
+            "present": done.present,
+            "hours": done.hours,
+            "wall_s": done.wall_s,
+            "times_real_time": done.times_real_time,
+        }
+    )

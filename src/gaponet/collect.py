@@ -1,0 +1,182 @@
+"""Record a recipe on a virtual fleet into a dataset, on all cores, and go on where a killed run stopped.
+
+Every sequence is a function of seed, fleet, motion, unit, payload, rate and repetition alone: a recipe that was
+interrupted is continued by running it again, and ends with the same samples as one that was not.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.store import Dataset, write_text
+from gaponet.errors import DatasetError
+from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
+from gaponet.robot import RobotSpec
+from gaponet.virtual.fleet import Fleet
+from gaponet.virtual.play import Job, library, play
+
+__all__ = ["Collected", "Recipe", "collect", "load_recipe"]
+
+Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
+
+ROWS = 72  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a call to collect did."""
+
+    out: str
+    written: int
+    present: int  # takes that were there before
+    hours: float  # recorded now
+    wall_s: float
+
+    @property
+    def times_real_time(self) -> float:
+        """Recorded time over wall time."""
+        return self.hours * 3600 / self.wall_s if self.wall_s > 0 else 0.0
+
+
+def collect(
+    robot: RobotSpec,
+    fleet: Fleet,
+    recipe: Recipe,
+    out: str | Path,
+    seed: int = 0,
+    nproc: int = 0,
+    progress: Progress | None = None,
+) -> Collected:
+    """Record every take of a recipe that the dataset at `out` does not hold yet.
+
+    Args:
+        robot: The type that is played.
+        fleet: Virtual units of that type.
+        recipe: What to play.
+        out: Dataset folder; made if missing.
+        seed: Of motions and of everything random in a take.
+        nproc: Processes; 0 for one per core, 1 for none beside this one. More than one starts fresh interpreters: a
+            script that calls this needs `if __name__ == "__main__":`.
+        progress: Called after each sequence.
+
+    Raises:
+        UsageError: The recipe names a motion, unit or file that does not exist.
+        DatasetError: `out` holds something else, or another collect is writing there.
+    """
+    start = time.monotonic()
+    for unit in recipe.units:
+        fleet.unit(unit)
+    wanted = takes(recipe, library(robot, seed, recipe).names(recipe.variants))
+    Dataset.create(out, robot)
+    with _alone(Path(out)):
+        dataset = Dataset(out)
+        _claim(dataset, robot, fleet, recipe, seed)
+        present = {_key(m.motion, m.unit_id, m.payload_mass, dt, m.repetition) for m, dt in _listed(dataset)}
+        missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
+        written, seconds = 0, 0.0
+        jobs = [Job(robot, fleet, recipe, seed, tuple(part)) for part in _parts(missing)]
+        for sequence in _record(jobs, nproc or os.cpu_count() or 1):
+            dataset.append(sequence)
+            written += 1
+            seconds += sequence.duration
+            if progress:
+                progress(written, len(missing), seconds)
+    return Collected(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
+
+
+def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> tuple[object, ...]:
+    """What a sequence is, apart from its samples; two of the same key would be the same recording."""
+    return motion, unit, payload, round(dt * 1e9), repetition
+
+
+def _listed(dataset: Dataset) -> list[tuple[SequenceMeta, float]]:
+    return [(entry.meta, entry.dt) for entry in dataset.entries]
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """One collector per folder. The lock goes with its process, however that ends; what a killed one left is cleared."""
+    import fcntl
+
+    with (folder / "collect.lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DatasetError(f"{folder}: another gaponet collect is writing here; wait for it or stop it") from None
+        for temporary in (folder / "sequences").glob(".*.tmp"):
+            temporary.unlink()
+        yield
+
+
+def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int) -> None:
+    """Write beside the data what made it; refuse to mix it with what something else made."""
+    path = dataset.path / "collect.json"
+    mine = {
+        "virtual": True,
+        "robot": robot.name,
+        "fleet": fleet.name,
+        "fleet_sha256": fleet.digest(),
+        "seed": seed,
+        "max_payload": max(recipe.payloads),
+        "payload_side": recipe.payload_side,
+    }
+    if path.is_file():
+        theirs = json.loads(path.read_text(encoding="utf-8"))
+        for key, value in mine.items():
+            if theirs.get(key) != value:
+                raise DatasetError(
+                    f"{dataset.path}: was collected with {key} {theirs.get(key)!r}, not {value!r} (collect.json); "
+                    "choose another folder"
+                )
+    elif len(dataset):
+        raise DatasetError(f"{dataset.path}: holds sequences that were not collected here; choose another folder")
+    else:
+        write_text(path, json.dumps(mine, indent=1) + "\n")
+
+
+def _parts(missing: list[Take]) -> Iterator[list[Take]]:
+    """Whole motions at one rate together, up to about ROWS takes."""
+    by_rate: dict[float, dict[str, list[Take]]] = {}
+    for take in missing:
+        by_rate.setdefault(take.rate, {}).setdefault(take.motion, []).append(take)
+    for motions in by_rate.values():
+        part: list[Take] = []
+        for group in motions.values():
+            if part and len(part) + len(group) > ROWS:
+                yield part
+                part = []
+            part = part + group
+        if part:
+            yield part
+
+
+def _record(jobs: list[Job], nproc: int) -> Iterator[Sequence]:
+    """Sequences in the jobs' order, whichever process is first."""
+    if nproc == 1 or len(jobs) < 2:
+        for job in jobs:
+            yield from play(job)
+        return
+    with ProcessPoolExecutor(min(nproc, len(jobs)), get_context("spawn"), _leave_with, (os.getpid(),)) as pool:
+        for sequences in pool.map(play, jobs):
+            yield from sequences
+
+
+def _leave_with(parent: int) -> None:
+    """A worker whose parent was killed would wait for work forever: it ends itself instead."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,19 @@
+"""Checks: what a person must know about a dataset, judged from the surveys of its sequences.
+
+A check takes the surveys and the robot and yields findings; where nothing is wrong it says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from gaponet.data.checks.finding import Finding
+from gaponet.data.checks.motor import lag, sag, torque
+from gaponet.data.checks.recording import blocked, rate, regularity, saturation, stuck
+from gaponet.data.checks.wiring import labels, limits, order, sign, unit
+from gaponet.data.survey import Survey
+from gaponet.robot import RobotSpec
+
+CHECKS: tuple[Callable[[list[Survey], RobotSpec], Iterator[Finding]], ...] = (
+    order, sign, unit, limits, rate, regularity, blocked, saturation, stuck, lag, sag, torque, labels,
+)  # fmt: skip

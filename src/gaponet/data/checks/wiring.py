@@ -1,0 +1,139 @@
+"""Is the log what it says: order, sign, unit and range of its joints, and its labels?"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+
+from gaponet.data.checks.finding import Finding, some
+from gaponet.data.survey import Survey
+from gaponet.robot import RobotSpec
+
+MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
+
+
+def order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Does each command move its own joint?"""
+    guilty: dict[tuple[int, int], list[float]] = defaultdict(list)
+    asked = np.zeros(len(robot.joint_names), int)
+    for s in surveys:
+        moved = s.ctrl_range > MOVED
+        asked += moved
+        for i in np.flatnonzero(moved & (np.diag(s.follows) < 0.3) & (np.diag(s.opposes) < 0.6)):
+            others = np.flatnonzero((s.follows[i] > 0.6) & ((s.ctrl_range < 0.02) | (s.follows[:, i] > 0.6)))
+            if others.size:
+                j = int(others[s.follows[i, others].argmax()])
+                guilty[int(i), j].append(float(s.follows[i, j]))
+    swapped = {pair: found for pair, found in guilty.items() if 2 * len(found) >= asked[pair[0]]}
+    for (own, other), found in swapped.items():
+        a, b = robot.joint_names[own], robot.joint_names[other]
+        text = (
+            f"the command of {a} moves {b}, not {a} (correlation {np.median(found):.2f}, {len(found)} of {asked[own]} "
+            "motions): names are swapped; import again with --map NAME_IN_LOG=NAME_OF_ROBOT"
+        )
+        yield Finding("error", "order", text, (a, b))
+    idle = tuple(name for name, count in zip(robot.joint_names, asked, strict=True) if not count)
+    if idle:
+        level = "warning" if set(idle) & set(robot.operated) else "note"
+        text = f"no motion commands {some(list(idle))} over more than {MOVED:g} rad: nothing can be learned there"
+        yield Finding(level, "order", text, idle)
+    if not swapped:
+        yield Finding("ok", "order", "each command moves the joint of its name")
+
+
+def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Does each joint move the way it is told?"""
+    wrong = []
+    for i, name in enumerate(robot.joint_names):
+        asked = [s for s in surveys if s.ctrl_range[i] > MOVED]
+        against = [s for s in asked if s.opposes[i, i] > 0.6 and s.follows[i, i] < 0.3]
+        if against and 2 * len(against) >= len(asked):
+            wrong.append(name)
+            text = (
+                f"{name} moves against its command in {len(against)} of {len(asked)} motions: command and state have "
+                "opposite signs; negate one of them and import again"
+            )
+            yield Finding("error", "sign", text, (name,))
+    if not wrong:
+        yield Finding("ok", "sign", "no joint moves against its command")
+
+
+def unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Are commands, positions and velocities in the same unit, and is it the radian?"""
+    wrong = []
+    for i, name in enumerate(robot.joint_names):
+        asked = [s.qpos_range[i] / s.ctrl_range[i] for s in surveys if s.ctrl_range[i] > MOVED]
+        ratio = float(np.median(asked)) if asked else 1.0
+        if ratio > 10 or 0 < ratio < 0.03:  # between 0.03 and 0.1 it may as well be stuck
+            text = (
+                f"{name} moves {ratio:.3g} times as far as commanded (57.3 and 0.0175 are degrees beside radians): "
+                "import again with the right units"
+            )
+            wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
+        gains = [s.qvel_gain[i] for s in surveys if np.isfinite(s.qvel_gain[i])]
+        gain = float(np.median(gains)) if gains else 1.0
+        if not 0.5 < gain < 2:
+            text = (
+                f"recorded velocity of {name} is {gain:.3g} times the derivative of its position: not rad/s; leave the "
+                "velocity out at import, it is then computed"
+            )
+            wrong.append(Finding("warning", "unit", text, (name,), {"ratio": gain}))
+    widest = max(float(s.ctrl_range.max()) for s in surveys)
+    if widest < 0.12:
+        wrong.append(
+            Finding("warning", "unit", f"no command spans more than {widest:.3f} rad: were radians read as degrees?")
+        )
+    yield from _converted(surveys, robot)
+    yield from wrong or [Finding("ok", "unit", "commands, positions and velocities agree in unit")]
+
+
+def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    odd: dict[str, str] = {}
+    for s in surveys:
+        odd |= s.entry.meta.notes.get("converted_from", {})
+    degrees = tuple(name for name, was in odd.items() if was == "deg")
+    if degrees:
+        yield Finding("note", "unit", f"logged in degrees, converted: {', '.join(degrees)}", degrees)
+    for name, was in odd.items():
+        if was == "fraction":
+            low, high = robot.qpos_range[robot.joint_names.index(name)]
+            text = (
+                f"{name} is logged as 0..1, not in rad: mapped to its range [{low:.2f}, {high:.2f}], velocity computed"
+            )
+            yield Finding("note", "unit", text, (name,))
+
+
+def limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Do commands and positions stay in the joint ranges of the MJCF?"""
+    found = []
+    for i, name in enumerate(robot.joint_names):
+        low, high = robot.qpos_range[i]
+        for what, level, slack, ends in (
+            ("commanded", "warning", 0.01, [s.ctrl_limits[i] for s in surveys]),
+            ("measured", "note", 0.05, [s.qpos_limits[i] for s in surveys]),
+        ):
+            beyond = np.array([max(low - a, b - high) for a, b in ends])
+            if (beyond > slack).any():
+                clips = ", and the simulator clips there" if what == "commanded" else ""
+                text = (
+                    f"{name} is {what} up to {beyond.max():.3f} rad beyond [{low:.2f}, {high:.2f}] in "
+                    f"{(beyond > slack).sum()} sequence(s), worst {surveys[int(beyond.argmax())].motion}{clips}: check "
+                    "its zero, or its range in robot.xml"
+                )
+                found.append(Finding(level, "range", text, (name,), {"beyond_rad": float(beyond.max())}))
+    yield from found or [Finding("ok", "range", "commands and positions stay inside the joint ranges")]
+
+
+def labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Is one recording filed under two payloads or units?"""
+    seen: dict[str, list[str]] = defaultdict(list)
+    for s in surveys:
+        seen[s.samples].append(s.entry.id)
+    found = [
+        Finding("error", "labels", f"same samples under different labels: {', '.join(ids)}; remove the wrong one")
+        for ids in seen.values()
+        if len(ids) > 1
+    ]
+    yield from found or [Finding("ok", "labels", "no recording is filed twice")]

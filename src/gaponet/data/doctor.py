@@ -1,0 +1,118 @@
+"""Doctor: looks through a dataset and says what a person must know before training on it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.checks import CHECKS
+from gaponet.data.checks.finding import LEVELS, Finding
+from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
+from gaponet.data.store import Dataset
+from gaponet.data.survey import Survey, survey
+from gaponet.errors import DatasetError
+from gaponet.robot import RobotSpec
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """findings: worst first. sequences, joints: one row of numbers each, for tables."""
+
+    findings: list[Finding]
+    sequences: list[dict[str, Any]]
+    joints: list[dict[str, Any]]
+
+    def count(self, level: str) -> int:
+        """Findings of a level."""
+        return sum(f.level == level for f in self.findings)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        errors, warnings = self.count("error"), self.count("warning")
+        if errors:
+            return f"Do not train on this yet: {errors} error(s) and {warnings} warning(s)."
+        if warnings:
+            return f"Usable. Read the {warnings} warning(s) first."
+        return "Good: nothing found that training should not see."
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "verdict": self.verdict,
+            "findings": [asdict(f) for f in self.findings],
+            "sequences": self.sequences,
+            "joints": self.joints,
+        }
+
+
+def diagnose(
+    dataset: Dataset, robot: RobotSpec, progress: Callable[[float, float, str], None] | None = None
+) -> Diagnosis:
+    """Survey every sequence, one in memory at a time, and judge them together.
+
+    Args:
+        dataset: At least one sequence.
+        robot: The dataset's robot.
+        progress: Called with done, total and the motion.
+    """
+    dataset.require_robot(robot)
+    if not dataset.entries:
+        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+    surveys: list[Survey] = []
+    for entry in dataset.entries:
+        surveys.append(survey(entry, dataset.read(entry), robot))
+        if progress:
+            progress(len(surveys), len(dataset), entry.meta.motion)
+    findings = [f for check in CHECKS for f in check(surveys, robot)]
+    findings.sort(key=lambda f: -LEVELS.index(f.level))
+    return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
+
+
+def inventory(dataset: Dataset) -> str:
+    """How much there is, of which units and payloads."""
+    motions = len({e.meta.motion for e in dataset.entries})
+    units = Counter(e.meta.unit_id for e in dataset.entries)
+    payloads = sorted({e.meta.payload_mass for e in dataset.entries})
+    virtual = sum(e.meta.virtual for e in dataset.entries)
+    kind = f", {virtual} of them VIRTUAL" if virtual else ""
+    return (
+        f"{len(dataset)} sequences{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
+        f"units {', '.join(units)}; payloads {', '.join(f'{p:g}' for p in payloads)} kg"
+    )
+
+
+def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
+    lags = {name: round(x[0], 4) for name, x in fast_lags([s], robot).items()}
+    meta = s.entry.meta
+    return {
+        "motion": meta.motion, "unit": meta.unit_id, "payload_mass": meta.payload_mass, "repetition": meta.repetition,
+        "rows": s.entry.rows, "seconds": round(s.entry.rows * s.entry.dt, 2), "rate_hz": round(s.rate_hz, 2),
+        "jitter_ms": s.jitter_ms, "longest_gap_ms": s.longest_gap_ms, "rows_are": meta.notes.get("rows", ""),
+        "fast_lag_s": lags,
+    }  # fmt: skip
+
+
+def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]:
+    lags, rests = fast_lags(surveys, robot), static_errors(surveys, robot)
+    ctrl = np.array([s.ctrl_limits for s in surveys])  # (sequences, n, 2)
+    qpos = np.array([s.qpos_limits for s in surveys])
+    rows = []
+    for i, name in enumerate(robot.joint_names):
+        rest = rests.get(name)
+        rows.append({
+            "joint": name,
+            "operated": name in robot.operated,
+            "commanded_rad": [float(ctrl[:, i, 0].min()), float(ctrl[:, i, 1].max())],
+            "measured_rad": [float(qpos[:, i, 0].min()), float(qpos[:, i, 1].max())],
+            "lag_s": lag_values(lags[name]) if name in lags else None,
+            "static_error_rad": rest.middle if rest and np.isfinite(rest.middle) else None,
+            "stiction_band_rad": rest.half_band if rest and rest.balanced else None,
+            "rests": rest.up + rest.down if rest else 0,
+            "torque_spikes": sum(int(s.torque.spikes[i]) for s in surveys if s.torque),
+        })  # fmt: skip
+    return rows

@@ -1,0 +1,178 @@
+"""Survey: what one sequence shows about its own recording, measured and not yet judged."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.data.holds import Holds, find_holds
+from gaponet.data.sequence import Sequence
+from gaponet.data.signals import differentiate, estimate_delay, fast_speed
+from gaponet.data.store import Entry
+from gaponet.robot import RobotSpec
+
+Array = np.ndarray
+
+MAX_LAG_S = 0.4
+BLOCKED_ERROR = 0.15  # standing this far from a command, rad; a loaded joint may, so the command must also move
+BLOCKED_CHANGE = 0.1  # by this, rad, without moving the joint
+STAND_S, STAND = 0.2, 0.005  # a joint that moves less than this in this time stands: s, rad
+FROZEN_CHANGE = 0.1  # the command must move this far while the state repeats itself, rad
+TORQUE_NOISE = 0.05  # of the limit; a reading may exceed it by that
+SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
+
+
+@dataclass(frozen=True)
+class Torque:
+    """Of one sequence: per joint (n) least and greatest value, N·m, rows above the limit, rows that are spikes."""
+
+    low: Array
+    high: Array
+    over_limit: Array
+    spikes: Array
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Numbers of one sequence; n joints in robot order.
+
+    Attributes:
+        entry: Which sequence.
+        samples: Hash of command and state alone, whatever unit or payload they are filed under.
+        rate_hz, jitter_ms, longest_gap_ms: Of the state's own timestamps; jitter is the largest deviation from median.
+        ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.
+        speed: signals.fast_speed of the command, (n), rad/s.
+        delay: (n) s, NaN where the motion does not say.
+        follows, opposes: (n, n); [i, j] is the greatest correlation of commanded velocity i with measured velocity j,
+            and with its negative, at lags up to MAX_LAG_S; 0 where one does not move; periodic motion does both.
+        qvel_gain: Recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves.
+        blocked_s, blocked_at: Longest stand-still far from a command that moves on, (n) s, and where, rad.
+        frozen_s: Longest stretch in which no sample of the state changed while the command moved, s.
+        torque: None where no torque was recorded.
+        holds: Rests.
+    """
+
+    entry: Entry
+    samples: str
+    rate_hz: float
+    jitter_ms: float
+    longest_gap_ms: float
+    ctrl_limits: Array
+    qpos_limits: Array
+    speed: Array
+    delay: Array
+    follows: Array
+    opposes: Array
+    qvel_gain: Array
+    blocked_s: Array
+    blocked_at: Array
+    frozen_s: float
+    torque: Torque | None
+    holds: Holds
+
+    @property
+    def motion(self) -> str:
+        """Name."""
+        return self.entry.meta.motion
+
+    @property
+    def ctrl_range(self) -> Array:
+        """(n) rad."""
+        return np.ptp(self.ctrl_limits, axis=1)
+
+    @property
+    def qpos_range(self) -> Array:
+        """(n) rad."""
+        return np.ptp(self.qpos_limits, axis=1)
+
+
+def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
+    """Measure one sequence."""
+    ctrl, qpos, dt, notes = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes
+    blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
+    follows, opposes = _follows(ctrl, qpos, dt)
+    return Survey(
+        entry=entry,
+        samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
+        rate_hz=float(notes.get("rate_hz", 1 / dt)),
+        jitter_ms=float(notes.get("jitter_ms", 0.0)),
+        longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
+        ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
+        qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
+        speed=fast_speed(ctrl, dt),
+        delay=estimate_delay(ctrl, qpos, dt, MAX_LAG_S),
+        follows=follows,
+        opposes=opposes,
+        qvel_gain=_qvel_gain(sequence),
+        blocked_s=blocked_s,
+        blocked_at=blocked_at,
+        frozen_s=_frozen(sequence),
+        torque=_torque(sequence, robot),
+        holds=find_holds(sequence, robot.operated_index),
+    )
+
+
+def _follows(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
+    """Velocities over a step of about 60 ms; lags in steps of about 40 ms."""
+    span, stride = max(1, round(0.06 / dt)), max(1, round(0.04 / dt))
+    u, v = ctrl[span:] - ctrl[:-span], qpos[span:] - qpos[:-span]
+    most, least = np.zeros((2, ctrl.shape[1], ctrl.shape[1]))
+    for lag in range(0, min(round(MAX_LAG_S / dt), len(u) // 2) + 1, stride):
+        a, b = u[: len(u) - lag], v[lag:]
+        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        scale = np.sqrt(np.outer((a**2).sum(axis=0), (b**2).sum(axis=0)))
+        correlation = (a.T @ b) / np.where(scale > 0, scale, np.inf)
+        most, least = np.maximum(most, correlation), np.minimum(least, correlation)
+    return most, -least
+
+
+def _qvel_gain(sequence: Sequence) -> Array:
+    derivative = differentiate(sequence.qpos, sequence.dt)
+    power = (derivative**2).sum(axis=0)
+    moves = np.ptp(sequence.qpos, axis=0) > 0.05
+    return np.where(moves, (sequence.qvel * derivative).sum(axis=0) / np.where(power > 0, power, 1.0), np.nan)
+
+
+def _blocked(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
+    w = max(1, round(STAND_S / dt))
+    stands = np.zeros(qpos.shape, bool)
+    stands[w:] = np.abs(qpos[w:] - qpos[:-w]) < STAND
+    seconds, places = np.zeros((2, qpos.shape[1]))
+    for j, mask in enumerate((stands & (np.abs(ctrl - qpos) > BLOCKED_ERROR)).T):
+        runs = [r for r in _runs(mask) if np.ptp(ctrl[r, j]) > BLOCKED_CHANGE]
+        if runs:
+            longest = max(runs, key=lambda r: r.stop - r.start)
+            seconds[j], places[j] = (longest.stop - longest.start) * dt, qpos[longest.start, j]
+    return seconds, places
+
+
+def _frozen(sequence: Sequence) -> float:
+    """A resting robot repeats its positions; one whose every signal repeats while it is told to move is not read."""
+    state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
+    same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
+    told = [r for r in _runs(same) if np.ptp(sequence.ctrl[r.start : r.stop + 1], axis=0).max() > FROZEN_CHANGE]
+    return max((r.stop - r.start for r in told), default=0) * sequence.dt
+
+
+def _runs(mask: Array) -> list[slice]:
+    """Runs of True in (T,)."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
+    return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
+    if sequence.tau is None:
+        return None
+    from scipy.ndimage import median_filter
+
+    tau = sequence.tau
+    size = np.abs(tau)
+    usual = median_filter(size, size=(max(3, round(SPIKE_WINDOW_S / sequence.dt)), 1), mode="nearest")
+    return Torque(
+        low=tau.min(axis=0),
+        high=tau.max(axis=0),
+        over_limit=(size > robot.effort_limit * (1 + TORQUE_NOISE)).sum(axis=0),
+        spikes=(size - usual > SPIKE_SHARE * robot.effort_limit).sum(axis=0),
+    )

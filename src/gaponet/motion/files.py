@@ -1,0 +1,118 @@
+"""Motion files: SAGE motion txt, csv and npz, read into a Motion and written from one.
+
+SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample, rad,
+at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: arrays joint_names, ctrl (T, k) rad, dt (s).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.errors import LogError
+from gaponet.motion.motion import Motion
+from gaponet.robot import RobotSpec
+
+Array = np.ndarray
+
+SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
+SUFFIXES = (".txt", ".csv", ".npz")
+
+
+def read_motion(
+    path: str | Path, robot: RobotSpec, dt: float | None = None, extra: dict[str, str] | None = None
+) -> Motion:
+    """A motion from a file; joints that the file does not name stay at home.
+
+    Args:
+        path: .txt, .csv or .npz.
+        robot: Decides names, order and home.
+        dt: Sample period, s, where the file does not say; 0.02 for SAGE txt by default.
+        extra: Joint names in the file → the robot's.
+
+    Raises:
+        LogError: Unreadable; with file, line and what is wrong.
+        JointMismatchError: A joint that the robot does not have.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
+    names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
+    period = dt or period or SAGE_DT
+    columns = robot.index([robot.resolve(name, str(path), extra) for name in names])
+    if len(set(columns.tolist())) != len(columns):
+        raise LogError(f"{path}: two columns are the same joint of {robot.name}; delete one")
+    ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
+    ctrl[:, columns] = rows
+    return Motion(path.stem, level_of(ctrl, robot), period, ctrl)
+
+
+def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
+    """Write a motion: .txt at 50 Hz as SAGE reads it, .csv and .npz at the motion's own period."""
+    path = Path(path)
+    if path.suffix == ".npz":
+        np.savez(path, joint_names=np.array(robot.joint_names), ctrl=motion.ctrl, dt=motion.dt)
+        return
+    if path.suffix not in SUFFIXES:
+        raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
+    names, ctrl = list(robot.joint_names), motion.ctrl
+    if path.suffix == ".txt":
+        ctrl = motion.sample(SAGE_DT)
+    else:
+        names, ctrl = ["time", *names], np.column_stack([np.arange(len(ctrl)) * motion.dt, ctrl])
+    lines = [",".join(names), *(",".join(f"{v:.9g}" for v in row) for row in ctrl)]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def level_of(ctrl: Array, robot: RobotSpec) -> str:
+    """joint when one joint moves, upper_body when only operated joints and torso move, else whole_body."""
+    moved = [name for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True) if span > 1e-6]
+    if len(moved) <= 1:
+        return "joint"
+    upper = {name for name in robot.joint_names if name in robot.operated or name.startswith(("torso", "waist"))}
+    return "upper_body" if set(moved) <= upper and len(upper) < len(robot.joint_names) else "whole_body"
+
+
+def _text(path: Path) -> tuple[list[str], Array, float | None]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: not a text file") from None
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        cells = line.replace(",", " ").split()
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            raise LogError(f"{path}:{number}: not a row of numbers: {line[:60]}") from None
+        if len(row) != len(names) or not np.isfinite(row).all():
+            raise LogError(f"{path}:{number}: {len(row)} values for {len(names)} names, or one is not finite")
+        rows.append(row)
+    if len(rows) < 2:
+        raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
+    table = np.array(rows)
+    if "time" not in names:
+        return names, table, None
+    at = names.index("time")
+    period = np.diff(table[:, at])
+    if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
+        raise LogError(f"{path}: time must rise evenly; it steps by {period.min():.4g} to {period.max():.4g} s")
+    return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
+
+
+def _npz(path: Path) -> tuple[list[str], Array, float | None]:
+    with np.load(path, allow_pickle=False) as file:
+        for key in ("joint_names", "ctrl"):
+            if key not in file:
+                raise LogError(f"{path}: array '{key}' is missing; it holds {', '.join(file.files)}")
+        names, rows = [str(name) for name in file["joint_names"]], np.asarray(file["ctrl"], float)
+        dt = float(file["dt"]) if "dt" in file else None
+    if rows.ndim != 2 or rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
+        raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
+    return names, rows, dt

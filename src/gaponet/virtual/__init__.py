@@ -1,0 +1,1 @@
+"""Robots with hidden physics: the test bench. What they give is marked virtual; nothing that learns may look inside."""

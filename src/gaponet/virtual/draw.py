@@ -1,0 +1,28 @@
+"""`python -m gaponet.virtual.draw FLEET ROBOT`: draw a fleet's units again and write them into its file.
+
+Run once after a distribution or the seed was changed; results from before belong to another fleet.
+"""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+
+from gaponet.robot import load_robot
+from gaponet.virtual.fleet import FLEETS, UNITS, _header, draw, to_toml
+
+MARK = "\n# ---- drawn units ----\n"
+
+
+def main(fleet: str, robot_name: str) -> None:
+    """Keep everything above the mark, replace everything below."""
+    path = FLEETS / f"{fleet}.toml"
+    head = path.read_text(encoding="utf-8").split(MARK)[0]
+    seed, laws = _header(tomllib.loads(head), path)
+    robot = load_robot(robot_name)
+    units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
+    path.write_text(head + MARK + to_toml(robot, units), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

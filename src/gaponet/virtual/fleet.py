@@ -1,0 +1,163 @@
+"""Fleets: virtual units drawn once from written-down distributions, and kept as data.
+
+A fleet file (fleets/*.toml) holds a seed, one [[distribution]] per hidden parameter with its source, and the drawn
+units. All units of a type share what the type has (type_spread, from joint to joint) and differ by what production leaves
+open (unit_spread for the whole unit, joint_spread for each joint of it). For a robot whose units are not in the file they
+are drawn when the fleet is loaded, by the same rule.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec
+from gaponet.virtual.physics import Physics
+
+Array = np.ndarray
+
+FLEETS = Path(__file__).parent / "fleets"
+UNITS = 4
+DIGITS = 6  # significant, of a saved number
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """How one parameter is drawn: (mean + three normal deviations), clipped to [low, high], times the torque limit if so said."""
+
+    name: str
+    mean: float
+    source: str
+    type_spread: float = 0.0
+    unit_spread: float = 0.0
+    joint_spread: float = 0.0
+    low: float = -np.inf
+    high: float = np.inf
+    of_effort: bool = False  # in parts of the joint's torque limit
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Virtual units of one robot type, by id."""
+
+    name: str
+    robot: str
+    seed: int
+    distributions: tuple[Distribution, ...]
+    units: dict[str, Physics]
+
+    def unit(self, unit_id: str) -> Physics:
+        """One unit's hidden physics."""
+        if unit_id not in self.units:
+            raise UsageError(f"fleet '{self.name}' has no unit '{unit_id}'; it has {', '.join(self.units)}")
+        return self.units[unit_id]
+
+    def digest(self) -> str:
+        """Identity of the hidden numbers, 12 hex digits: datasets of different fleets are not mixed."""
+        sha = hashlib.sha256()
+        for unit_id, unit in self.units.items():
+            sha.update(unit_id.encode())
+            for f in fields(Physics):
+                sha.update(np.ascontiguousarray(getattr(unit, f.name), float).tobytes())
+        return sha.hexdigest()[:12]
+
+
+def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
+    """A fleet of the package by name, or a file.
+
+    Raises:
+        UsageError: No such fleet, or the file is not one; with the file and what is wrong.
+    """
+    path = FLEETS / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in FLEETS.glob("*.toml")))
+        raise UsageError(f"no fleet '{name_or_path}': in the package are {known}; or give a .toml file")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    seed, laws = _header(table, path)
+    saved = table.get("robot", {}).get(robot.name)
+    if saved is None:
+        units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
+    else:
+        units = {unit_id: _physics(unit_id, unit, robot, path) for unit_id, unit in saved.items()}
+    return Fleet(str(table.get("name", path.stem)), robot.name, seed, laws, units)
+
+
+def _header(table: dict[str, Any], path: Path) -> tuple[int, tuple[Distribution, ...]]:
+    known = [f.name for f in fields(Physics)]
+    laws = []
+    for entry in table.get("distribution", []):
+        if entry.get("name") not in known:
+            raise UsageError(f"{path}: [[distribution]] names '{entry.get('name')}'; parameters are {', '.join(known)}")
+        try:
+            laws.append(Distribution(**entry))
+        except TypeError as error:
+            raise UsageError(f"{path}: [[distribution]] {entry['name']}: {error}") from None
+    missing = set(known) - {law.name for law in laws}
+    if missing:
+        raise UsageError(f"{path}: no [[distribution]] for {', '.join(sorted(missing))}")
+    if not isinstance(table.get("seed"), int):
+        raise UsageError(f"{path}: seed is missing; add seed = <whole number>")
+    return table["seed"], tuple(laws)
+
+
+def draw(robot: RobotSpec, laws: tuple[Distribution, ...], seed: int, unit: int) -> Physics:
+    """Unit number `unit` (from 1); the type's own deviations come from the seed alone.
+
+    Every parameter has its own stream, so that adding one leaves the others as they were.
+    """
+    n = len(robot.joint_names)
+    scope = {f.name: f.metadata["scope"] for f in fields(Physics)}
+    values = {}
+    for law in laws:
+        stream = int(hashlib.sha256(law.name.encode()).hexdigest()[:8], 16)
+        kind, own = np.random.default_rng([seed, stream, 0]), np.random.default_rng([seed, stream, unit])
+        size = n if scope[law.name] == "joint" else 1
+        deviation = (
+            law.type_spread * kind.standard_normal(size)
+            + law.unit_spread * own.standard_normal()
+            + law.joint_spread * own.standard_normal(size)
+        )
+        value = np.clip(law.mean + deviation, law.low, law.high)
+        if law.of_effort:
+            value = value * robot.effort_limit
+        values[law.name] = np.array([float(f"{v:.{DIGITS}g}") for v in value])
+    return Physics(**values)
+
+
+def _physics(unit_id: str, unit: dict[str, Any], robot: RobotSpec, path: Path) -> Physics:
+    joints = unit.get("joint", {})
+    values = {}
+    for f in fields(Physics):
+        try:
+            if f.metadata["scope"] == "unit":
+                values[f.name] = np.array([float(unit[f.name])])
+            else:
+                values[f.name] = np.array([float(joints[name][f.name]) for name in robot.joint_names])
+        except KeyError as error:
+            raise UsageError(f"{path}: unit '{unit_id}': {f.name}: {error} is missing; draw the fleet again") from None
+    return Physics(**values)
+
+
+def to_toml(robot: RobotSpec, units: dict[str, Physics]) -> str:
+    """The drawn units as the part of a fleet file that follows its distributions."""
+    lines = []
+    for unit_id, unit in units.items():
+        lines.append(f"\n[robot.{robot.name}.{unit_id}]")
+        scopes = {f.name: f.metadata["scope"] for f in fields(Physics)}
+        lines += [f"{name} = {float(getattr(unit, name)[0])!r}" for name, s in scopes.items() if s == "unit"]
+        lines.append(f"[robot.{robot.name}.{unit_id}.joint]")
+        for i, joint in enumerate(robot.joint_names):
+            pairs = [f"{name} = {float(getattr(unit, name)[i])!r}" for name, s in scopes.items() if s == "joint"]
+            lines.append(f"{joint} = {{ {', '.join(pairs)} }}")
+    return "\n".join(lines) + "\n"

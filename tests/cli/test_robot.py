@@ -1,0 +1,70 @@
+"""gaponet robot: what robots there are, and what is wrong with one."""
+
+import json
+
+import pytest
+from arm import TOML, XML, write_arm
+
+from gaponet.cli.main import main
+
+
+def test_list_names_the_packages_robots(capsys):
+    assert main(["robot", "list", "--json"]) == 0
+    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == ["h1_2", "so101"]
+
+
+@pytest.mark.parametrize("name", ["so101", "h1_2"])
+def test_the_packages_robots_are_right(name, capsys):
+    assert main(["robot", "check", name, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["warnings"] == []
+    assert len(result["simulator_hash"]) == 12
+    assert result["joints"][0].keys() >= {"kp", "kd", "effort_limit", "range", "operated"}
+
+
+def test_a_users_folder_is_checked_and_shown(tmp_path, capsys):
+    write_arm(tmp_path / "arm")
+    assert main(["robot", "check", str(tmp_path / "arm")]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "-1.50…1.50" in told
+    assert "hand on fore" in told
+    assert "ok: arm compiles" in told
+
+
+@pytest.mark.parametrize(
+    ("toml", "xml", "warning"),
+    [
+        (TOML.replace("kp = 20.0", "kp = 20.0\nhome = 2.0", 1), XML, "home 2 lies outside its range [-1.50, 1.50]"),
+        (TOML.replace("kp = 20.0", "kp = 0.0", 1), XML, "shoulder: kp is 0; a position-controlled joint needs kp > 0"),
+        (
+            TOML.replace("effort_limit = 5.0", "effort_limit = 0.5", 1),
+            XML,
+            "needs 0.883 N·m to hold its home, its limit is",
+        ),
+        (TOML, XML.replace(' range="-1.5 1.5"', "", 1), "shoulder: has no range in the MJCF"),
+        (TOML.split("[[payload_mount]]")[0], XML, "no [[payload_mount]]: payloads other than 0 will be refused"),
+    ],
+)
+def test_what_compiles_and_is_doubtful_is_a_warning(tmp_path, capsys, toml, xml, warning):
+    write_arm(tmp_path / "arm", toml=toml, xml=xml)
+    assert main(["robot", "check", str(tmp_path / "arm"), "--json"]) == 0
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert any(warning in text for text in warnings)
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (TOML.replace('"elbow"', '"knee"'), "robot.toml names joint 'knee', the MJCF has: elbow, shoulder"),
+        (TOML.replace('"fore"', '"hand"'), "payload mount 'hand' names body 'hand', which is missing"),
+    ],
+)
+def test_a_broken_folder_is_one_line_and_exit_code_2(tmp_path, capsys, toml, message):
+    write_arm(tmp_path / "arm", toml=toml)
+    assert main(["robot", "check", str(tmp_path / "arm")]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_check_without_a_name_says_which_there_are(capsys):
+    assert main(["robot", "check"]) == 2
+    assert "needs a robot name (h1_2, so101) or a folder" in capsys.readouterr().err

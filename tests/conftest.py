@@ -1,0 +1,44 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+from arm import write_arm
+
+from gaponet.data.importer import import_logs
+from gaponet.data.store import Dataset
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model
+
+SHARED = Path(os.environ.get("GAPONET_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def so101() -> RobotSpec:
+    return load_robot("so101")
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> RobotSpec:
+    """The two-joint arm of tests/arm.py as a user's robot folder."""
+    return write_arm(tmp_path / "robots" / "arm")
+
+
+@pytest.fixture(scope="session")
+def sage_so101() -> Path:
+    """The public SO-101 logs: 40 motions of one unit, no payload."""
+    folder = SHARED / "sage_so101"
+    if not folder.is_dir():
+        pytest.skip(f"no real logs at {folder}; set GAPONET_DATA to the folder that holds sage_so101")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def real_dataset(sage_so101: Path, so101: RobotSpec, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    """The public SO-101 logs, imported once; read only."""
+    model = build_model(so101)
+    out = tmp_path_factory.mktemp("real") / "so101"
+    gravity = lambda qpos, mass, side: static_torque(model, qpos)  # noqa: E731
+    return import_logs(sage_so101, so101, "lab", 0.0, out, gravity=gravity, simulator="nominal").dataset

@@ -1,0 +1,219 @@
+"""Tables: CSV and Parquet with named columns; units are said, never guessed."""
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from logs import arm_columns, table_text
+
+from gaponet.data.formats import detect, find_logs, read_logs
+from gaponet.errors import JointMismatchError, LogError, UsageError
+
+SI = {"position_unit": "rad", "time_unit": "s"}
+
+
+def write(path, columns, old="", new=""):
+    path.write_text(table_text(columns).replace(old, new, 1))
+    return path
+
+
+def write_parquet(path, columns):
+    pq.write_table(pa.table({k: pa.array(v) for k, v in columns.items()}), path)
+    return path
+
+
+def only(path, robot, **options):
+    ((_, log),) = read_logs(path, robot, **(SI | options))
+    return log
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_numbers_come_back_as_written(tmp_path, arm, kind):
+    columns = arm_columns() | {"tau.shoulder": np.arange(60.0), "tau.elbow": np.zeros(60), "note": np.ones(60)}
+    file = tmp_path / f"wave.{kind}"
+    (write if kind == "csv" else write_parquet)(file, columns)
+    log = only(file, arm)
+    assert log.joint_names == ("shoulder", "elbow")
+    assert sorted(log.channels) == ["ctrl", "qpos", "tau"]
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(60))
+    assert np.array_equal(log.channels["qpos"].values[:, 1], columns["qpos.elbow"])
+    assert np.array_equal(log.channels["tau"].values[:, 0], np.arange(60.0))
+
+
+def test_a_folder_holds_one_motion_per_file(tmp_path, arm):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    write(folder / "b.csv", arm_columns())
+    write_parquet(folder / "a.parquet", arm_columns())
+    (folder / "readme.txt").touch()
+    (folder / ".hidden.csv").touch()
+    assert detect(folder) == "table"
+    assert [f.name for f in find_logs(folder)] == ["a.parquet", "b.csv"]
+    assert [name for name, _ in read_logs(folder, arm, **SI)] == ["a", "b"]
+
+
+@pytest.mark.parametrize("given", [{}, {"position_unit": "rad"}, {"time_unit": "s"}])
+def test_a_unit_that_was_not_said_is_asked_for(tmp_path, arm, given):
+    file = write(tmp_path / "wave.csv", arm_columns())
+    missing = "position" if "time_unit" in given else "time"
+    with pytest.raises(UsageError, match=f"the table's {missing} unit is not given; say it with --position-unit rad"):
+        list(read_logs(file, arm, **given))
+
+
+def test_90_degrees_are_half_pi_and_1500_ms_are_one_and_a_half_seconds(tmp_path, arm):
+    columns = {name: np.full(4, 90.0) for name in arm_columns()} | {"time": np.array([0.0, 500.0, 1000.0, 1500.0])}
+    columns |= {"qvel.shoulder": np.full(4, 180.0), "qvel.elbow": np.zeros(4)}
+    log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="deg", time_unit="ms")
+    assert log.channels["ctrl"].values[0] == pytest.approx([np.pi / 2] * 2)
+    assert log.channels["qvel"].values[0] == pytest.approx([np.pi, 0])
+    assert log.channels["qpos"].time[-1] == pytest.approx(1.5)
+
+
+def test_a_clock_that_counts_nanoseconds_since_1970_starts_at_zero(tmp_path, arm):
+    columns = arm_columns() | {"time": 1_700_000_000_000_000_000 + 20_000_000 * np.arange(60)}
+    time = only(write_parquet(tmp_path / "wave.parquet", columns), arm, time_unit="ns").channels["qpos"].time
+    assert time[0] == 0
+    assert np.diff(time) == pytest.approx(0.02, abs=1e-6)
+
+
+def test_a_column_map_names_columns_and_units(tmp_path, arm):
+    theirs = dict(zip(["t", "cmd_1", "cmd_2", "pos_1", "pos_2"], arm_columns().values(), strict=True))
+    theirs["t"] = theirs["t"] * 1000
+    file = write(tmp_path / "wave.csv", theirs)
+    toml = tmp_path / "map.toml"
+    toml.write_text(
+        'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
+        '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "deg"\n'
+    )
+    ((_, log),) = read_logs(file, arm, columns=toml)
+    assert np.array_equal(log.channels["qpos"].values[:, 0], theirs["pos_1"])
+    assert np.allclose(log.channels["qpos"].values[:, 1], theirs["pos_2"] * np.pi / 180)
+    assert log.channels["qpos"].time[-1] == pytest.approx(1.18)
+    assert log.meta["converted_from"] == {"elbow": "deg"}
+
+
+def test_a_joint_at_three_quarters_of_its_range_of_three_radians(tmp_path, arm):
+    columns = {name: np.full(4, 0.75) for name in arm_columns()} | {"time": 0.02 * np.arange(4)}
+    log = only(write(tmp_path / "wave.csv", columns), arm, position_unit="fraction")
+    assert log.channels["qpos"].values[0] == pytest.approx([0.75, 0.75])  # -1.5 + 0.75 * 3
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        ('tme = "t"', "'tme' is unknown; use time, time_unit, position_unit"),
+        ('[columns]\n"control.elbow" = "x"', "'control.elbow' is neither time nor ctrl.<joint>, qpos.<joint>"),
+        (
+            '[columns]\n"ctrl.elbow" = "x"',
+            r"column 'x' \(for ctrl.elbow\) is missing; the header has: time, ctrl.shoulder",
+        ),
+        ('time_unit = "min"', "time unit 'min' is not one of s, ms, us, ns"),
+        ('time_unit = "s"\n[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
+        ("time_unit", "not valid TOML"),
+    ],
+)
+def test_a_broken_column_map_says_what_is_wrong(tmp_path, arm, toml, message):
+    (tmp_path / "map.toml").write_text(toml)
+    options = {"position_unit": "rad"} | ({} if "time_unit" in toml else {"time_unit": "s"})
+    file = write(tmp_path / "wave.csv", arm_columns())
+    with pytest.raises((UsageError, LogError), match=message):
+        list(read_logs(file, arm, columns=tmp_path / "map.toml", **options))
+
+
+def test_a_column_map_that_is_not_there_is_named(tmp_path, arm):
+    file = write(tmp_path / "wave.csv", arm_columns())
+    with pytest.raises(UsageError, match=r"--columns .*no\.toml: No such file or directory"):
+        only(file, arm, columns=tmp_path / "no.toml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("time", "clock", r":1: column 'time' is missing; the header has: clock, ctrl.shoulder, .*--columns file"),
+        ("qpos.elbow", "elbow", r":1: column 'qpos.elbow' is missing: every channel needs the same joints"),
+        ("ctrl.elbow", "note", r":1: column 'ctrl.elbow' is missing: every channel needs the same joints"),
+        ("qpos.elbow", "qpos.shoulder", r":1: column 'qpos.shoulder' stands twice; rename one"),
+        ("\n0.04,", "\n0.04,x", r":4: column 'ctrl.shoulder' is 'x.*', not a number; repair or cut the row"),
+        ("\n0.04,", "\n0.04,,", r":4: 6 cells, the header has 5; the file may be cut short"),
+        ("\n0.04,", "\n\n0.04,", r":4: 0 cells, the header has 5"),
+        ("\n0.04,", "\n,", r":4: column 'time' is '', not a number"),
+        ("\n0.04,", "\n0.01,", r":4: time does not increase in channel"),
+    ],
+)
+def test_a_broken_table_is_refused_by_file_and_line(tmp_path, arm, old, new, message):
+    file = write(tmp_path / "wave.csv", arm_columns(), old, new)
+    with pytest.raises(LogError, match=r"wave\.csv" + message):
+        only(file, arm)
+
+
+def test_nan_is_refused_by_line_and_joint(tmp_path, arm):
+    columns = arm_columns()
+    columns["qpos.elbow"] = np.where(np.arange(60) == 7, np.nan, columns["qpos.elbow"])
+    with pytest.raises(LogError, match=r"wave\.csv:9: qpos of elbow is not finite"):
+        only(write(tmp_path / "wave.csv", columns), arm)
+    with pytest.raises(LogError, match=r"wave\.parquet:8: qpos of elbow is not finite"):
+        only(write_parquet(tmp_path / "wave.parquet", columns), arm)
+
+
+def test_a_table_cut_short_names_its_last_line(tmp_path, arm):
+    file = write(tmp_path / "wave.csv", arm_columns())
+    text = file.read_text()
+    file.write_text(text[: text.rindex(",")])
+    with pytest.raises(LogError, match=r"wave\.csv:61: 4 cells, the header has 5; the file may be cut short"):
+        only(file, arm)
+
+
+@pytest.mark.parametrize(("text", "message"), [("", "empty; a table needs a header"), ("time\n", "is missing")])
+def test_an_empty_table_is_refused(tmp_path, arm, text, message):
+    (tmp_path / "wave.csv").write_text(text)
+    with pytest.raises(LogError, match=message):
+        only(tmp_path / "wave.csv", arm)
+
+
+def test_a_header_without_rows_is_refused(tmp_path, arm):
+    (tmp_path / "wave.csv").write_text(table_text(arm_columns()).split("\n")[0] + "\n")
+    with pytest.raises(LogError, match=r"wave\.csv: holds a header and no rows"):
+        only(tmp_path / "wave.csv", arm)
+
+
+def test_a_half_written_parquet_file_is_refused(tmp_path, arm):
+    file = write_parquet(tmp_path / "wave.parquet", arm_columns())
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file \(.*\); it may be half-written"):
+        only(file, arm)
+
+
+def test_a_parquet_cell_that_is_empty_or_no_number_is_refused(tmp_path, arm):
+    columns = arm_columns()
+    hole = pa.array([None if i == 3 else x for i, x in enumerate(columns["ctrl.elbow"])])
+    pq.write_table(pa.table(columns | {"ctrl.elbow": hole}), tmp_path / "hole.parquet")
+    with pytest.raises(LogError, match=r"hole\.parquet:4: column 'ctrl.elbow' is empty"):
+        only(tmp_path / "hole.parquet", arm)
+    pq.write_table(pa.table(columns | {"ctrl.elbow": pa.array(["1.0"] * 60)}), tmp_path / "text.parquet")
+    with pytest.raises(LogError, match=r"text\.parquet: column 'ctrl.elbow' is string, not numbers"):
+        only(tmp_path / "text.parquet", arm)
+
+
+def test_a_strange_joint_says_how_to_map_it(tmp_path, arm):
+    file = write(tmp_path / "wave.csv", {k.replace("elbow", "knee"): v for k, v in arm_columns().items()})
+    with pytest.raises(
+        JointMismatchError, match=r"wave\.csv:1 names joint 'knee', but robot 'arm' has: shoulder, elbow"
+    ):
+        only(file, arm)
+    assert only(file, arm, joint_map={"knee": "elbow"}).joint_names == ("shoulder", "elbow")
+
+
+def test_radians_that_are_degrees_are_refused(tmp_path, arm):
+    columns = {k: v * (1 if k == "time" else 57.3) for k, v in arm_columns().items()}
+    with pytest.raises(LogError, match=r"wave\.csv:\d+: .* these look like degrees \(tables: --position-unit deg\)"):
+        only(write(tmp_path / "wave.csv", columns), arm)
+
+
+def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
+    (tmp_path / "readme.txt").touch()
+    with pytest.raises(LogError, match=r"not a log this version reads\. Known formats: sage: .*; table: CSV"):
+        list(read_logs(tmp_path, arm))
+    with pytest.raises(LogError, match="nowhere: does not exist"):
+        list(read_logs(tmp_path / "nowhere", arm))
+    with pytest.raises(LogError, match="unknown format 'rosbag'; use one of sage, table"):
+        list(read_logs(tmp_path, arm, "rosbag"))

@@ -1,0 +1,226 @@
+"""The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a good one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from logs import arm_sequence, late, wave
+
+from gaponet.data.checks.finding import Finding
+from gaponet.data.doctor import Diagnosis, diagnose, inventory
+from gaponet.data.store import Dataset
+from gaponet.errors import DatasetError
+
+ROWS = 600
+FAST = {"amplitude": 0.4, "hertz": 0.4}  # about 1 rad/s
+
+
+def good(rows: int = ROWS, lag: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Command and state of two joints, the state three periods of 20 ms late."""
+    ctrl = wave(rows, 2, 0.02, **FAST)
+    return ctrl, late(ctrl, lag)
+
+
+def examine(arm, tmp_path, *sequences) -> Diagnosis:
+    dataset = Dataset.create(tmp_path / "data", arm)
+    for sequence in sequences:
+        dataset.append(sequence)
+    return diagnose(dataset, arm)
+
+
+def found(diagnosis: Diagnosis, check: str, level: str) -> Finding:
+    """The one finding of a check at a level."""
+    (finding,) = [f for f in diagnosis.findings if (f.check, f.level) == (check, level)]
+    return finding
+
+
+def test_a_good_recording_has_no_warning(arm, tmp_path):
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=wave(ROWS, 2)))
+    assert [f for f in diagnosis.findings if f.level in ("warning", "error")] == []
+    assert diagnosis.verdict == "Good: nothing found that training should not see."
+
+
+def test_findings_stand_worst_first(arm, tmp_path):
+    ctrl, qpos = good()
+    levels = [f.level for f in examine(arm, tmp_path, arm_sequence(arm, ctrl, -qpos)).findings]
+    assert levels == sorted(levels, key=["error", "warning", "note", "ok"].index)
+    assert levels[0] == "error"
+
+
+def test_swapped_joints_are_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos[:, ::-1]))
+    texts = [f.message for f in diagnosis.findings if f.check == "order" and f.level == "error"]
+    assert len(texts) == 2
+    assert texts[0].startswith("the command of shoulder moves elbow, not shoulder (correlation 1.00, 1 of 1 motions)")
+    assert "--map" in texts[0]
+    assert diagnosis.verdict.startswith("Do not train on this yet: 2 error(s)")
+
+
+def test_two_joints_told_the_same_are_not_taken_for_swapped(arm, tmp_path):
+    ctrl = np.repeat(wave(ROWS, 1, 0.02, **FAST), 2, axis=1)
+    assert found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(ctrl, 3))), "order", "ok")
+
+
+def test_a_joint_that_moves_the_other_way_is_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, -1]))
+    assert found(diagnosis, "sign", "error").joints == ("elbow",)
+    assert found(diagnosis, "order", "ok")
+
+
+def test_states_in_degrees_beside_commands_in_radians_are_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 57.3])), "unit", "error")
+    assert finding.message.startswith("elbow moves 57.3 times as far as commanded")
+
+
+def test_velocities_in_degrees_are_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    qvel = np.gradient(qpos, 0.02, axis=0) * 57.3
+    qvel[:, 0] /= 57.3
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, qvel=qvel)), "unit", "warning")
+    assert finding.message.startswith("recorded velocity of elbow is 57.3 times the derivative of its position")
+
+
+def test_commands_beyond_the_joint_range_are_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    shift = np.array([1.2, 0.0])
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl + shift, qpos + shift)), "range", "warning")
+    assert finding.joints == ("shoulder",)
+    assert finding.values["beyond_rad"] == pytest.approx(0.1, abs=0.005)  # 1.2 + 0.4 against 1.5
+    assert "the simulator clips there" in finding.message
+
+
+def test_a_joint_that_never_moves_when_told_is_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 0])), "stuck", "error")
+    assert finding.message.startswith("elbow does not move when commanded in m: unplugged, torque off or not read")
+
+
+def test_a_state_that_repeats_itself_while_the_command_moves_is_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    qpos[100:121] = qpos[100]
+    qvel = np.gradient(qpos, 0.02, axis=0)
+    qvel[100:121] = qvel[100]
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, qvel=qvel)), "stuck", "warning")
+    assert "the whole state repeats itself for up to 0.40 s" in finding.message
+
+
+def test_a_joint_that_is_never_commanded_is_named(arm, tmp_path):
+    ctrl, qpos = good()
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl * [1, 0], qpos * [1, 0])), "order", "warning")
+    assert finding.joints == ("elbow",)
+
+
+def test_a_joint_that_runs_into_a_stop_is_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    qpos[:, 0] = np.minimum(qpos[:, 0], 0.1)
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos)), "blocked", "warning")
+    assert finding.message.startswith("shoulder stood at 0.10 rad for")
+
+
+def test_a_load_that_sags_far_is_not_taken_for_a_stop(arm, tmp_path):
+    ctrl, qpos = good()
+    hold = np.repeat(ctrl[-1:], 200, axis=0)
+    sequence = arm_sequence(arm, np.concatenate([ctrl, hold]), np.concatenate([qpos, hold]) + 0.25)
+    assert found(examine(arm, tmp_path, sequence), "blocked", "ok")
+
+
+def test_missing_samples_and_jitter_are_reported_from_the_logs_own_clock(arm, tmp_path):
+    notes = {"rate_hz": 50.0, "jitter_ms": 80.0, "longest_gap_ms": 100.0, "rows": "resampled to 50.00 Hz"}
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), notes=notes))
+    assert found(diagnosis, "gaps", "warning").message.startswith("1 sequence(s) miss samples, at worst 100 ms (m)")
+    assert found(diagnosis, "jitter", "warning").values == {"jitter_ms": 80.0}
+    assert found(diagnosis, "rate", "note").message == "1 sequence(s) were put on a uniform grid: m"
+
+
+def test_two_rates_in_one_dataset_are_a_warning(arm, tmp_path):
+    first = arm_sequence(arm, *good())
+    second = replace(arm_sequence(arm, *good(lag=2)), dt=0.01)
+    message = found(examine(arm, tmp_path, first, second), "rate", "warning").message
+    assert message.startswith("1 at 50.00 Hz (20.00 ms), 1 at 100.00 Hz (10.00 ms)")
+
+
+def test_a_lag_of_three_periods_is_reported_as_60_ms(arm, tmp_path):
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(lag=3))), "lag", "note")
+    assert finding.values["elbow"]["median"] == pytest.approx(0.06, abs=0.003)
+    assert "elbow 60 ms" in finding.message
+
+
+def test_slow_motions_say_nothing_about_lag(arm, tmp_path):
+    ctrl = wave(ROWS, 2, 0.02, amplitude=0.4, hertz=0.05)
+    message = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(ctrl, 3))), "lag", "note").message
+    assert message.startswith("nothing is commanded faster than 0.3 rad/s")
+
+
+def test_sag_is_reported_for_the_lightest_and_the_heaviest_payload(arm, tmp_path):
+    ctrl, qpos = good()
+    still = np.repeat(ctrl[-1:], 60, axis=0)
+    rest = lambda sag: (np.concatenate([ctrl, still]), np.concatenate([qpos, still + np.array([sag, 0])]))  # noqa: E731
+    sequences = [arm_sequence(arm, *rest(0.03 + 0.1 * mass), payload=mass) for mass in (0.0, 0.5, 1.0)]
+    finding = found(examine(arm, tmp_path, *sequences), "sag", "note")
+    assert finding.joints == ("shoulder",)
+    assert "shoulder +30" in finding.message
+    assert "shoulder +130" in finding.message
+    assert "0.5 kg" not in finding.message
+
+
+def test_torque_that_is_never_negative_is_unsigned(arm, tmp_path):
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=np.abs(wave(ROWS, 2))))
+    assert found(diagnosis, "torque", "warning").message.startswith("torque is unsigned (never negative")
+
+
+def test_torque_spikes_are_counted_and_the_worst_is_named(arm, tmp_path):
+    tau = 0.3 * wave(ROWS, 2)
+    tau[100, 1], tau[300:302, 0] = 4.5, -3.0
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(), tau=tau)), "torque", "warning")
+    assert finding.message == "torque spikes: 3 samples in m; worst 4.50 N·m on elbow in m"
+
+
+def test_torque_beyond_the_limit_is_a_warning(arm, tmp_path):
+    tau = np.clip(40 * wave(ROWS, 2), -9, 9)
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, *good(), tau=tau)), "saturation", "warning")
+    assert "worst 9.00 N·m on shoulder (limit 5.00)" in finding.message
+
+
+def test_a_torque_channel_that_never_changes_is_a_warning(arm, tmp_path):
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, *good(), tau=np.zeros((ROWS, 2))))
+    assert found(diagnosis, "torque", "warning").message == "torque of shoulder, elbow never changes; ignore it"
+
+
+def test_one_recording_under_two_payloads_is_an_error(arm, tmp_path):
+    sequence = arm_sequence(arm, *good())
+    other = replace(sequence, meta=replace(sequence.meta, payload_mass=1.0))
+    assert "m-a-0kg" in found(examine(arm, tmp_path, sequence, other), "labels", "error").message
+
+
+def test_an_empty_dataset_and_another_robot_are_refused(arm, so101, tmp_path):
+    dataset = Dataset.create(tmp_path / "data", arm)
+    with pytest.raises(DatasetError, match="holds no sequences yet; import or collect some"):
+        diagnose(dataset, arm)
+    with pytest.raises(DatasetError, match="holds robot 'arm'"):
+        diagnose(dataset, so101)
+
+
+def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
+    dataset = Dataset.create(tmp_path / "data", arm)
+    dataset.append(arm_sequence(arm, *good()))
+    dataset.append(arm_sequence(arm, *good(), payload=1.5, unit="b"))
+    assert inventory(dataset) == "2 sequences, 1 motions, 0.4 min; units a, b; payloads 0, 1.5 kg"
+
+
+def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
+    diagnosis = diagnose(real_dataset, so101)
+    assert diagnosis.count("error") == 0
+    lags = found(diagnosis, "lag", "note").values
+    for joint in so101.operated:
+        assert 0.08 <= lags[joint]["median"] <= 0.16
+        assert 0.07 <= lags[joint]["min"] <= lags[joint]["max"] <= 0.16
+    assert found(diagnosis, "sag", "note").joints == ("shoulder_lift", "elbow_flex")
+    assert found(diagnosis, "unit", "note").message.startswith("gripper is logged as 0..1, not in rad")
+    torque = [f.message for f in diagnosis.findings if f.check == "torque"]
+    assert torque[0].startswith("torque is unsigned")
+    assert torque[1].startswith("torque spikes")
+    assert {row["rate_hz"] for row in diagnosis.sequences} == {49.85}
+    assert found(diagnosis, "blocked", "warning").joints == ("wrist_roll",)

@@ -1,0 +1,177 @@
+"""Importing: all recordings or none, into a new dataset or behind what is there."""
+
+import hashlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+from logs import SERVO_NAMES, arm_columns, late, table_text, wave, write_sage, write_so101
+
+from gaponet.data.importer import import_logs
+from gaponet.data.offsets import FILE
+from gaponet.data.store import Dataset
+from gaponet.errors import DatasetError, LogError, UsageError
+
+SI = {"position_unit": "rad", "time_unit": "s"}
+
+
+@pytest.fixture
+def logs(tmp_path):
+    """Two SO-101 motions, 2 periods late."""
+    for i, name in enumerate(("up", "down")):
+        ctrl = wave(200, 6, hertz=0.5 + 0.2 * i)
+        write_sage(tmp_path / "logs" / "real" / "so101" / "custom" / name, ctrl, late(ctrl, 2))
+    return tmp_path / "logs"
+
+
+def test_every_motion_becomes_a_sequence_with_its_origin(logs, so101, tmp_path):
+    report = import_logs(logs, so101, "lab", 0.0, tmp_path / "data", level="joint")
+    assert [e.meta.motion for e in report.entries] == ["down", "up"]
+    assert len(Dataset(tmp_path / "data")) == 2
+    meta = report.entries[0].meta
+    assert (meta.unit_id, meta.payload_mass, meta.level, meta.virtual) == ("lab", 0.0, "joint", False)
+    assert meta.source == "logs/real/so101/custom/down"
+    folder = logs / "real" / "so101" / "custom" / "down"
+    both = (folder / "control.csv").read_bytes() + (folder / "state_motor.csv").read_bytes()
+    assert meta.source_sha256 == hashlib.sha256(both).hexdigest()
+
+
+def test_no_absolute_path_enters_the_dataset(logs, so101, tmp_path):
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    for file in (tmp_path / "data").glob("*.json*"):
+        assert str(tmp_path) not in file.read_text()
+
+
+def test_the_delay_of_each_joint_is_found(logs, so101, tmp_path):
+    entry = import_logs(logs, so101, "lab", 0.0, tmp_path / "data").entries[0]
+    assert entry.dt == pytest.approx(0.02006)
+    assert list(entry.findings["delay_s"]) == list(so101.joint_names)
+    assert entry.findings["delay_s"]["elbow_flex"] == pytest.approx(2 * 0.02006, abs=0.003)
+
+
+def test_a_joint_that_stands_has_no_delay(so101, tmp_path):
+    ctrl = wave(200, 6)
+    ctrl[:, 0] = 0.1
+    write_sage(tmp_path / "logs" / "m", ctrl, late(ctrl, 2))
+    entry = import_logs(tmp_path / "logs", so101, "lab", 0.0, tmp_path / "data").entries[0]
+    assert entry.findings["delay_s"]["shoulder_pan"] is None
+
+
+def test_progress_counts_to_the_number_of_recordings(logs, so101, tmp_path):
+    seen = []
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data", progress=lambda *what: seen.append(what))
+    assert seen == [(1, 2, "down"), (2, 2, "up")]
+
+
+def test_a_recording_that_is_there_is_refused_by_name_and_nothing_is_added(logs, so101, tmp_path):
+    first = import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    write_so101(logs / "real" / "so101" / "custom" / "new")
+    with pytest.raises(
+        DatasetError, match=rf"2 of 3 recordings are there already .* '{first.entries[0].id}' of .*data"
+    ):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    assert len(Dataset(tmp_path / "data")) == 2
+
+
+def test_one_recording_twice_in_the_source_is_refused(logs, so101, tmp_path):
+    custom = logs / "real" / "so101" / "custom"
+    shutil.copytree(custom / "up", custom / "up_again")
+    with pytest.raises(DatasetError, match=r"1 of 3 recordings are there already .*up_again is logs/.*/up\."):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    import_logs(logs, so101, "lab", 0.2, tmp_path / "data", payload_side="hand")
+    report = import_logs(logs, so101, "roof", 0.0, tmp_path / "data")
+    assert len(report.dataset) == 6
+    assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[::2]] == [
+        ("lab", 0.0), ("lab", 0.2), ("roof", 0.0),
+    ]  # fmt: skip
+
+
+def test_a_second_take_of_a_motion_is_its_next_repetition(logs, so101, tmp_path):
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    again = wave(150, 6)
+    write_sage(tmp_path / "later" / "up", again, late(again, 2))
+    report = import_logs(tmp_path / "later", so101, "lab", 0.0, tmp_path / "data")
+    assert [e.meta.repetition for e in report.entries] == [1]
+
+
+def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
+    state = logs / "real" / "so101" / "custom" / "up" / "state_motor.csv"
+    state.write_text(state.read_text()[:-100])
+    with pytest.raises(LogError, match=r"up/state_motor\.csv:201"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_disk_that_fills_up_leaves_no_new_dataset(logs, so101, tmp_path, monkeypatch):
+    append = Dataset.append
+
+    def once(self, sequence, findings=None):
+        if len(self):
+            raise OSError("no space left on device")
+        return append(self, sequence, findings)
+
+    monkeypatch.setattr(Dataset, "append", once)
+    with pytest.raises(OSError, match="no space left"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    assert not (tmp_path / "data").exists()
+
+
+def test_another_robots_dataset_is_refused_before_anything_is_read(logs, so101, arm, tmp_path):
+    Dataset.create(tmp_path / "data", arm)
+    shutil.rmtree(logs)
+    with pytest.raises(DatasetError, match="holds robot 'arm'"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+
+
+def test_a_hand_the_robot_does_not_have_is_refused(logs, so101, tmp_path):
+    with pytest.raises(UsageError, match="payload side 'left' is unknown to so101; use one of both, hand"):
+        import_logs(logs, so101, "lab", 0.2, tmp_path / "data", payload_side="left")
+
+
+def test_a_table_is_imported_with_its_hash_and_units(arm, tmp_path):
+    file = tmp_path / "wave.csv"
+    file.write_text(table_text(arm_columns(200)))
+    entry = import_logs(file, arm, "a", 0.0, tmp_path / "data", **SI).entries[0]
+    assert entry.meta.source == "wave.csv"
+    assert entry.meta.source_sha256 == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert entry.dt == pytest.approx(0.02)
+
+
+def test_offsets_are_fitted_where_a_gravity_is_given(logs, so101, tmp_path):
+    asked = []
+
+    def weightless(qpos, payload_mass, payload_side):
+        asked.append((payload_mass, payload_side))
+        return np.zeros_like(qpos)
+
+    report = import_logs(logs, so101, "lab", 0.2, tmp_path / "data", gravity=weightless, simulator="abc")
+    assert asked[0] == (0.2, "both")
+    assert list(report.offsets.joints) == list(so101.operated)
+    assert json.loads((tmp_path / "data" / FILE).read_text())["units"]["lab"]["simulator"] == "abc"
+
+
+def test_importing_changes_no_sample_by_an_offset(so101, tmp_path):
+    ctrl = wave(200, len(SERVO_NAMES))
+    write_sage(tmp_path / "logs" / "m", ctrl, ctrl + 0.1)
+    report = import_logs(tmp_path / "logs", so101, "lab", 0.0, tmp_path / "data", gravity=lambda q, m, s: 0 * q)
+    stored = report.dataset.read(report.entries[0])
+    assert np.array_equal(stored.qpos[:, :5], (ctrl + 0.1)[:, :5].astype(np.float32))
+
+
+def test_the_40_real_motions_come_in_as_recorded(real_dataset):
+    assert len(real_dataset) == 40
+    assert real_dataset.hours() * 60 == pytest.approx(59.3, abs=0.1)
+    assert {e.dt for e in real_dataset.entries} == {0.02006}
+    assert all(e.meta.notes["rows"] == "as recorded" for e in real_dataset.entries)
+
+
+def test_a_source_named_by_a_dot_is_known_by_its_folder(so101, tmp_path, monkeypatch):
+    monkeypatch.chdir(write_so101(tmp_path / "wave"))
+    meta = import_logs(".", so101, "lab", 0.0, tmp_path / "data").entries[0].meta
+    assert (meta.motion, meta.source) == ("wave", "wave")

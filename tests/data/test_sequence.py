@@ -1,0 +1,102 @@
+"""From what came off the wire to rows at a fixed period."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gaponet.data.log import Channel, Log
+from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
+from gaponet.errors import LogError
+
+META = SequenceMeta("arm", "a", "wave", 0.0, source="wave.csv")
+ROWS = 50
+
+
+def arm_log(time: np.ndarray, ctrl_time: np.ndarray | None = None, **meta: object) -> Log:
+    ctrl_time = time if ctrl_time is None else ctrl_time
+    both = lambda t: np.stack([t, 2 * t], axis=1)  # noqa: E731
+    channels = {"ctrl": Channel(ctrl_time, both(ctrl_time)), "qpos": Channel(time, both(time))}
+    return Log("arm", ("shoulder", "elbow"), channels, "wave.csv", dict(meta))
+
+
+def test_even_rows_are_kept_as_recorded_at_their_own_rate(arm):
+    time = 0.02006 * np.arange(ROWS) + 1e-4 * np.sin(np.arange(ROWS))
+    sequence = to_sequence(arm_log(time), arm, META)
+    assert sequence.meta.notes["rows"] == "as recorded"
+    assert sequence.dt == pytest.approx(0.02006, abs=2e-5)
+    assert len(sequence) == ROWS
+    assert np.array_equal(sequence.qpos[:, 0], time.astype(np.float32))
+
+
+def test_a_missing_sample_puts_the_log_on_a_grid(arm):
+    time = np.delete(0.02 * np.arange(ROWS), 20)
+    sequence = to_sequence(arm_log(time), arm, META)
+    assert sequence.meta.notes["rows"] == "resampled to 50.00 Hz"
+    assert sequence.meta.notes["longest_gap_ms"] == pytest.approx(40)
+    assert len(sequence) == ROWS
+    assert sequence.qpos[20, 0] == pytest.approx(0.4)  # on the line between its neighbours
+    assert sequence.ctrl[20, 0] == pytest.approx(0.38)  # the command of row 19 still stands
+
+
+def test_commands_and_states_on_different_clocks_meet_where_they_overlap(arm):
+    time = 0.02 * np.arange(ROWS)
+    sequence = to_sequence(arm_log(time, ctrl_time=time + 0.25), arm, META)
+    assert sequence.qpos[0, 0] == pytest.approx(0.25)
+    assert len(sequence) == 37  # (0.98 − 0.25) / 0.02 periods and the first row
+
+
+def test_channels_that_do_not_overlap_are_refused(arm):
+    time = 0.02 * np.arange(ROWS)
+    with pytest.raises(LogError, match=r"command and state channels overlap for .* s only; check the clocks"):
+        to_sequence(arm_log(time, ctrl_time=time + 10), arm, META)
+
+
+def test_joints_go_into_the_robots_order_and_absent_ones_stand_at_home(arm):
+    log = arm_log(0.02 * np.arange(ROWS))
+    one = Log("arm", ("elbow",), {k: Channel(c.time, c.values[:, 1:]) for k, c in log.channels.items()}, "wave.csv")
+    sequence = to_sequence(one, arm, META)
+    assert sequence.joint_names == ("shoulder", "elbow")
+    assert not sequence.qpos[:, 0].any()
+    assert sequence.qpos[10, 1] == pytest.approx(0.4)
+    assert sequence.meta.notes["held_at_home"] == ["shoulder"]
+
+
+def test_velocity_is_computed_where_the_log_has_none(arm):
+    sequence = to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, META)
+    assert np.allclose(sequence.qvel, [1.0, 2.0], atol=1e-4)
+    assert sequence.meta.notes["qvel"] == "central differences of qpos"
+
+
+def test_velocity_of_a_joint_logged_as_a_fraction_is_computed_too(arm):
+    log = arm_log(0.02 * np.arange(ROWS), converted_from={"elbow": "fraction"})
+    log.channels["qvel"] = Channel(log.channels["qpos"].time, np.full((ROWS, 2), 7.0))
+    assert np.allclose(to_sequence(log, arm, META).qvel, [7.0, 2.0], atol=1e-4)
+
+
+def test_a_rate_can_be_forced(arm):
+    assert to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, META, dt=0.01).rate == pytest.approx(100)
+
+
+@pytest.mark.parametrize("mass", [-0.1, float("nan"), 1000.0])
+def test_a_payload_no_hand_can_carry_is_refused(mass):
+    with pytest.raises(LogError, match=r"payload_mass is .*; give kg, 0 when empty"):
+        replace(META, payload_mass=mass)
+
+
+def test_a_level_nobody_knows_is_refused():
+    with pytest.raises(LogError, match="level 'legs' is not one of joint, upper_body, whole_body"):
+        replace(META, level="legs")
+
+
+def test_samples_that_are_not_numbers_are_refused(arm):
+    bad = np.full((5, 2), np.nan)
+    with pytest.raises(LogError, match=r"wave\.csv: ctrl has shape \(5, 2\) or holds NaN"):
+        Sequence(META, arm.joint_names, 0.02, bad, bad, bad)
+
+
+def test_identity_is_samples_unit_and_payload_and_not_the_name(arm):
+    sequence = to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, META)
+    assert replace(sequence, meta=replace(META, motion="other")).content_hash() == sequence.content_hash()
+    assert replace(sequence, meta=replace(META, payload_mass=1.0)).content_hash() != sequence.content_hash()
+    assert replace(sequence, qpos=sequence.qpos + 0.001).content_hash() != sequence.content_hash()

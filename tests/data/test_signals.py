@@ -1,0 +1,77 @@
+"""Resampling, derivatives and delays on numbers worked by hand."""
+
+import numpy as np
+import pytest
+
+from gaponet.data.signals import differentiate, estimate_delay, fast_speed, lowpass, resample_linear, resample_zoh
+
+TIME = np.array([0.0, 0.1, 0.4])
+VALUES = np.array([[0.0], [1.0], [4.0]])
+DT = 0.02
+
+
+def smooth_noise(rows: int, seed: int = 0) -> np.ndarray:
+    """Band-limited motion that repeats nowhere, (rows,)."""
+    return lowpass(np.random.default_rng(seed).normal(size=(rows, 1)), DT, 2.0)[:, 0]
+
+
+def test_a_state_between_two_samples_lies_on_the_line():
+    assert resample_linear(TIME, VALUES, np.array([0.05, 0.1, 0.2, 0.4]))[:, 0].tolist() == pytest.approx(
+        [0.5, 1, 2, 4]
+    )
+
+
+def test_a_command_holds_until_the_next_arrives():
+    assert resample_zoh(TIME, VALUES, np.array([0.0, 0.099, 0.1, 0.399, 0.4]))[:, 0].tolist() == [0, 0, 1, 1, 4]
+
+
+def test_the_derivative_of_a_ramp_is_its_slope_up_to_the_ends():
+    ramp = 3.0 * DT * np.arange(10)[:, None]
+    assert np.allclose(differentiate(ramp, DT), 3.0)
+
+
+def test_the_lowpass_filter_shifts_nothing():
+    t = np.arange(500) * DT
+    slow = np.sin(2 * np.pi * 0.5 * t)[:, None]
+    assert np.abs(lowpass(slow, DT, 6.0) - slow)[50:-50].max() < 0.002
+
+
+@pytest.mark.parametrize("steps", [0, 3, 7])
+def test_a_state_that_follows_k_periods_later_has_a_delay_of_k_periods(steps):
+    u = smooth_noise(1000)
+    qpos = np.concatenate([np.full(steps, u[0]), u[: len(u) - steps]])
+    assert estimate_delay(u[:, None], qpos[:, None], DT)[0] == pytest.approx(steps * DT, abs=0.003)
+
+
+def test_half_a_period_of_delay_is_seen():
+    u = smooth_noise(2000)
+    qpos = (u[:-4] + u[1:-3]) / 2  # between the commands of four and of three rows ago
+    assert estimate_delay(u[4:, None], qpos[:, None], DT)[0] == pytest.approx(3.5 * DT, abs=0.003)
+
+
+def test_sag_and_drift_do_not_shift_the_delay():
+    u = smooth_noise(1000)
+    qpos = np.concatenate([np.full(4, u[0]), u[:-4]]) + 0.3 + 1e-4 * np.arange(1000)
+    assert estimate_delay(u[:, None], qpos[:, None], DT)[0] == pytest.approx(4 * DT, abs=0.003)
+
+
+def test_a_joint_that_is_not_commanded_has_no_delay():
+    u = smooth_noise(500)
+    assert np.isnan(estimate_delay(0.001 * u[:, None], u[:, None], DT)[0])
+
+
+def test_a_joint_that_does_not_follow_has_no_delay():
+    assert np.isnan(estimate_delay(smooth_noise(500)[:, None], smooth_noise(500, seed=1)[:, None] * 0, DT)[0])
+
+
+def test_a_best_shift_at_the_limit_of_the_search_is_no_delay():
+    u = smooth_noise(1000)
+    qpos = np.concatenate([np.full(20, u[0]), u[:-20]])
+    assert np.isnan(estimate_delay(u[:, None], qpos[:, None], DT, max_delay=0.4)[0])
+    assert estimate_delay(u[:, None], qpos[:, None], DT, max_delay=0.6)[0] == pytest.approx(0.4, abs=0.003)
+
+
+def test_fast_speed_is_what_a_joint_does_in_its_fastest_twentieth():
+    ctrl = np.zeros((101, 1))
+    ctrl[90:, 0] = 2.0 * DT * np.arange(11)
+    assert fast_speed(ctrl, DT)[0] == pytest.approx(2.0)

@@ -1,0 +1,134 @@
+"""The dataset folder: what is listed is complete, what is not listed does not exist."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import write_arm
+from logs import arm_sequence, late, wave
+
+from gaponet.data.pair import Twin
+from gaponet.data.store import Dataset
+from gaponet.errors import DatasetError
+
+
+@pytest.fixture
+def sequence(arm):
+    ctrl = wave(40, 2)
+    return arm_sequence(arm, ctrl, late(ctrl, 2), tau=np.ones((40, 2)))
+
+
+@pytest.fixture
+def dataset(arm, sequence, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    data.append(sequence, {"delay_s": {"shoulder": 0.04}})
+    return data
+
+
+def test_what_was_appended_is_read_back_bit_by_bit(dataset, sequence):
+    back = Dataset(dataset.path)
+    read = back.read(back.entries[0])
+    for name in ("ctrl", "qpos", "qvel", "tau"):
+        assert np.array_equal(getattr(read, name), getattr(sequence, name))
+    assert read.qacc is None
+    assert read.meta == sequence.meta
+    assert read.content_hash() == sequence.content_hash() == back.entries[0].hash
+    assert back.entries[0].findings == {"delay_s": {"shoulder": 0.04}}
+
+
+def test_the_same_recording_is_refused_by_name(dataset, sequence):
+    renamed = replace(sequence, meta=replace(sequence.meta, motion="other", source="other.csv"))
+    with pytest.raises(DatasetError, match=rf"other\.csv: already in .* as '{dataset.entries[0].id}'"):
+        dataset.append(renamed)
+    assert len(Dataset(dataset.path)) == 1
+
+
+def test_another_payload_of_the_same_motion_is_another_sequence(dataset, sequence):
+    dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]
+
+
+def test_a_line_cut_short_by_a_crash_is_dropped(dataset, sequence):
+    journal = dataset.path / "sequences.jsonl"
+    whole = journal.read_text()
+    journal.write_text(whole + whole[: len(whole) // 2])
+    assert len(Dataset(dataset.path)) == 1
+    assert journal.read_text() == whole
+
+
+def test_a_damaged_line_is_named(dataset):
+    journal = dataset.path / "sequences.jsonl"
+    journal.write_text("{}\n" + journal.read_text())
+    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: damaged line .* delete it and import that log again"):
+        Dataset(dataset.path)
+
+
+def test_a_listed_file_that_is_gone_is_named(dataset):
+    next((dataset.path / "sequences").iterdir()).unlink()
+    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: .*\.parquet is missing"):
+        Dataset(dataset.path)
+
+
+def test_a_half_written_file_is_named(dataset):
+    file = next((dataset.path / "sequences").iterdir())
+    file.write_bytes(file.read_bytes()[:200])
+    with pytest.raises(DatasetError, match=r"\.parquet: not a readable Parquet file .* import the log again"):
+        dataset.read(dataset.entries[0])
+
+
+def test_a_dataset_belongs_to_one_robot(dataset, so101):
+    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'so101' .* use --robot arm"):
+        Dataset.create(dataset.path, so101)
+
+
+def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, tmp_path):
+    swapped = write_arm(tmp_path / "swapped")
+    object.__setattr__(swapped, "joint_names", ("elbow", "shoulder"))
+    with pytest.raises(DatasetError, match=r"holds robot 'arm' \(shoulder, elbow\), not 'arm' \(elbow, shoulder\)"):
+        dataset.require_robot(swapped)
+
+
+def test_a_folder_with_other_things_in_it_is_not_taken(arm, tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").touch()
+    with pytest.raises(DatasetError, match="exists, holds files and is not a dataset; choose an empty folder"):
+        Dataset.create(tmp_path / "photos", arm)
+
+
+def test_peeking_makes_nothing(arm, tmp_path):
+    assert Dataset.peek(tmp_path / "new", arm) is None
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(DatasetError, match="file: is a file; choose a folder"):
+        Dataset.peek(tmp_path / "file", arm)
+
+
+def test_a_newer_format_asks_for_an_upgrade(dataset):
+    header = dataset.path / "dataset.json"
+    header.write_text(json.dumps(json.loads(header.read_text()) | {"format": 99}))
+    with pytest.raises(DatasetError, match="format 99 is newer than this gaponet reads"):
+        Dataset(dataset.path)
+
+
+def test_a_folder_that_is_no_dataset_says_how_to_make_one(tmp_path):
+    with pytest.raises(
+        DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import or collect"
+    ):
+        Dataset(tmp_path)
+
+
+def test_a_motion_that_is_not_there_names_those_that_are(dataset):
+    assert len(dataset.select(("m",))) == 1
+    with pytest.raises(DatasetError, match="no motion 'dance'; it holds: m"):
+        dataset.select(("dance",))
+
+
+def test_a_twin_belongs_to_one_simulator(dataset, sequence):
+    entry = dataset.entries[0]
+    twin = Twin("abc", sequence.qpos, sequence.qvel, sequence.tau)
+    dataset.write_twin(entry, twin)
+    assert dataset.has_twin(entry, "abc")
+    assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
+    with pytest.raises(DatasetError, match="has no twin for simulator xyz; run gaponet pair"):
+        dataset.pair(entry, "xyz")

@@ -1,0 +1,81 @@
+"""Small logs in the formats that gaponet reads, written by the tests themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.robot import RobotSpec
+
+SERVO_NAMES = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+PERIOD_US = 20060.0  # the public SO-101 logs' own
+
+
+def wave(rows: int, n: int, dt: float = 0.02006, amplitude: float = 0.3, hertz: float = 0.5) -> np.ndarray:
+    """Targets (rows, n): a sine of another phase and pace for every joint."""
+    t = np.arange(rows)[:, None] * dt
+    return amplitude * np.sin(2 * np.pi * hertz * t * (1 + 0.37 * np.arange(n)) + np.arange(n))
+
+
+def late(ctrl: np.ndarray, steps: int) -> np.ndarray:
+    """The same `steps` rows later, first row held."""
+    return np.concatenate([np.repeat(ctrl[:1], steps, axis=0), ctrl[:-steps]]) if steps else ctrl.copy()
+
+
+def write_sage(
+    folder: Path,
+    ctrl: np.ndarray,
+    qpos: np.ndarray,
+    tau: np.ndarray | None = None,
+    names: tuple[str, ...] = SERVO_NAMES,
+    time: np.ndarray | None = None,
+) -> Path:
+    """One motion folder; time in µs, (rows,)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    time = 7.1 + PERIOD_US * np.arange(len(ctrl)) if time is None else time
+    (folder / "joint_list.txt").write_text("\n".join(names) + "\n")
+    (folder / "event.csv").write_text("type,timestamp,event\nEVENT,0,CONTROL_MODE_ENABLE\nEVENT,7.1,MOTION_START\n")
+    numbers = lambda row: '"[' + ", ".join(repr(float(x)) for x in row) + ']"'  # noqa: E731
+    qvel, tau = np.zeros_like(qpos), np.zeros_like(qpos) if tau is None else tau
+    control = [f"CONTROL,{t},{numbers(u)}" for t, u in zip(time, ctrl, strict=True)]
+    state = [
+        f"STATE_MOTOR,{t},{numbers(q)},{numbers(v)},{numbers(f)}"
+        for t, q, v, f in zip(time, qpos, qvel, tau, strict=True)
+    ]
+    (folder / "control.csv").write_text("\n".join(["type,timestamp,positions", *control]) + "\n")
+    (folder / "state_motor.csv").write_text("\n".join(["type,timestamp,positions,velocities,torques", *state]) + "\n")
+    return folder
+
+
+def write_so101(folder: Path, rows: int = 60, lag: int = 2) -> Path:
+    """One motion of an SO-101 in SAGE's form; the gripper in 0..1."""
+    ctrl = wave(rows, 6)
+    ctrl[:, 5] = 0.5 + ctrl[:, 5]
+    return write_sage(folder, ctrl, late(ctrl, lag))
+
+
+def table_text(columns: dict[str, np.ndarray]) -> str:
+    """CSV."""
+    rows = zip(*columns.values(), strict=True)
+    return "\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows)]) + "\n"
+
+
+def arm_columns(rows: int = 60, dt: float = 0.02, lag: int = 2) -> dict[str, np.ndarray]:
+    """Columns of a table for the two-joint arm of tests/arm.py, in s and rad."""
+    ctrl = wave(rows, 2, dt)
+    qpos = late(ctrl, lag)
+    columns = {"time": dt * np.arange(rows)}
+    columns |= {f"ctrl.{name}": ctrl[:, j] for j, name in enumerate(("shoulder", "elbow"))}
+    return columns | {f"qpos.{name}": qpos[:, j] for j, name in enumerate(("shoulder", "elbow"))}
+
+
+def arm_sequence(
+    robot: RobotSpec, ctrl: np.ndarray, qpos: np.ndarray, motion: str = "m", payload: float = 0.0, **fields: object
+) -> Sequence:
+    """A sequence of any robot at its own rate; qvel is the derivative unless given."""
+    notes = fields.pop("notes", {})
+    meta = SequenceMeta(robot.name, str(fields.pop("unit", "a")), motion, payload, notes=notes)  # type: ignore[arg-type]
+    qvel = fields.pop("qvel", np.gradient(qpos, robot.dt, axis=0))
+    return Sequence(meta, robot.joint_names, robot.dt, ctrl, qpos, qvel, **fields)  # type: ignore[arg-type]

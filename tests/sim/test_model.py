@@ -1,0 +1,142 @@
+"""The nominal simulator: joints that hold still, payloads that weigh, robots a user brings along."""
+
+import mujoco
+import numpy as np
+import pytest
+from arm import TOML, XML, write_arm
+
+from gaponet.errors import RobotError, UsageError
+from gaponet.robot import load_robot
+from gaponet.sim.model import build_model, model_hash, qpos_range
+
+
+def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Positions 10 s after a start at the targets, when the swing has died away, and `seconds` later, (n,) rad."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = data.ctrl[:] = ctrl
+    mujoco.mj_step(model, data, round(10 / model.opt.timestep))
+    early = data.qpos.copy()
+    mujoco.mj_step(model, data, round(seconds / model.opt.timestep))
+    return early, data.qpos.copy()
+
+
+@pytest.mark.parametrize(("name", "mass"), [("so101", 0.0), ("so101", 0.3), ("h1_2", 3.0)])
+def test_a_loaded_joint_held_for_a_minute_does_not_creep(name, mass):
+    robot = load_robot(name)
+    posture = np.clip(robot.qpos_home + 0.3, robot.qpos_range[:, 0] + 0.05, robot.qpos_range[:, 1] - 0.05)
+    early, late = hold(build_model(robot, mass), posture, 60.0)
+    assert np.abs(late - early).max() < 0.5e-3
+    assert np.abs(early - posture).max() > 2e-3  # and it does carry a load
+
+
+def test_a_joint_released_within_its_stiction_stays_where_it_is(arm):
+    robot = arm
+    model = build_model(robot)
+    model.opt.gravity[:] = 0
+    start = np.array([0.002, 0.0])  # kp 20 pulls with 0.04 N·m, friction holds 0.05
+    data = mujoco.MjData(model)
+    data.qpos[:] = start
+    mujoco.mj_step(model, data, round(60 / model.opt.timestep))
+    assert np.abs(data.qpos - start).max() < 0.5e-3
+
+
+def test_gravity_on_an_outstretched_arm_is_mass_times_lever(arm):
+    data = mujoco.MjData(build_model(arm))
+    mujoco.mj_forward(data.model, data)
+    # 0.3 kg at 0.1 m and 0.2 kg at 0.3 m; the fore arm alone 0.2 kg at 0.1 m; y axis: down is positive.
+    assert data.qfrc_bias == pytest.approx([-9.81 * (0.03 + 0.06), -9.81 * 0.02], abs=1e-9)
+
+
+def test_a_payload_weighs_in_the_hand(arm):
+    data = mujoco.MjData(build_model(arm, 0.5))
+    mujoco.mj_forward(data.model, data)
+    assert data.qfrc_bias == pytest.approx([-9.81 * (0.09 + 0.5 * 0.4), -9.81 * (0.02 + 0.5 * 0.2)], abs=1e-9)
+
+
+def test_a_payload_in_one_hand_leaves_the_other_arm_alone():
+    robot = load_robot("h1_2")
+    torque = {}
+    for side in ("left", "right", "both"):
+        data = mujoco.MjData(build_model(robot, 3.0, side))
+        mujoco.mj_forward(data.model, data)
+        torque[side] = data.qfrc_bias.copy()
+    right = robot.index(["right_shoulder_pitch_joint", "right_elbow_joint"])
+    left = robot.index(["left_shoulder_pitch_joint", "left_elbow_joint"])
+    assert torque["left"][left] == pytest.approx(torque["both"][left])
+    assert torque["right"][right] == pytest.approx(torque["both"][right])
+    assert np.abs(torque["left"][right] - torque["both"][right]).max() > 1.0
+
+
+def test_an_actuator_pulls_with_kp_times_error_up_to_the_torque_limit(arm):
+    data = mujoco.MjData(build_model(arm))
+    data.ctrl[:] = [0.1, 1.0]
+    mujoco.mj_forward(data.model, data)
+    assert data.actuator_force == pytest.approx([2.0, 5.0])  # 20 · 0.1; 20 · 1.0 limited to 5
+
+
+def test_the_number_of_physics_steps_is_the_same_at_any_rate(arm):
+    assert build_model(arm).opt.timestep == pytest.approx(0.005)
+    assert build_model(arm, dt=0.02006).opt.timestep == pytest.approx(0.005015)
+    assert build_model(arm, dt=0.01).opt.timestep == pytest.approx(0.0025)
+
+
+def test_a_timestep_that_does_not_divide_the_control_period_is_refused(tmp_path):
+    with pytest.raises(RobotError, match="is not a whole number; choose a timestep that divides the control period"):
+        write_arm(tmp_path / "arm", toml=TOML.replace("timestep = 0.005", "timestep = 0.007"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"payload_mass": -1.0}, r"payload_mass is -1\.0; give the mass in kg, 0 for an empty hand"),
+        ({"payload_mass": float("nan")}, "payload_mass is nan"),
+        ({"payload_side": "foot"}, "payload side 'foot' is unknown to arm; use both or one of hand"),
+        ({"dt": 0.0}, "the control period in seconds must be positive"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_refused(arm, options, message):
+    with pytest.raises(UsageError, match=message):
+        build_model(arm, **options)
+
+
+@pytest.mark.parametrize(
+    ("toml", "xml", "message"),
+    [
+        (TOML, "<mujoco>", "not valid MJCF"),
+        (TOML.replace('"elbow"', '"knee"'), XML, r"robot.toml names joint 'knee', the MJCF has: elbow, shoulder"),
+        (TOML.replace('"fore"', '"hand"'), XML, "payload mount 'hand' names body 'hand', which is missing"),
+        ("[[joint]]".join(TOML.split("[[joint]]")[:2]), XML, "has 2 degrees of freedom .* names 1 hinge"),
+        (TOML.replace("shoulder", "x").replace("elbow", "shoulder").replace('"x"', '"elbow"'), XML,
+         "must list the joints in the MJCF's order: shoulder, elbow"),
+        (TOML, XML.replace('mass="0.3"', 'mass="-1"'), "does not compile|not valid MJCF"),
+    ],
+)  # fmt: skip
+def test_a_broken_robot_folder_says_what_is_wrong(tmp_path, toml, xml, message):
+    robot = write_arm(tmp_path / "arm", toml=toml, xml=xml)
+    with pytest.raises(RobotError, match=message):
+        build_model(robot)
+
+
+def test_a_robot_without_a_mount_carries_nothing(tmp_path):
+    robot = write_arm(tmp_path / "arm", toml=TOML.split("[[payload_mount]]")[0])
+    assert build_model(robot).nv == 2
+    with pytest.raises(RobotError, match=r"arm has no \[\[payload_mount\]\]; add one to robot.toml to attach 1.0 kg"):
+        build_model(robot, 1.0)
+
+
+def test_actuators_of_the_mjcf_are_replaced(tmp_path):
+    motors = '<actuator><motor joint="elbow"/><motor joint="elbow" gear="9"/></actuator></mujoco>'
+    model = build_model(write_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", motors)))
+    assert [model.actuator(i).name for i in range(model.nu)] == ["shoulder", "elbow"]
+
+
+def test_ranges_come_from_the_mjcf(arm):
+    assert qpos_range(build_model(arm)).tolist() == [[-1.5, 1.5], [-1.5, 1.5]]
+
+
+def test_another_gain_is_another_simulator(tmp_path):
+    one = write_arm(tmp_path / "a")
+    other = write_arm(tmp_path / "b", toml=TOML.replace("kp = 20.0", "kp = 998.0"))
+    assert model_hash(one) == model_hash(write_arm(tmp_path / "c"))
+    assert model_hash(one) != model_hash(other)
+    assert len(model_hash(one)) == 12

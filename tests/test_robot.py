@@ -1,0 +1,89 @@
+"""Robots are folders: names, gains and limits come from there, and a broken folder says what is wrong."""
+
+import numpy as np
+import pytest
+from arm import TOML, XML, write_arm
+
+from gaponet.errors import JointMismatchError, RobotError
+from gaponet.robot import available, load_robot
+
+
+def test_the_package_holds_h1_2_and_so101():
+    assert available() == ["h1_2", "so101"]
+
+
+def test_h1_2_operates_the_ten_arm_joints_of_27():
+    robot = load_robot("h1_2")
+    assert len(robot.joint_names) == 27
+    assert len(robot.operated) == 10
+    assert robot.joint_names[robot.operated_index[3]] == "left_elbow_joint"
+
+
+def test_so101_leaves_its_gripper_alone(so101):
+    assert so101.joint_names[-1] == "gripper"
+    assert "gripper" not in so101.operated
+    assert so101.log_units[-1] == "fraction"
+
+
+def test_20_ms_in_steps_of_5_ms_is_4_steps(so101):
+    assert so101.decimation == 4
+
+
+def test_gains_cannot_be_changed_after_loading(so101):
+    with pytest.raises(ValueError, match="read-only"):
+        so101.kp[0] = 1.0
+
+
+def test_an_unlimited_joint_has_an_infinite_range(tmp_path):
+    robot = write_arm(tmp_path / "arm", xml=XML.replace(' range="-1.5 1.5"', "", 1))
+    assert robot.qpos_range.tolist() == [[-np.inf, np.inf], [-1.5, 1.5]]
+
+
+@pytest.mark.parametrize("name", ["Pitch", "shoulder_lift", "/so101/upper_arm/shoulder_lift", " Pitch "])
+def test_a_joint_is_known_by_its_aliases_and_by_the_end_of_a_path(so101, name):
+    assert so101.resolve(name, "a.csv") == "shoulder_lift"
+
+
+def test_the_users_map_wins_over_aliases(so101):
+    assert so101.resolve("Pitch", "a.csv", {"Pitch": "elbow_flex"}) == "elbow_flex"
+
+
+def test_an_unknown_joint_names_the_file_the_valid_names_and_the_likely_one(so101):
+    with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', but robot 'so101' has: shoulder_pan, .*"
+                       r"Map it with --map elbow=elbow_flex"):  # fmt: skip
+        so101.resolve("elbow", "a.csv")
+
+
+def test_an_unknown_robot_names_those_of_the_package():
+    with pytest.raises(RobotError, match="no robot 'nope': in the package are h1_2, so101; or give a folder"):
+        load_robot("nope")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "arm"', "", "'name' is missing; add name = ..."),
+        ("kp = 20.0", "", r"\[\[joint\]\] 1: 'kp' is missing"),
+        ("kp = 20.0", 'kp = "much"', r"\[\[joint\]\] 1: 'kp' has the wrong type \(str\)"),
+        ('name = "elbow"', 'name = "shoulder"', "a joint name appears twice in shoulder, shoulder"),
+        ("timestep = 0.005", "timestep = 0.003", "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number"),
+        ("kp = 20.0", 'kp = 20.0\nlog_unit = "grad"', "joint shoulder: log_unit must be one of rad, deg, fraction"),
+        ("kp = 20.0", "kp = 20.0\noperated = false", "no joint has operated = true"),
+        ("dt = 0.02", "dt = ", "not valid TOML"),
+        ("[[joint]]", "[[joints]]", r"no \[\[joint\]\] entries; add one for each actuated joint"),
+        ('body = "fore"\n', "", r"\[\[payload_mount\]\] 1: 'body' is missing"),
+    ],
+)
+def test_a_broken_robot_toml_says_what_is_wrong(tmp_path, old, new, message):
+    toml = TOML.replace(old, new)
+    if "operated" not in new and old == "kp = 20.0":
+        toml = TOML.replace(old, new, 1)
+    with pytest.raises(RobotError, match=message):
+        write_arm(tmp_path / "arm", toml=toml)
+
+
+def test_a_folder_without_mjcf_says_where_to_put_it(tmp_path):
+    write_arm(tmp_path / "arm")
+    (tmp_path / "arm" / "robot.xml").unlink()
+    with pytest.raises(RobotError, match=r"robot\.xml is missing beside it"):
+        load_robot(tmp_path / "arm")
