@@ -1,6 +1,6 @@
 """The README's table and picture: real SO-101 logs, 3 seeds, whole-motion free run on 10 motions never used for choosing.
 
-    python benchmarks/real_so101.py LOGS WORK [--budget 8m] [--mlp-budget 4m] [--seeds 0 1 2]
+    python benchmarks/real_so101.py LOGS WORK [--budget 1300000] [--mlp-budget 1000000] [--seeds 0 1 2]
 
 Calls the commands a user would call; writes docs/results/real_so101.{json,md,svg,png}. Runs that exist in WORK are kept.
 """
@@ -41,7 +41,9 @@ def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int]) -
     for seed in seeds:
         for kind, budget in budgets.items():
             if not (work / f"{kind}-{seed}" / "model" / "card.json").exists():
-                gaponet("train", data, "--out", work / f"{kind}-{seed}", "--model", kind, "--seed", seed, "--budget", budget)
+                gaponet(
+                    "train", data, "--out", work / f"{kind}-{seed}", "--model", kind, "--seed", seed, "--budget", budget
+                )
     return [gaponet("eval", work / f"gaponet-{s}", data, "--also", work / f"mlp-{s}") for s in seeds]
 
 
@@ -58,12 +60,17 @@ def spread(results: list[dict[str, Any]], *path: str) -> tuple[float, float]:
 def table(results: list[dict[str, Any]]) -> str:
     """Markdown, method by method."""
     nominal = spread(results, "nominal", "mpjae")[0]
-    rows = ["| method | MPJAE, mrad | of nominal | Q_dis, rad·s | share ≥ 0.05 rad |", "| --- | ---: | ---: | ---: | ---: |"]
+    rows = [
+        "| method | MPJAE, mrad | of nominal | Q_dis, rad·s | share ≥ 0.05 rad |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
     for name in results[0]["methods"]:
         mean, std = spread(results, name, "mpjae")
         text = f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std else f"{mean * 1e3:.2f}"
         large = spread(results, name, "large_0.05")[0] * 100
-        rows.append(f"| {NAMES[name]} | {text} | {mean / nominal:.2f} | {spread(results, name, 'q_dis')[0]:.2f} | {large:.1f} % |")
+        rows.append(
+            f"| {NAMES[name]} | {text} | {mean / nominal:.2f} | {spread(results, name, 'q_dis')[0]:.2f} | {large:.1f} % |"
+        )
     return "\n".join(rows)
 
 
@@ -112,8 +119,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", type=Path)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--budget", default="8m")
-    parser.add_argument("--mlp-budget", default="4m")
+    parser.add_argument("--budget", default="1300000")
+    parser.add_argument("--mlp-budget", default="1000000")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
@@ -122,13 +129,15 @@ def main() -> None:
     first = results[0]
     text = (
         f"# Real SO-101\n\nWhole-motion free run on {first['sequences']} held-out motions, mean ± std over seeds "
-        f"{args.seeds}; training budgets {args.budget} (GAPONet) and {args.mlp_budget} (MLP) of wall-clock time on 2 cores; "
+        f"{args.seeds}; training budgets {args.budget} (GAPONet) and {args.mlp_budget} (MLP) control steps; "
         f"{date.today()}.\nSimulator {first['simulator_hash']}. Regenerate: "
         f"`python benchmarks/real_so101.py LOGS WORK --budget {args.budget} --mlp-budget {args.mlp_budget}`.\n\n"
         f"{table(results)}\n\nHeld-out motions: {', '.join(first['motions'])}.\n\n![](real_so101.svg)\n"
     )
     (DOCS / "real_so101.md").write_text(text, encoding="utf-8")
-    (DOCS / "real_so101.json").write_text(json.dumps(dict(zip(map(str, args.seeds), results, strict=True)), indent=1) + "\n")
+    (DOCS / "real_so101.json").write_text(
+        json.dumps(dict(zip(map(str, args.seeds), results, strict=True)), indent=1) + "\n"
+    )
     draw(results, args.work / f"gaponet-{args.seeds[0]}")
     print(table(results))
 

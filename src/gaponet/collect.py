@@ -105,7 +105,7 @@ def _listed(dataset: Dataset) -> list[tuple[SequenceMeta, float]]:
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    """One collector per folder. The lock goes with its process, however that ends; what a killed one left is cleared."""
+    """One collector per folder. The lock ends with its process, whatever ends it; what a killed one left is cleared."""
     import fcntl
 
     with (folder / "collect.lock").open("w") as lock:

@@ -56,7 +56,9 @@ def test_clamping_idle_limbs_changes_nothing_for_the_others():
     ctrl[:, robot.index(["left_elbow_joint"])] = 0.4 * np.sin(np.arange(40) / 6)[:, None]
     meta = SequenceMeta("h1_2", "a", "elbow", 1.0)
     sequence = Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.zeros_like(ctrl))
-    assert idle_limbs([sequence], robot) == tuple(j for j in robot.joint_names if "hip" in j or "knee" in j or "ankle" in j)
+    assert idle_limbs([sequence], robot) == tuple(
+        j for j in robot.joint_names if "hip" in j or "knee" in j or "ankle" in j
+    )
     whole, arms = (replay([sequence], robot, lock_idle=lock)[0] for lock in (False, True))
     op = robot.operated_index
     np.testing.assert_allclose(whole.qpos[:, op], arms.qpos[:, op], atol=1e-6)

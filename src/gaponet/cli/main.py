@@ -53,6 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except GAPONetError as error:
         print(f"{type(error).__name__.removesuffix('Error')}: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # a full disk, a missing permission: the user's to mend, not a bug
+        print(f"File: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("interrupted; what was written so far is complete", file=sys.stderr)
         return 130

@@ -21,13 +21,13 @@ class Out:
 
     def say(self, text: str) -> None:
         """A line for people."""
-        self.console.print(text)
+        self.console.print(text, soft_wrap=True)
 
     def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
         """A table for people; the first column is text, the others are right-aligned."""
         table = Table(title=title, title_justify="left", title_style="bold")
         for i, column in enumerate(columns):
-            table.add_column(column, justify="left" if i == 0 else "right")
+            table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
         for row in rows:
             table.add_row(*row)
         self.console.print(table)

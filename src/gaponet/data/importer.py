@@ -15,7 +15,7 @@ import numpy as np
 
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.log import Log
-from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, record_offsets
+from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
 from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
 from gaponet.data.store import Dataset, Entry
@@ -48,7 +48,7 @@ def import_logs(
     progress: Progress | None = None,
     **options: Any,
 ) -> ImportReport:
-    """Import every recording under a path; all of them or none.
+    """Import every recording under a path; a bad one refuses them all, and nothing is written.
 
     Args:
         src: File or folder in one of data.formats.FORMATS.
@@ -70,6 +70,8 @@ def import_logs(
     """
     src, out = Path(src), Path(out)
     known = Dataset.peek(out, robot)
+    if known:
+        read_offsets(known)  # a damaged one is said before anything is read
     side, name = _side(robot, payload_side), os.path.basename(os.path.abspath(src))
     meta = SequenceMeta(robot.name, unit_id, name, payload_mass, side, level, source=str(src))
     sequences: list[Sequence] = []

@@ -107,14 +107,14 @@ def fit_offsets(holds: dict[Condition, Holds], robot: RobotSpec, gravity: Gravit
     """
     n = len(robot.joint_names)
     every = join(list(holds.values()), n)
-    sag = np.concatenate([np.zeros((0, n)), *(-gravity(h.qpos, *key) / robot.kp for key, h in holds.items())])  # (k, n)
+    sag = np.concatenate([np.zeros((0, n)), *(_nominal_sag(h.qpos, key, robot, gravity) for key, h in holds.items())])
     plain: dict[str, JointOffset] = {}
     zeros: dict[str, dict[str, Any]] = {}
     stiffness = None
     for name, j in zip(robot.operated, robot.operated_index, strict=True):
         error, beyond = static_error(every, j), static_error(every, j, sag[:, j])
         plain[name] = _without_zero(error, beyond)
-    rests = {key: _rests(h, robot) for key, h in holds.items()}
+    rests = {key: _rests(h, robot, max(30, MAX_POSES // len(holds))) for key, h in holds.items()}
     if sum(int(r.used.sum()) for r in rests.values()) >= MIN_RESTS:
         zeros, stiffness = _fit_zeros(rests, robot, gravity)
     few = {"reason": f"fewer than {MIN_RESTS} rests after a motion: let the robot stand still in many postures"}
@@ -144,8 +144,13 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     return content
 
 
+def _nominal_sag(qpos: Array, condition: Condition, robot: RobotSpec, gravity: Gravity) -> Array:
+    """Static error of the nominal model, (k, n) rad; 0 for a joint without gain."""
+    return -gravity(qpos, *condition) / np.where(robot.kp > 0, robot.kp, np.inf)
+
+
 def _without_zero(error: StaticError, beyond: StaticError) -> JointOffset:
-    number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
+    number = lambda x: round(float(x), 6) if math.isfinite(x) else None  # noqa: E731
     return JointOffset(
         rests_up=error.up,
         rests_down=error.down,
@@ -156,11 +161,12 @@ def _without_zero(error: StaticError, beyond: StaticError) -> JointOffset:
     )
 
 
-def _rests(holds: Holds, robot: RobotSpec) -> _Rests:
+def _rests(holds: Holds, robot: RobotSpec, most: int) -> _Rests:
+    """Evenly thinned to `most` postures: gravity is evaluated some hundred times in each."""
     op = robot.operated_index
     used = holds.fresh[:, op] & (holds.approach[:, op] != 0)
     rows = np.flatnonzero(used.any(axis=1))
-    rows = rows[:: max(1, math.ceil(len(rows) / MAX_POSES))]
+    rows = rows[:: max(1, math.ceil(len(rows) / most))]
     error = (holds.qpos - holds.ctrl)[rows][:, op]
     return _Rests(holds.qpos[rows], error, holds.approach[rows][:, op].astype(float), used[rows])
 
@@ -183,8 +189,13 @@ def _fit_zeros(
             reason = f"motors with {stiffness:.2f} of the nominal kp explain the sag with another zero"
         elif std > IDENTIFIED:
             reason = "the sag changes too little over these postures"
-        fields[name] = {"zero_offset": float(fixed[i]), "zero_std": std, "identifiable": not reason, "reason": reason}
-    return fields, stiffness
+        fields[name] = {
+            "zero_offset": round(float(fixed[i]), 6),
+            "zero_std": round(std, 6),
+            "identifiable": not reason,
+            "reason": reason,
+        }
+    return fields, round(stiffness, 4)
 
 
 def _least_squares(
@@ -202,9 +213,8 @@ def _least_squares(
         """Nominal sag at qpos + z for all used rests, (rests,), rad."""
         turned = np.zeros(len(robot.joint_names))
         turned[op] = z
-        return np.concatenate(
-            [-(gravity(r.qpos + turned, *key) / robot.kp)[:, op][r.used] for key, r in rests.items()]
-        )  # fmt: skip
+        sags = {key: _nominal_sag(r.qpos + turned, key, robot, gravity)[:, op] for key, r in rests.items()}
+        return np.concatenate([sags[key][r.used] for key, r in rests.items()])
 
     error = np.concatenate([r.error[r.used] for r in rests.values()])
     side = np.concatenate([(r.approach[:, :, None] * np.eye(m))[r.used] for r in rests.values()])  # (rests, m)

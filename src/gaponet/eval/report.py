@@ -169,6 +169,12 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
         out.append(
             f"Trained on one unit ({card['units'][0]}): another unit's zero offsets and friction are unknown to it."
         )
+    span = card["model"]["history"] * card["model"]["stride"] * min(card["dt"])
+    if card["excess_delay"] > span + 1e-6:
+        out.append(
+            f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans {span * 1e3:.0f} ms: "
+            "raise --model.history or --model.stride."
+        )
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
     worse = [j for j, m in methods[kind]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]

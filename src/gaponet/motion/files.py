@@ -1,7 +1,7 @@
 """Motion files: SAGE motion txt, csv and npz, read into a Motion and written from one.
 
-SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample, rad,
-at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: arrays joint_names, ctrl (T, k) rad, dt (s).
+SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample in
+rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: joint_names, ctrl (T, k) rad and dt s.
 """
 
 from __future__ import annotations

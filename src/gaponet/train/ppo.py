@@ -16,7 +16,7 @@ from gaponet.model.deeponet import build_network
 from gaponet.train.config import PPOConfig, TrainConfig
 from gaponet.train.env import DeltaEnv
 
-STD_RANGE = (math.exp(-5), math.exp(-1))  # rad
+STD_RANGE = (0.001, math.exp(-1))  # rad
 
 
 class DeltaActor(MLPModel):

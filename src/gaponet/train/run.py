@@ -278,6 +278,7 @@ class Trainer:
             val_mpjae={"model": self.best, "nominal": self.nominal},
             sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
             seed=self.config.seed,
+            excess_delay=max(self.baseline.delay.values()),
             steps=self.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,

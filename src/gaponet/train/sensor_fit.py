@@ -13,8 +13,8 @@ from gaponet.sim.batch import Condition
 
 Array = np.ndarray
 
-STATES = 4096
-STEPS = 800
+STATES = 2048
+STEPS = 600
 BATCH = 256
 POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: half of the states are moved off the recorded ones by these
 

@@ -118,6 +118,13 @@ def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int) ->
     net.features.standardise.fit(net.features.relative(torch.from_numpy(x)))
     shuffled = rng.permutation(pick)
     features, answers = sensor_labels(
-        net, robot, x[shuffled], q[shuffled], v[shuffled], [env.conditions[g] for g in group[shuffled]], env.locked, seed
+        net,
+        robot,
+        x[shuffled],
+        q[shuffled],
+        v[shuffled],
+        [env.conditions[g] for g in group[shuffled]],
+        env.locked,
+        seed,
     )
     return fit_predictor(net, features, answers, seed)

@@ -1,9 +1,9 @@
 """Fleets: virtual units drawn once from written-down distributions, and kept as data.
 
 A fleet file (fleets/*.toml) holds a seed, one [[distribution]] per hidden parameter with its source, and the drawn
-units. All units of a type share what the type has (type_spread, from joint to joint) and differ by what production leaves
-open (unit_spread for the whole unit, joint_spread for each joint of it). For a robot whose units are not in the file they
-are drawn when the fleet is loaded, by the same rule.
+units. All units of a type share what the type has (type_spread, from joint to joint) and differ by what production
+leaves open (unit_spread for the whole unit, joint_spread for each joint of it). For a robot whose units are not in the
+file they are drawn when the fleet is loaded, by the same rule.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ DIGITS = 6  # significant, of a saved number
 
 @dataclass(frozen=True)
 class Distribution:
-    """How one parameter is drawn: (mean + three normal deviations), clipped to [low, high], times the torque limit if so said."""
+    """How one parameter is drawn: mean + three normal deviations, clipped to [low, high]."""
 
     name: str
     mean: float

@@ -1,7 +1,8 @@
 """The hidden laws, each on (N, n) arrays for N simulations at once; parameters come from Physics.
 
 MuJoCo integrates the joints: these laws only set, every law period, what its actuators and friction constraints are
-allowed to do. So friction sticks as MuJoCo's does, and with neutral parameters nothing differs from the nominal simulator.
+allowed to do. So friction sticks as MuJoCo's does, and with neutral parameters nothing differs from the nominal
+simulator.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class Backlash:
     """Play between motor and link: when the torque changes sign the motor first has to cross the gap.
 
     While it crosses, the link feels no torque. The motor is a free rotor there: its inertia is the joint's armature, and
-    it arrives after √(2·gap·J/τ) under a constant torque (Nordin & Gutman 2002, Automatica 38, the dead-zone picture with
-    a rigid, plastic contact).
+    it arrives after √(2·gap·J/τ) under a constant torque (the dead-zone picture of Nordin & Gutman 2002, Automatica 38,
+    with a rigid, plastic contact).
     """
 
     def __init__(self, physics: Physics, armature: Array) -> None:

@@ -1,4 +1,4 @@
-"""What is hidden in a virtual robot: its parameters, which effect each belongs to, and the value that means "no effect".
+"""What is hidden in a virtual robot: its parameters, the effect each belongs to, and the value for "no effect".
 
 The numbers themselves, with their sources, stand in fleets/*.toml.
 """

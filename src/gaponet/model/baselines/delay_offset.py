@@ -16,7 +16,7 @@ Array = np.ndarray
 
 MAX_DELAY = 0.16  # s, in steps of the control period
 PIECE = 20.0  # s, free run per fitting piece
-FRAMES = 20_000  # frames fitted on at most
+FRAMES = 10_000  # frames fitted on at most
 
 
 @dataclass(frozen=True)
