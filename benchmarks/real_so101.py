@@ -1,4 +1,4 @@
-"""The README's table and picture: real SO-101 logs, 3 seeds, whole-motion free run on 10 motions never used for choosing.
+"""The README's table and picture: real SO-101 logs, 3 seeds, whole-motion free run on 10 motions never used otherwise.
 
     python benchmarks/real_so101.py LOGS WORK [--budget 1300000] [--mlp-budget 1000000] [--seeds 0 1 2]
 
@@ -83,10 +83,12 @@ def draw(results: list[dict[str, Any]], run: Path) -> None:
         joints = list(results[0]["methods"]["nominal"]["by_joint"])
         width = 0.8 / len(methods)
         for i, name in enumerate(methods):
-            values = np.array([spread(results, name, "by_joint", j, "mpjae") for j in joints]) * 1e3
+            values = 1e3 * np.array([spread(results, name, "by_joint", j, "mpjae") for j in joints])
             x = np.arange(len(joints)) + (i - (len(methods) - 1) / 2) * width
-            left.bar(x, values[:, 0], width * 0.92, yerr=values[:, 1] if values[:, 1].any() else None, color=COLOURS[name],
-                     error_kw={"lw": 0.8}, label=NAMES[name])  # fmt: skip
+            error = values[:, 1] if values[:, 1].any() else None
+            left.bar(
+                x, values[:, 0], width * 0.92, yerr=error, color=COLOURS[name], error_kw={"lw": 0.8}, label=NAMES[name]
+            )
         left.set_xticks(np.arange(len(joints)), [j.replace("_", "\n") for j in joints])
         left.grid(axis="x", visible=False)
         left.set_ylabel("MPJAE, mrad")

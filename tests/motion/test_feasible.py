@@ -49,7 +49,7 @@ def test_a_motion_that_is_too_heavy_is_brought_nearer_to_its_start(arm):
 
 def test_what_cannot_be_fitted_says_why(arm):
     limits = Feasibility(arm, 5.0)
-    with pytest.raises(UsageError, match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg .* lighter payload"):
+    with pytest.raises(UsageError, match=r"'hold' does not fit arm .* shoulder needs .* at 5 kg, .* lighter payload"):
         limits.fit(Motion("hold", "joint", GRID, still(arm, 0.0)))
 
 

@@ -50,7 +50,8 @@ def evaluate(
         runs_dirs: Training runs; the first one's split and delay + offset baseline apply.
         dataset: The one trained on, or another.
         robot: The nominal simulator.
-        motions: Only these; default: the test motions of the dataset trained on, all that was never trained on of another.
+        motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
+            trained on.
         progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)

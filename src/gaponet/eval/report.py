@@ -6,7 +6,7 @@ import base64
 import html
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -128,14 +128,7 @@ def _page(
     ]  # fmt: skip
     if len(methods["nominal"]["by_payload"]) > 1:
         body.append(_figure(draw.by_payload(methods), "Payload in each hand."))
-    body += ["</div>", "<h2>Trajectories</h2>"]
-    for row, shown in enumerate(metrics["shown"]):
-        errors = np.abs(arrays[f"{row}/nominal"] - arrays[f"{row}/recorded"]).mean(axis=0)
-        worst = sorted(np.argsort(-errors)[:3].tolist())
-        fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(methods), shown["dt"])
-        unit = f"unit {shown['unit_id']}, {shown['payload_mass']:g} kg"
-        body.append(_figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({html.escape(unit)}): the 20 s with most motion, "
-                                 "the three joints with the largest nominal error; Δa is the learned correction."))  # fmt: skip
+    body += ["</div>", "<h2>Trajectories</h2>", *_trajectories(arrays, metrics, robot)]
     body += [
         "<h2>Training</h2>", '<div class="row">',
         _figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
@@ -148,6 +141,20 @@ def _page(
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{CSS}</style></head><body>{''.join(body)}</body></html>\n"
     )
+
+
+def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[str]:
+    from gaponet.eval import figures as draw
+
+    caption = (
+        "the 20 s with most motion, the three joints with the largest nominal error; Δa is the learned correction."
+    )
+    for row, shown in enumerate(metrics["shown"]):
+        errors = np.abs(arrays[f"{row}/nominal"] - arrays[f"{row}/recorded"]).mean(axis=0)
+        worst = sorted(np.argsort(-errors)[:3].tolist())
+        fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(metrics["methods"]), shown["dt"])
+        where = html.escape(f"unit {shown['unit_id']}, {shown['payload_mass']:g} kg")
+        yield _figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({where}): {caption}")
 
 
 def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:

@@ -99,8 +99,8 @@ class Feasibility:
         raise UsageError(
             f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {need.worst_joint} needs "
             f"{need.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {need.speed:.2f} of "
-            f"{MAX_SPEED:g} rad/s, limbs come within {need.clearance * 100:.1f} cm ({CLEARANCE * 100:g} wanted). "
-            "Start it from a posture that is easier to hold, or collect with a lighter payload"
+            f"{MAX_SPEED:g} rad/s, the nearest limbs are {need.clearance * 100:.1f} cm apart (at least "
+            f"{CLEARANCE * 100:g}). Start it from a posture that is easier to hold, or collect with a lighter payload"
         )
 
     def still(self, posture: Array) -> bool:

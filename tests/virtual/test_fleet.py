@@ -1,0 +1,87 @@
+import tomllib
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from gaponet.errors import UsageError
+from gaponet.robot import load_robot
+from gaponet.virtual.fleet import FLEETS, draw, load_fleet, to_toml
+from gaponet.virtual.physics import EFFECTS, Physics, neutral
+
+NAMES = ("default", "shifted")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_saved_units_are_what_the_distributions_and_the_seed_give(name):
+    robot = load_robot("h1_2")
+    fleet = load_fleet(name, robot)
+    assert list(fleet.units) == ["virtual-1", "virtual-2", "virtual-3", "virtual-4"]
+    for k, unit in enumerate(fleet.units.values(), 1):
+        again = draw(robot, fleet.distributions, fleet.seed, k)
+        for f in fields(Physics):
+            assert np.array_equal(getattr(unit, f.name), getattr(again, f.name)), f.name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_number_has_a_source_and_the_file_says_virtual(name):
+    table = tomllib.loads((FLEETS / f"{name}.toml").read_text(encoding="utf-8"))
+    assert table["virtual"] is True
+    assert {d["name"] for d in table["distribution"]} == {f.name for f in fields(Physics)}
+    assert all(len(d["source"]) > 10 for d in table["distribution"])
+
+
+def test_units_of_a_type_are_alike_and_not_the_same():
+    fleet = load_fleet("default", load_robot("h1_2"))
+    kp = np.array([u.kp_scale for u in fleet.units.values()])  # (units, joints)
+    assert len({tuple(row) for row in kp}) == 4
+    between_units, between_joints = kp.std(axis=0).mean(), kp.mean(axis=0).std()
+    assert 0.2 * between_joints < between_units < 3 * between_joints
+
+
+def test_the_shifted_fleet_lies_outside_the_default_one():
+    robot = load_robot("h1_2")
+    default, shifted = (load_fleet(n, robot) for n in NAMES)
+    mean = lambda fleet, name: np.mean([getattr(u, name).mean() for u in fleet.units.values()])  # noqa: E731
+    assert mean(shifted, "friction") > 1.3 * mean(default, "friction")
+    assert mean(shifted, "delay") > 1.5 * mean(default, "delay")
+    assert mean(default, "cogging") == 0
+    assert mean(shifted, "cogging") > 0
+    assert default.digest() != shifted.digest()
+
+
+def test_a_robot_that_the_file_does_not_hold_is_drawn_from_the_same_distributions(arm):
+    a, b = load_fleet("default", arm), load_fleet("default", arm)
+    assert a.digest() == b.digest()
+    assert a.unit("virtual-1").friction.shape == (2,)
+    assert 0.005 * 5 < a.unit("virtual-1").friction.mean() < 0.05 * 5  # parts of the 5 N·m limit
+
+
+def test_switching_all_effects_off_leaves_nothing():
+    unit = load_fleet("shifted", load_robot("h1_2")).unit("virtual-1")
+    off, none = unit.without(*EFFECTS), neutral(27)
+    assert all(np.array_equal(getattr(off, f.name), getattr(none, f.name)) for f in fields(Physics))
+    kept = unit.without("friction")
+    assert (kept.friction == 0).all()
+    assert np.array_equal(kept.backlash, unit.backlash)
+
+
+def test_a_fleet_can_be_written_and_read(arm, tmp_path):
+    head = (FLEETS / "default.toml").read_text(encoding="utf-8").split("\n# ---- drawn units ----\n")[0]
+    fleet = load_fleet("default", arm)
+    file = tmp_path / "mine.toml"
+    file.write_text(head.replace('name = "default"', 'name = "mine"') + to_toml(arm, fleet.units), encoding="utf-8")
+    assert load_fleet(file, arm).digest() == fleet.digest()
+
+
+def test_errors_say_what_there_is(arm, tmp_path):
+    with pytest.raises(UsageError, match="no fleet 'lab': in the package are default, shifted; or give a .toml file"):
+        load_fleet("lab", arm)
+    with pytest.raises(UsageError, match="fleet 'default' has no unit 'robot-7'; it has virtual-1, virtual-2"):
+        load_fleet("default", arm).unit("robot-7")
+    with pytest.raises(UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"):
+        neutral(2).without("magic")
+    file = tmp_path / "bad.toml"
+    file.write_text('[[distribution]]\nname = "charm"\n')
+    with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm'; parameters are kp_scale"):
+        load_fleet(file, arm)
