@@ -2,7 +2,7 @@
 
     python benchmarks/real_so101.py LOGS WORK [--budget 1300000] [--mlp-budget 1000000] [--seeds 0 1 2]
 
-Calls the commands a user would call; writes docs/results/real_so101.{json,md,svg,png}. Runs that exist in WORK are kept.
+Calls the commands a user would call; writes docs/results/real_so101.{json,md,svg,png}. Runs found in WORK are kept.
 """
 
 from __future__ import annotations
@@ -67,10 +67,8 @@ def table(results: list[dict[str, Any]]) -> str:
     for name in results[0]["methods"]:
         mean, std = spread(results, name, "mpjae")
         text = f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std else f"{mean * 1e3:.2f}"
-        large = spread(results, name, "large_0.05")[0] * 100
-        rows.append(
-            f"| {NAMES[name]} | {text} | {mean / nominal:.2f} | {spread(results, name, 'q_dis')[0]:.2f} | {large:.1f} % |"
-        )
+        large, q_dis = spread(results, name, "large_0.05")[0] * 100, spread(results, name, "q_dis")[0]
+        rows.append(f"| {NAMES[name]} | {text} | {mean / nominal:.2f} | {q_dis:.2f} | {large:.1f} % |")
     return "\n".join(rows)
 
 

@@ -1,7 +1,7 @@
 """How far a simulator is from the robot: the metrics, in free run, grouped as people ask for them.
 
-e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's number is
-the mean over its sequences.
+e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's
+number is the mean over its sequences.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
     """Metrics averaged over sequences, over all joints or over some columns.
 
     Returns:
-        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (median error while still; the rest),
+        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (the median error; the rest),
         iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape %.
     """
     rows = [_sequence_metrics(r, columns) for r in part]

@@ -25,8 +25,7 @@ def moving(arm):
     for row in ctrl:
         robots.step(row[None])
         data = robots.batch.get_data(0)
-        mujoco.mj_energyPos(model, data)
-        mujoco.mj_energyVel(model, data)
+        mujoco.mj_forward(model, data)
         rows.append((data.energy.sum(), data.qpos.copy(), data.qvel.copy(), force[0].copy(), friction[0].copy()))
     return robots, model, [np.array(x) for x in zip(*rows, strict=True)]
 

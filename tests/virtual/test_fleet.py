@@ -43,7 +43,8 @@ def test_the_shifted_fleet_lies_outside_the_default_one():
     robot = load_robot("h1_2")
     default, shifted = (load_fleet(n, robot) for n in NAMES)
     mean = lambda fleet, name: np.mean([getattr(u, name).mean() for u in fleet.units.values()])  # noqa: E731
-    assert mean(shifted, "friction") > 1.3 * mean(default, "friction")
+    dry = lambda fleet: np.mean([u.friction / robot.effort_limit for u in fleet.units.values()])  # noqa: E731
+    assert dry(shifted) > 1.3 * dry(default)
     assert mean(shifted, "delay") > 1.5 * mean(default, "delay")
     assert mean(default, "cogging") == 0
     assert mean(shifted, "cogging") > 0

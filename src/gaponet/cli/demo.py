@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -41,9 +43,10 @@ def demo(
 
     screen, began = Out(json), time.monotonic()
     _clear(out)
-    holdout = _make_dataset(out / "dataset", data, robot, screen)
-    dataset = Dataset(out / "dataset")
-    gap(out / "dataset", robot)
+    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
+        holdout = _make_dataset(out / "dataset", data, robot, screen)
+        dataset = Dataset(out / "dataset")
+        gap(out / "dataset", robot)
     for config, limit in ((TrainConfig(), budget), (TrainConfig(model=ModelConfig(kind="mlp")), mlp_budget)):
         run_training(dataset, robot, out / config.model.kind, config, limit, False, holdout)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)

@@ -179,7 +179,8 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
     span = card["model"]["history"] * card["model"]["stride"] * min(card["dt"])
     if card["excess_delay"] > span + 1e-6:
         out.append(
-            f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans {span * 1e3:.0f} ms: "
+            f"The robot lags the simulator by {card['excess_delay'] * 1e3:.0f} ms, the history spans "
+            f"{span * 1e3:.0f} ms: "
             "raise --model.history or --model.stride."
         )
     if card.get("interrupted"):
@@ -239,15 +240,15 @@ def _by_motion(methods: dict[str, Any], names: dict[str, str]) -> str:
 
 
 def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
-    r2 = card.get("sensor_r2")
+    r2, shape, ppo, motions = card.get("sensor_r2"), card["model"], config["ppo"], card["motions"]
     rows = [
-        ["trained on", f"{len(card['motions']['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
+        ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
-        ["validated on", ", ".join(card["motions"]["val"][:6]) + (" …" if len(card["motions"]["val"]) > 6 else "")],
-        ["observation", f"{card['model']['history']} past frames, payload {'in' if card['model']['payload_input'] else 'out'}"],
+        ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
+        ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
         ["sensor predictor R²", "–" if r2 is None else f"{r2:.3f} on held-out states"],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
-        ["PPO", f"{config['ppo']['num_envs']} environments, {config['ppo']['epochs']} epochs, σ {config['ppo']['init_std']:g} rad"],
+        ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['init_std']:g} rad"],
         ["seed", str(card["seed"])],
         ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
     ]  # fmt: skip

@@ -31,10 +31,10 @@ class ModelConfig:
     probe_large: float = 0.4
     """Probe that reads inertia, payload and saturation, rad."""
     sensors: Literal["predicted", "off"] = "predicted"
-    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees the observation only."""
+    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only."""
     branch_history: bool = True
-    """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay can
-    be corrected (docs/log.md)."""
+    """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
+    can be corrected (docs/log.md)."""
     num_basis: int = 16
     """p, basis functions per joint."""
     branch_hidden: tuple[int, ...] = (256, 256, 256)

@@ -1,4 +1,4 @@
-"""A network in a running simulation: history, observation, inference, bounds. Used by validation, evaluation, deployment."""
+"""A network in a running simulation: history, observation, inference, bounds."""
 
 from __future__ import annotations
 

@@ -115,8 +115,8 @@ class OperatorNet(nn.Module):
         self.trunk = dense(self.query_dim, config.trunk_hidden, n * config.num_basis, last=0.003)
         self.bias = nn.Parameter(torch.zeros(n))
         self.bounded = Bounded(config.delta_max)
-        # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is unsure
-        # of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
+        # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is
+        # unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
         self.sample_sensors = False
 
     def forward(self, x: Tensor) -> Tensor:

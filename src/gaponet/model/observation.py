@@ -14,7 +14,7 @@ Array = np.ndarray
 
 
 class History:
-    """Past frames of num_envs robots and the observation made from them; float32, no allocation per step but the result."""
+    """Past frames of num_envs robots and the observation made from them, float32."""
 
     def __init__(self, config: ModelConfig, num_envs: int, n: int) -> None:
         """Empty history: reset every environment before observing."""

@@ -16,14 +16,14 @@ Condition = tuple[float, str, float]  # payload_mass kg, payload_side, dt s
 class BatchSim:
     """num_envs simulations of a robot; each may carry its own payload and control period.
 
-    `qpos` and `qvel` are live (num_envs, n) views: a write is the state at the next step. Results are bit-identical to a
-    loop of mj_step over one MjData each, at any number of threads.
+    `qpos` and `qvel` are live (num_envs, n) views: a write is the state at the next step. Results are bit-identical to
+    a loop of mj_step over one MjData each, at any number of threads.
     """
 
     def __init__(
         self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = ()
     ) -> None:
-        """One simulation per entry of `conditions`; nthread 0 uses all cores; n counts the joints that are not locked."""
+        """One simulation per entry of `conditions`; nthread 0 uses all cores; n counts joints that are not locked."""
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         self.models = {c: build_model(robot, c[0], c[1], c[2], locked) for c in dict.fromkeys(conditions)}

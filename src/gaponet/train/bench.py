@@ -1,4 +1,4 @@
-"""How much of the simulator's speed is left: bare Batch loop, replay and training environment, interleaved in one run."""
+"""How much of the simulator's speed is left: bare Batch loop, replay and environment, interleaved in one run."""
 
 from __future__ import annotations
 

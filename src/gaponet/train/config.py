@@ -68,8 +68,8 @@ class PPOConfig:
     critic_warmup: int = 10
     """Updates of the critic alone, before a warm-started actor moves."""
     init_std: float = 0.003
-    """Exploration σ at start, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction, and
-    the best noisy policy is not the best policy."""
+    """Exploration σ at start, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
+    and the best noisy policy is not the best policy."""
     critic_hidden: tuple[int, ...] = (256, 128)
     """Hidden layers of the critic."""
 

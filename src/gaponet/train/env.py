@@ -1,4 +1,4 @@
-"""The training environment: many simulations chase recorded motions; the action is Δa, the reward is staying with them."""
+"""The training environment: many simulations chase recorded motions; the action is Δa, the reward is staying close."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Supervised start: regress the inverse labels on states that the policy visits itself (DAgger, Ross et al. 2011).
 
 Fitted on recorded states alone, a policy meets other states as soon as it errs and errs more. So each round rolls the
-present policy out, labels every visited state with u* − a of its row (train/inverse.py: right wherever the state is, the
-plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven by the
-labels themselves and only seeds the second.
+present policy out, labels every visited state with u* − a of its row (train/inverse.py: right wherever the state is,
+the plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven
+by the labels themselves and only seeds the second.
 """
 
 from __future__ import annotations
