@@ -221,11 +221,13 @@ class Trainer:
     def _spent(self) -> float:
         return self.budget.spent(self.seconds(), self.steps)
 
-    def _tick(self) -> None:
+    def _tick(self) -> float:
+        """Show where the run stands; returns the share of the budget spent."""
         self.show(
             Status(self.stage, min(self._spent(), 1.0), self.steps, self.seconds(), self.reward, self.val, self.best,
                    self.nominal)
         )  # fmt: skip
+        return self._spent()
 
     def _save(self) -> None:
         state = {

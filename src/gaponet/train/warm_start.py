@@ -74,8 +74,12 @@ class WarmStart:
         noise[: len(noise) // 4] = 0.0
         return noise
 
-    def round(self, tick: Callable[[], None]) -> float:
-        """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad."""
+    def round(self, tick: Callable[[], float]) -> float:
+        """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad.
+
+        tick is called after every gradient step and returns the share of the budget spent: whichever is further, rounds
+        or budget, lowers the step size.
+        """
         self.collect(follow_labels=self.done == 0)
         if self.done == 0:
             self.net.features.standardise.fit(self.net.features.relative(self.pool_x[0]))
@@ -83,8 +87,9 @@ class WarmStart:
         config, net, total = self.config, self.net, 0.0
         net.train()
         net.sample_sensors = True
+        spent = 0.0
         for step in range(config.gradient_steps):
-            progress = (self.done + step / config.gradient_steps) / config.rounds
+            progress = min(max((self.done + step / config.gradient_steps) / config.rounds, spent), 1.0)
             for group in self.optimiser.param_groups:
                 group["lr"] = config.learning_rate * 0.1**progress
             batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
@@ -93,7 +98,7 @@ class WarmStart:
             loss.backward()
             self.optimiser.step()
             total += loss.item()
-            tick()
+            spent = tick()
         net.sample_sensors = False
         net.eval()
         self.done += 1
