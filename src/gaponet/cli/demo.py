@@ -17,15 +17,17 @@ from gaponet.cli.train import evaluate, run_training
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.robot import load_robot
-from gaponet.train.config import TrainConfig
+from gaponet.train.config import TrainConfig, WarmStartConfig
+
+QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
 
 
 def demo(
     data: Path | None = None,
     robot: str = "h1_2",
     out: Path = Path("demo_run"),
-    budget: str = "150s",
-    mlp_budget: str = "75s",
+    budget: str = "180s",
+    mlp_budget: str = "90s",
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Show the whole way in minutes: on your logs, or on an embedded VIRTUAL robot where there are none.
@@ -47,8 +49,8 @@ def demo(
         holdout = _make_dataset(out / "dataset", data, robot, screen)
         dataset = Dataset(out / "dataset")
         gap(out / "dataset", robot)
-    for config, limit in ((TrainConfig(), budget), (TrainConfig(model=ModelConfig(kind="mlp")), mlp_budget)):
-        run_training(dataset, robot, out / config.model.kind, config, limit, False, holdout)
+    for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
+        run_training(dataset, robot, out / model.kind, TrainConfig(model, warm_start=QUICK), limit, False, holdout)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))

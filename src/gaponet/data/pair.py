@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ def split_by_motion(motions: list[str], test_share: float = 0.25, val_share: flo
 
     Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
     """
-    names = sorted(set(motions), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+    names = hash_order(motions)
     if len(names) < 3:
         raise UsageError(f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more")
     test = max(1, round(len(names) * test_share))
@@ -74,8 +75,18 @@ def split_by_motion(motions: list[str], test_share: float = 0.25, val_share: flo
     return Split(tuple(names[test + val :]), tuple(names[test : test + val]), tuple(names[:test]))
 
 
-def require_disjoint(*parts: list[Sequence], key: Callable[[Sequence], str] = Sequence.content_hash) -> None:
-    """Refuse parts of a split that share a recording under two names."""
+def hash_order(names: Iterable[str]) -> list[str]:
+    """Distinct names in the order of their SHA-256: as good as shuffled, the same everywhere."""
+    return sorted(set(names), key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+
+
+def require_disjoint(*parts: list[Any], key: Callable[[Any], str] = Sequence.content_hash) -> None:
+    """Refuse parts of a split that share a recording under two names.
+
+    Args:
+        parts: Sequences, or anything else with a `meta` and the given content key.
+        key: Content of one of them.
+    """
     seen: dict[str, int] = {}
     for i, part in enumerate(parts):
         for sequence in part:

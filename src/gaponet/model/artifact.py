@@ -70,11 +70,7 @@ def infer_session(path: Path) -> Infer:
 
 @dataclass(frozen=True)
 class GapModel:
-    """A delta-action model and its card.
-
-    For one robot in a loop: `reset` at the start, then `delta` once per control period. For many simulations:
-    `corrector`.
-    """
+    """A delta-action model and its card. `corrector` puts it into a stepping simulator."""
 
     path: Path
     card: dict[str, Any]

@@ -93,7 +93,7 @@ class Trainer:
         )
         self.parts = split_entries(dataset, holdout_units)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
-        require_disjoint(self.train_set, self.val_set, dataset.sequences(self.parts["test"]))
+        require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.torch_threads)
