@@ -75,7 +75,7 @@ def _bars(methods: dict[str, Any], group: str, title: str, suffix: str = "") -> 
         x = np.arange(len(keys)) + (i - (len(methods) - 1) / 2) * width
         values = [m[group][k]["mpjae"] * 1e3 for k in keys]
         ax.bar(x, values, width * 0.92, color=COLOURS[name], label=NAMES[name])
-    labels = [k.removesuffix("_joint").replace("_", "\n", 1) + suffix for k in keys]
+    labels = [k.removesuffix("_joint").replace("_", "\n") + suffix for k in keys]
     ax.set_xticks(np.arange(len(keys)), labels)
     ax.grid(axis="x", visible=False)
     ax.set_ylabel("mrad")

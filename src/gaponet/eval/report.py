@@ -165,9 +165,9 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
     if not metrics["unseen"]:
         out.append("Some recordings were used in training or for choosing the model: not a held-out result.")
-    for other in ("nominal", "delay_offset", "mlp"):
-        if other in methods and other != kind and own >= methods[other]["mpjae"]:
-            out.append(f"The model does not beat {other.replace('_', ' + ')}: do not deploy it.")
+    better = [n for n, m in methods.items() if n != kind and m["mpjae"] <= own]
+    if better:
+        out.append(f"The model does not beat {', '.join(better).replace('_', ' + ')}: do not use it.")
     seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
     outside = [p for p in asked if not min(seen) <= p <= max(seen)]
     if outside:
@@ -193,8 +193,8 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
 
 def _verdict(name: str, kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
     own, base = methods[kind]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
-    change = (1 - ratio[kind]) * 100
-    text = f"{name} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change:.0f} % less error"
+    change = f"{abs(1 - ratio[kind]) * 100:.0f} % {'less' if ratio[kind] <= 1 else 'MORE'} error"
+    text = f"{name} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
     others = [f"{n} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
     return text + (f" ({', '.join(o.replace('_', ' + ') for o in others)} mrad)." if others else ".")
 
