@@ -26,8 +26,8 @@ def demo(
     data: Path | None = None,
     robot: str = "h1_2",
     out: Path = Path("demo_run"),
-    budget: str = "180s",
-    mlp_budget: str = "90s",
+    budget: str = "210s",
+    mlp_budget: str = "60s",
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Show the whole way in minutes: on your logs, or on an embedded VIRTUAL robot where there are none.
