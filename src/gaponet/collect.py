@@ -149,7 +149,7 @@ def _parts(missing: list[Take]) -> Iterator[list[Take]]:
     by_rate: dict[float, dict[str, list[Take]]] = {}
     for take in missing:
         by_rate.setdefault(take.rate, {}).setdefault(take.motion, []).append(take)
-    for motions in by_rate.values():
+    for _, motions in sorted(by_rate.items()):  # by rate, so that a resumed run keeps the order
         part: list[Take] = []
         for group in motions.values():
             if part and len(part) + len(group) > ROWS:

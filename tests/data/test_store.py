@@ -4,12 +4,14 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from arm import write_arm
 from logs import arm_sequence, late, wave
 
 from gaponet.data.pair import Twin
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import DatasetError
 
 
@@ -132,3 +134,38 @@ def test_a_twin_belongs_to_one_simulator(dataset, sequence):
     assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
     with pytest.raises(DatasetError, match="has no twin for simulator xyz; run gaponet pair"):
         dataset.pair(entry, "xyz")
+
+
+def test_licence_and_source_are_kept_in_the_header(dataset):
+    dataset.state(licence="CC0-1.0", source="here")
+    assert Dataset(dataset.path).header["licence"] == "CC0-1.0"
+    dataset.state(licence="")
+    assert "licence" not in Dataset(dataset.path).header
+    assert Dataset(dataset.path).header["source"] == "here"
+
+
+def test_some_channels_are_read_without_the_others(dataset, sequence):
+    arrays = dataset.channels(dataset.entries[0], ("tau", "ctrl"))
+    assert list(arrays) == ["tau", "ctrl"]
+    assert np.array_equal(arrays["ctrl"], sequence.ctrl)
+
+
+def test_files_of_earlier_versions_are_read_as_before(dataset, sequence):
+    file = next((dataset.path / "sequences").iterdir())
+    n, columns = 2, ("ctrl", "qpos", "qvel", "tau")
+    arrays = [pa.array(np.arange(40) * 0.02)]
+    arrays += [pa.FixedSizeListArray.from_arrays(pa.array(getattr(sequence, c).ravel()), n) for c in columns]
+    pq.write_table(pa.table(arrays, names=["time", *columns]), file, compression="zstd")  # nullable, other compression
+    assert dataset.read(dataset.entries[0]).content_hash() == sequence.content_hash()
+
+
+def test_the_identity_of_a_set_does_not_depend_on_its_order(dataset, sequence):
+    dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    assert dataset_hash(dataset.entries) == dataset_hash(dataset.entries[::-1])
+    assert dataset_hash(dataset.entries) != dataset_hash(dataset.entries[:1])
+
+
+def test_a_line_separator_in_a_name_does_not_break_the_journal(dataset, sequence):
+    odd = replace(sequence, meta=replace(sequence.meta, payload_mass=1.0, source="a\u2028b.csv"))
+    dataset.append(odd)
+    assert Dataset(dataset.path).entries[1].meta.source == "a\u2028b.csv"

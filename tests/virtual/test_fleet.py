@@ -76,7 +76,7 @@ def test_a_fleet_can_be_written_and_read(arm, tmp_path):
 
 
 def test_errors_say_what_there_is(arm, tmp_path):
-    with pytest.raises(UsageError, match="no fleet 'lab': in the package are default, shifted; or give a .toml file"):
+    with pytest.raises(UsageError, match=r"no fleet 'lab': in the package are default, shifted; or give a \.toml file"):
         load_fleet("lab", arm)
     with pytest.raises(UsageError, match="fleet 'default' has no unit 'robot-7'; it has virtual-1, virtual-2"):
         load_fleet("default", arm).unit("robot-7")

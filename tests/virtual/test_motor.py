@@ -114,7 +114,7 @@ def test_cogging_repeats_over_the_turn():
 
 def played(physics, chances, times, dt=0.02):
     """Commands 1, 2, 3, … sent every dt; what is in force at `times`."""
-    link = CommandLink(physics)
+    link = CommandLink(physics, dt)
     link.reset(np.array([[0.0]]))
     sent, out = 0, []
     for time in times:
@@ -128,6 +128,10 @@ def played(physics, chances, times, dt=0.02):
 def test_a_command_arrives_after_the_delay():
     assert played(one(delay=0.03), [(0.0, 1.0)], [0.0, 0.028, 0.03, 0.048, 0.05]) == [0, 0, 1, 1, 2]
     assert played(one(), [(0.0, 1.0)], [0.0, 0.02]) == [1, 2]
+
+
+def test_a_delay_of_many_periods_loses_nothing():
+    assert played(one(delay=0.5), [(0.0, 1.0)], [0.49, 0.5, 0.51, 0.52, 1.0]) == [0, 1, 1, 2, 26]
 
 
 def test_a_lost_packet_leaves_the_one_before_in_force():

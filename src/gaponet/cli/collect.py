@@ -55,8 +55,8 @@ def collect(
             lambda k, total, seconds: update(k, total, f"{k} of {total}, {seconds / 3600:.2f} h recorded"),
         )
     screen.table(
-        f"{done.out}: recorded on VIRTUAL robots (fleet {fleet})",
-        ["", ""],
+        f"VIRTUAL recordings, fleet {fleet}",
+        ["dataset", done.out],
         [
             ["sequences written", str(done.written)],
             ["already there", str(done.present)],

@@ -29,33 +29,34 @@ MAX_ROWS = 60
 def import_logs(
     src: tyro.conf.Positional[Path],
     robot: str,
-    unit_id: str,
-    payload_mass: float,
     out: Path,
-    payload_side: str = "both",
+    unit_id: str | None = None,
+    payload_mass: float | None = None,
+    payload_side: str | None = None,
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: Literal["sage", "table"] | None = None,
+    format: Literal["sage", "table", "lerobot"] | None = None,
     columns: Path | None = None,
-    position_unit: Literal["rad", "deg", "fraction"] | None = None,
+    position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-    level: Literal["joint", "upper_body", "whole_body"] = "whole_body",
+    level: Literal["joint", "upper_body", "whole_body"] | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Read logs of a robot into a dataset: all of them or none.
 
     Args:
-        src: SAGE folder, or a table (CSV, Parquet) or a folder of tables.
+        src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
         robot: Robot name or folder.
-        unit_id: Which of its kind: any name, the same for all logs of one unit.
-        payload_mass: kg in each hand; 0 when empty.
         out: Dataset folder; appended to where it exists.
-        payload_side: Which hand carries it: both, or the side of one payload mount.
+        unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
+        payload_mass: kg in each hand; 0 when empty. Needed unless the format states it.
+        payload_side: Which hand carries it: both (default), or the side of one payload mount.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
         format: Of the logs; default by looking.
         columns: Tables: TOML file that names columns and units.
-        position_unit: Tables: unit of positions; velocities are that per second.
+        position_unit: Tables and LeRobot: unit of positions; velocities are that per second. signed_percent: LeRobot's
+            older −100..100.
         time_unit: Tables: unit of time.
-        level: What the motions move.
+        level: What the motions move; whole_body by default.
         json: One JSON object on stdout.
     """
     from gaponet.data.importer import import_logs as run
@@ -122,10 +123,12 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     entries, data = report.entries, report.dataset
     minutes = sum(e.rows * e.dt for e in entries) / 60
     rates = sorted({round(1 / e.dt, 2) for e in entries})
-    meta = entries[0].meta
+    units = ", ".join(dict.fromkeys(e.meta.unit_id for e in entries))
+    payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
+    virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
     out.say(
-        f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, robot {robot.name}, "
-        f"unit {escape(meta.unit_id)}, payload {meta.payload_mass:g} kg; {escape(str(data.path))} now holds {len(data)}"
+        f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
+        f"{robot.name}, unit {escape(units)}, payload {payloads} kg; {escape(str(data.path))} now holds {len(data)}"
     )
     lags = {name: fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}

@@ -16,6 +16,7 @@ COMMANDS = {
     "doctor": "gaponet.cli.data:doctor",
     "pair": "gaponet.cli.gap:pair",
     "gap": "gaponet.cli.gap:gap",
+    "data": "gaponet.cli.dataset:data",
     "collect": "gaponet.cli.collect:collect",
     "train": "gaponet.cli.train:train",
     "eval": "gaponet.cli.train:evaluate",

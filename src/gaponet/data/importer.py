@@ -6,7 +6,7 @@ import hashlib
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.log import Log
 from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
-from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
+from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, LogError, UsageError
@@ -24,24 +24,37 @@ from gaponet.robot import RobotSpec
 
 Progress = Callable[[float, float, str], None]  # done, total, motion
 
+HOLD = 1 << 29  # bytes of samples kept between checking and writing; a larger source is read twice
+UNSTATED = -1  # repetition that the format does not state, until it is counted
+
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What one import added; offsets are None where no gravity model was given."""
+    """What one import added; offsets are None where no gravity model was given or several units were recorded."""
 
     dataset: Dataset
     entries: list[Entry]
     offsets: UnitOffsets | None
 
 
+@dataclass(frozen=True)
+class _Given:
+    """What the user says of all recordings; None where it is left to the format, or to the default."""
+
+    unit_id: str | None
+    payload_mass: float | None
+    payload_side: str | None
+    level: str | None
+
+
 def import_logs(
     src: str | Path,
     robot: RobotSpec,
-    unit_id: str,
-    payload_mass: float,
+    unit_id: str | None,
+    payload_mass: float | None,
     out: str | Path,
-    payload_side: str = "both",
-    level: str = "whole_body",
+    payload_side: str | None = None,
+    level: str | None = None,
     fmt: str | None = None,
     gravity: Gravity | None = None,
     simulator: str = "",
@@ -53,11 +66,11 @@ def import_logs(
     Args:
         src: File or folder in one of data.formats.FORMATS.
         robot: The robot that was recorded.
-        unit_id: Which of its kind; zero offsets belong to a unit.
-        payload_mass: In each hand named by payload_side, kg; 0.0 when empty.
+        unit_id: Which of its kind; zero offsets belong to a unit. None where the format states it.
+        payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None where the format states it.
         out: Dataset folder; made, or appended to.
-        payload_side: "both", or the side of one payload mount.
-        level: joint, upper_body or whole_body.
+        payload_side: "both" (default), or the side of one payload mount.
+        level: joint, upper_body or whole_body (default).
         fmt: Format; default by looking.
         gravity: Nominal model's gravity, to fit offsets with (data.offsets); default: no offsets.
         simulator: Hash of that model, recorded beside the offsets.
@@ -66,35 +79,95 @@ def import_logs(
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
+        UsageError: Unit or payload are missing, or contradict what the format states.
         DatasetError: `out` is another robot's, or holds one of the recordings already.
     """
     src, out = Path(src), Path(out)
     known = Dataset.peek(out, robot)
     if known:
         read_offsets(known)  # a damaged one is said before anything is read
-    side, name = _side(robot, payload_side), os.path.basename(os.path.abspath(src))
-    meta = SequenceMeta(robot.name, unit_id, name, payload_mass, side, level, source=str(src))
-    sequences: list[Sequence] = []
-    total = len(find_logs(src, fmt))
-    for motion, log in read_logs(src, robot, fmt, **options):
-        found = replace(meta, motion=motion, source=_relative(log.source, src), source_sha256=_sha256(log))
-        sequences.append(to_sequence(log, robot, found))
+    if payload_side is not None:
+        _require_side(robot, payload_side)
+    given = _Given(unit_id, payload_mass, payload_side, level)
+    dataset, entries = _import(src, out, robot, given, known, fmt, progress, options)
+    units = dict.fromkeys(e.meta.unit_id for e in entries)
+    offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
+    for unit, fitted in offsets.items():
+        record_offsets(dataset, unit, fitted, simulator)
+    return ImportReport(dataset, entries, next(iter(offsets.values())) if len(offsets) == 1 else None)
+
+
+def _import(
+    src: Path,
+    out: Path,
+    robot: RobotSpec,
+    given: _Given,
+    known: Dataset | None,
+    fmt: str | None,
+    progress: Progress | None,
+    options: dict[str, Any],
+) -> tuple[Dataset, list[Entry]]:
+    """Read and check all, then write all; where all is too much to hold, read it again for writing."""
+    digests: list[tuple[str, str]] = []
+    held: list[Sequence] = []
+    facts: dict[str, str] = {}
+    size, total = 0, len(find_logs(src, fmt))
+    for sequence, log in _sequences(src, robot, given, fmt, options):
+        digests.append((sequence.content_hash(), sequence.meta.source))
+        facts |= log.meta.get("dataset", {})
+        size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
+        held.append(sequence)
+        if size > HOLD:
+            held.clear()
         if progress:
-            progress(len(sequences), total, motion)
-    _refuse_known(sequences, known, out)
+            progress(len(digests), total, sequence.meta.motion)
+    _refuse_known(digests, known, out)
+    again = (s for s, _ in _sequences(src, robot, given, fmt, options))
     with _Undo(out, made=known is None):
         dataset = known or Dataset.create(out, robot)
+        if known is None and facts:
+            dataset.state(**facts)
         taken = Counter(_slot(e.meta) for e in dataset.entries)
         entries = []
-        for sequence in sequences:
+        for sequence in held if size <= HOLD else again:
             slot = _slot(sequence.meta)
-            numbered = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
-            entries.append(dataset.append(numbered, findings(numbered)))
+            if sequence.meta.repetition < 0:  # the format does not state it
+                sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
+            entries.append(dataset.append(sequence, findings(sequence)))
             taken[slot] += 1
-    offsets = fit_unit(dataset, robot, unit_id, gravity) if gravity else None
-    if offsets:
-        record_offsets(dataset, unit_id, offsets, simulator)
-    return ImportReport(dataset, entries, offsets)
+    return dataset, entries
+
+
+def _sequences(
+    src: Path, robot: RobotSpec, given: _Given, fmt: str | None, options: dict[str, Any]
+) -> Iterator[tuple[Sequence, Log]]:
+    """Every recording on its grid, with what the format and the user say of it."""
+    digests: dict[tuple[str, ...], str] = {}
+    for motion, log in read_logs(src, robot, fmt, **options):
+        files = tuple(sorted(set(log.meta["files"].values())))
+        if files not in digests:  # many episodes may lie in one file
+            digests[files] = _sha256(files)
+        meta = _meta(log, motion, src, robot, given, digests[files])
+        _require_side(robot, meta.payload_side)
+        sequence = to_sequence(log, robot, meta)
+        if "notes" in log.meta.get("stated", {}):  # how it was first recorded, not how it was written here
+            sequence = replace(sequence, meta=meta)
+        yield sequence, log
+
+
+def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha256: str) -> SequenceMeta:
+    """The user's word, completed by the format's; contradictions and gaps are refused."""
+    stated = log.meta.get("stated", {})
+    for name, value in vars(given).items():
+        flag = "--" + name.replace("_", "-")
+        if value is not None and stated.get(name, value) != value:
+            raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
+        if value is None and name in ("unit_id", "payload_mass") and name not in stated:
+            example = "0 (kg in each hand, 0 when empty)" if name == "payload_mass" else "NAME"
+            raise UsageError(f"{log.source}: this format does not say it: give {flag} {example}")
+    fields: dict[str, Any] = {"source": _relative(log.source, src), "source_sha256": sha256, "repetition": UNSTATED}
+    fields |= {name: value for name, value in vars(given).items() if value is not None}
+    return SequenceMeta(**(fields | {"robot": robot.name, "motion": motion} | stated))
 
 
 def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:
@@ -124,22 +197,22 @@ class _Undo:
             self.path.rmdir()
 
 
-def _refuse_known(sequences: list[Sequence], known: Dataset | None, out: Path) -> None:
-    """Refuse recordings that the dataset holds already, or that stand twice in the source."""
+def _refuse_known(recordings: list[tuple[str, str]], known: Dataset | None, out: Path) -> None:
+    """Refuse (content hash, source) that the dataset holds already, or that stand twice in the source."""
     names = {e.hash: f"'{e.id}' of {out}" for e in known.entries} if known else {}
-    if not sequences:
+    if not recordings:
         raise LogError("no recording found")
     twice = []
-    for sequence in sequences:
-        digest = sequence.content_hash()
+    for digest, source in recordings:
         if digest in names:
-            twice.append((sequence.meta.source, names[digest]))
-        names.setdefault(digest, sequence.meta.source)
+            twice.append((source, names[digest]))
+        names.setdefault(digest, source)
     if twice:
         source, twin = twice[0]
         raise DatasetError(
-            f"{len(twice)} of {len(sequences)} recordings are there already (same samples, unit and payload): {source} "
-            f"is {twin}. Nothing was imported; point at new recordings only, or say another --unit-id or --payload-mass"
+            f"{len(twice)} of {len(recordings)} recordings are there already (same samples, unit and payload): "
+            f"{source} is {twin}. Nothing was imported; point at new recordings only, or say another --unit-id or "
+            "--payload-mass"
         )
 
 
@@ -148,11 +221,10 @@ def _slot(meta: SequenceMeta) -> tuple[str, str, float, str]:
     return meta.motion, meta.unit_id, meta.payload_mass, meta.payload_side
 
 
-def _side(robot: RobotSpec, side: str) -> str:
+def _require_side(robot: RobotSpec, side: str) -> None:
     sides = ("both", *(mount.side for mount in robot.payload_mounts))
     if side not in sides:
         raise UsageError(f"payload side '{side}' is unknown to {robot.name}; use one of {', '.join(sides)}")
-    return side
 
 
 def _relative(source: str, src: Path) -> str:
@@ -160,9 +232,9 @@ def _relative(source: str, src: Path) -> str:
     return Path(os.path.relpath(source, Path(os.path.abspath(src)).parent)).as_posix()
 
 
-def _sha256(log: Log) -> str:
-    """Of the recording's files one after the other, in the order of their names (cat control.csv state_motor.csv)."""
+def _sha256(files: tuple[str, ...]) -> str:
+    """Of a recording's files one after the other, in the order of their names (cat control.csv state_motor.csv)."""
     digest = hashlib.sha256()
-    for file in sorted(set(log.meta["files"].values())):
+    for file in files:
         digest.update(Path(file).read_bytes())
     return digest.hexdigest()

@@ -13,6 +13,8 @@ Array = np.ndarray
 
 # Channel names and their SI units. ctrl is the commanded joint position.
 CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+# What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
+DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 REQUIRED = ("ctrl", "qpos")
 
 
@@ -30,9 +32,10 @@ class Log:
     Attributes:
         robot: Robot name.
         joint_names: The robot's own names, (n).
-        channels: Of CHANNELS, at least ctrl and qpos.
+        channels: Of CHANNELS and DERIVED, at least ctrl and qpos.
         source: File or folder it was read from, for errors and for the manifest.
-        meta: Whatever the format also says (events, gains, firmware).
+        meta: Whatever the format also says (events, gains, firmware). Two entries are acted on: dt, the exact period
+            of regular rows, s; stated, fields of SequenceMeta that the format itself holds.
     """
 
     robot: str
@@ -52,8 +55,8 @@ class Log:
             self._check(name, np.asarray(time), np.asarray(values))
 
     def _check(self, name: str, time: Array, values: Array) -> None:
-        if name not in CHANNELS:
-            raise LogError(f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS)}")
+        if name not in CHANNELS | DERIVED:
+            raise LogError(f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS | DERIVED)}")
         if values.shape != (len(time), len(self.joint_names)):
             raise LogError(
                 f"{self.source}: channel {name} has shape {values.shape}, expected "

@@ -118,8 +118,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     """Put a log on a uniform grid.
 
     Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
-    is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz). Otherwise measurements are
-    interpolated and commands held on a grid of the state's median period. The manifest says which.
+    is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz); or the exact period where
+    the format states one. Otherwise measurements are interpolated and commands held on a grid of the state's median
+    period. The manifest says which.
 
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
@@ -133,7 +134,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
     regular = bool(shared and (np.abs(period - median) <= 0.1 * median).all() and dt is None)
     if regular:
-        dt = round(median, 5)
+        dt = float(log.meta.get("dt", round(median, 5)))
         arrays = {name: channel.values for name, channel in log.channels.items()}
     else:
         dt = round(median, 5) if dt is None else dt

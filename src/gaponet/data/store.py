@@ -1,10 +1,13 @@
 """The dataset folder: Parquet files, one per sequence, and a journal that lists them.
 
-    dataset.json            format version, robot, joint names, units
+    dataset.json            format version, robot, joint names, units; licence and source where they were said
     sequences.jsonl         one line per sequence: metadata, hash, delays; appended, never rewritten in place
     offsets.json            static offsets of each unit as fitted at import (data.offsets); recorded, never applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
     twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
+    cache/<key>/            the same samples laid out for training batches (data.window_cache)
+    card.json, CARD.md      what is in it (data.card)
+    splits/<name>.json      which sequences are for training, validation, test (data.split)
 
 A sequence is written to a temporary file, renamed, then listed: a file that is not listed does not exist, and a line
 cut short by a crash is dropped on opening. Real data is never rewritten; twins can be computed again.
@@ -12,6 +15,7 @@ cut short by a crash is dropped on opening. Real data is never rewritten; twins 
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -72,6 +76,7 @@ class Dataset:
                 f"{header}: format {version} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
             )
         self.entries = list(self._journal())
+        self._by_hash = {entry.hash: entry for entry in self.entries}
 
     @classmethod
     def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
@@ -116,7 +121,7 @@ class Dataset:
 
     def find(self, content_hash: str) -> Entry | None:
         """The entry with this content, if any."""
-        return next((e for e in self.entries if e.hash == content_hash), None)
+        return self._by_hash.get(content_hash)
 
     def select(self, motions: tuple[str, ...] = ()) -> list[Entry]:
         """Entries of these motions, all by default; refuses a motion that is not there."""
@@ -129,6 +134,11 @@ class Dataset:
         if not self.entries:
             raise DatasetError(f"{self.path}: holds no sequences yet; import or collect some")
         return [e for e in self.entries if not motions or e.meta.motion in motions]
+
+    def state(self, **fields: str) -> None:
+        """Write what only a person can say (licence, source) into dataset.json; an empty text takes it away."""
+        self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
+        write_text(self.path / "dataset.json", json.dumps(self.header, indent=1, ensure_ascii=False) + "\n")
 
     def append(self, sequence: Sequence, findings: dict[str, Any] | None = None) -> Entry:
         """Add a sequence; one with the same content is refused with its name."""
@@ -159,12 +169,17 @@ class Dataset:
             journal.flush()
             os.fsync(journal.fileno())
         self.entries.append(entry)
+        self._by_hash[digest] = entry
         return entry
 
     def read(self, entry: Entry) -> Sequence:
         """Load one sequence."""
         arrays = _read_table(self._file(entry), entry.channels, len(self.joint_names))
         return Sequence(entry.meta, self.joint_names, entry.dt, **arrays)
+
+    def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Some channels of one sequence, (T, n) float32 each, without reading the others."""
+        return _read_table(self._file(entry), names, len(self.joint_names))
 
     def sequences(self, entries: list[Entry] | None = None) -> list[Sequence]:
         """Load sequences, all by default."""
@@ -205,7 +220,9 @@ class Dataset:
         complete, cut = text[: text.rfind("\n") + 1], text[text.rfind("\n") + 1 :]
         if cut:  # a crash while appending: the sequence was never listed
             write_text(journal, complete)
-        for number, line in enumerate(complete.splitlines(), 1):
+        folder = self.path / "sequences"
+        files = set(os.listdir(folder)) if folder.is_dir() else set()  # one look, not one for each of 11,000 files
+        for number, line in enumerate(complete.split("\n")[:-1], 1):
             try:
                 fields = json.loads(line)
                 meta = SequenceMeta(**fields.pop("meta"))
@@ -214,9 +231,14 @@ class Dataset:
                 raise DatasetError(
                     f"{journal}:{number}: damaged line ({error}); delete it and import that log again"
                 ) from None
-            if not self._file(entry).is_file():
+            if f"{entry.id}.parquet" not in files:
                 raise DatasetError(f"{journal}:{number}: {self._file(entry)} is missing; restore it or delete the line")
             yield entry
+
+
+def dataset_hash(entries: list[Entry]) -> str:
+    """Identity of a set of recordings, in any order; 12 hex digits."""
+    return hashlib.sha256("".join(sorted(e.hash for e in entries)).encode()).hexdigest()[:12]
 
 
 def write_text(path: Path, text: str) -> None:
@@ -235,16 +257,18 @@ def _write_table(path: Path, columns: dict[str, np.ndarray], dt: float, joint_na
 
     n = len(joint_names)
     rows = len(next(iter(columns.values())))
+    vector = pa.list_(pa.field("element", pa.float32(), nullable=False), n)
+    fields = [pa.field("time", pa.float64(), nullable=False), *(pa.field(c, vector, nullable=False) for c in columns)]
     arrays = [pa.array(np.arange(rows) * dt, pa.float64())]
     for values in columns.values():
         flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
-        arrays.append(pa.FixedSizeListArray.from_arrays(flat, n))
-    table = pa.table(arrays, names=["time", *columns]).replace_schema_metadata(
-        {"joint_names": ",".join(joint_names), "units": json.dumps({c: UNITS[c] for c in ["time", *columns]})}
-    )
+        arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=vector))
+    units = json.dumps({c: UNITS[c] for c in ["time", *columns]})
+    table = pa.table(arrays, schema=pa.schema(fields, {"joint_names": ",".join(joint_names), "units": units}))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        pq.write_table(table, temporary, compression="zstd", use_dictionary=False)
+        # Against zstd alone: 6 % larger, read in half the time (552 rows of 27 joints, 7 channels: 1.5 ms).
+        pq.write_table(table, temporary, compression="lz4", use_dictionary=False, use_byte_stream_split=True)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -255,7 +279,7 @@ def _read_table(path: Path, columns: tuple[str, ...], n: int) -> dict[str, np.nd
     import pyarrow.parquet as pq
 
     try:
-        table = pq.ParquetFile(path).read(columns=list(columns))
+        table = pq.ParquetFile(path).read(columns=list(columns), use_threads=False)
         arrays = {c: table.column(c).combine_chunks() for c in columns}
     except (pa.ArrowInvalid, pa.ArrowException, OSError, KeyError) as error:
         reason = str(error).split("\n")[0].rstrip(".")

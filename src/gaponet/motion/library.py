@@ -1,4 +1,4 @@
-"""The motions of a robot by name: made from a seed, fitted to its limits, the same on every machine."""
+"""The motions of a robot by name: made from a seed, fitted to its limits, the same every time."""
 
 from __future__ import annotations
 

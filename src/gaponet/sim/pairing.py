@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, Entry
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Progress, replay
@@ -10,14 +10,16 @@ from gaponet.sim.replay import Progress, replay
 BATCH = 64  # sequences replayed together; what an interruption can cost
 
 
-def pair_dataset(dataset: Dataset, robot: RobotSpec, progress: Progress | None = None) -> int:
+def pair_dataset(
+    dataset: Dataset, robot: RobotSpec, progress: Progress | None = None, entries: list[Entry] | None = None
+) -> int:
     """Replay the sequences that have no twin for this simulator yet, and store the twins; returns how many.
 
-    Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
+    All sequences, or only some. Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
     """
     dataset.require_robot(robot)
     digest = model_hash(robot)
-    todo = sorted((e for e in dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
+    todo = sorted((e for e in entries or dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
     total, done = sum(e.rows - 1 for e in todo), 0
     for start in range(0, len(todo), BATCH):
         part = todo[start : start + BATCH]

@@ -16,7 +16,7 @@ Array = np.ndarray
 STATES = 2048
 STEPS = 600
 BATCH = 256
-POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: half of the states are moved off the recorded ones by these
+POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states is moved off the recorded ones by these
 
 
 def sensor_labels(
@@ -29,7 +29,10 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
 ) -> tuple[Tensor, Tensor]:
-    """Standardised features and oracle answers for states the policy visited, half of them perturbed.
+    """Standardised features and oracle answers: a third at recorded states, a third near them, a third anywhere.
+
+    "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
+    and inertia there are asked of the simulator, since no recorded motion needs to have been there.
 
     Args:
         net: Its config says the probes.
@@ -41,17 +44,32 @@ def sensor_labels(
         seed: Of the perturbations.
     """
     rng = np.random.default_rng(seed)
+    third = rng.integers(0, 3, len(qpos))
     oracle, n = ProbeOracle(robot, net.config, conditions, locked=locked), net.n
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
-    noisy = rng.random(len(q)) < 0.5
-    q[np.ix_(noisy, op)] += rng.normal(0, POSITION_NOISE, (noisy.sum(), n))
-    v[np.ix_(noisy, op)] += rng.normal(0, VELOCITY_NOISE, (noisy.sum(), n))
-    x[:, :n], x[:, n : 2 * n] = q[:, op], v[:, op]
+    near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)
+    q[np.ix_(near, op)] += rng.normal(0, POSITION_NOISE, (len(near), n))
+    v[np.ix_(near, op)] += rng.normal(0, VELOCITY_NOISE, (len(near), n))
+    x[near, :n], x[near, n : 2 * n] = q[np.ix_(near, op)], v[np.ix_(near, op)]
+    low, high = np.clip(robot.qpos_range[robot.operated_index].T, -np.pi, np.pi)
+    shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
+    q[np.ix_(far, op)] += shift
+    x[far] += shift_positions(shift, net.config.history, x.shape[1])
     answers = oracle(q, v)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
     return features.clone(), torch.from_numpy(answers.reshape(len(q), -1))
+
+
+def shift_positions(shift: Array, history: int, dim: int) -> Array:
+    """What moving every position and target of [o_t | a_t] by shift (k, n) adds to it, (k, dim)."""
+    n, out = shift.shape[1], np.zeros((len(shift), dim))
+    out[:, :n] = out[:, -n:] = shift
+    for frame in range(history):
+        start = 2 * n + 3 * n * frame
+        out[:, start : start + n] = out[:, start + 2 * n : start + 3 * n] = shift
+    return out
 
 
 def fit_predictor(net: OperatorNet, features: Tensor, answers: Tensor, seed: int) -> float:

@@ -9,7 +9,7 @@ import sys
 import tomllib
 
 from gaponet.robot import load_robot
-from gaponet.virtual.fleet import FLEETS, UNITS, _header, draw, to_toml
+from gaponet.virtual.fleet import FLEETS, UNITS, draw, header, to_toml
 
 MARK = "\n# ---- drawn units ----\n"
 
@@ -18,7 +18,7 @@ def main(fleet: str, robot_name: str) -> None:
     """Keep everything above the mark, replace everything below."""
     path = FLEETS / f"{fleet}.toml"
     head = path.read_text(encoding="utf-8").split(MARK)[0]
-    seed, laws = _header(tomllib.loads(head), path)
+    seed, laws = header(tomllib.loads(head), path)
     robot = load_robot(robot_name)
     units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
     path.write_text(head + MARK + to_toml(robot, units), encoding="utf-8")

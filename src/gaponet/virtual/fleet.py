@@ -84,7 +84,7 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: not valid TOML: {error}") from None
-    seed, laws = _header(table, path)
+    seed, laws = header(table, path)
     saved = table.get("robot", {}).get(robot.name)
     if saved is None:
         units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
@@ -93,7 +93,8 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     return Fleet(str(table.get("name", path.stem)), robot.name, seed, laws, units)
 
 
-def _header(table: dict[str, Any], path: Path) -> tuple[int, tuple[Distribution, ...]]:
+def header(table: dict[str, Any], path: Path) -> tuple[int, tuple[Distribution, ...]]:
+    """Seed and distributions of a fleet file's parsed text; path is for messages."""
     known = [f.name for f in fields(Physics)]
     laws = []
     for entry in table.get("distribution", []):

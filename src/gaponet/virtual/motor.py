@@ -49,8 +49,8 @@ def cogging_torque(physics: Physics, qpos: Array) -> Array:
 class Backlash:
     """Play between motor and link: when the torque changes sign the motor first has to cross the gap.
 
-    While it crosses, the link feels no torque. The motor is a free rotor there: its inertia is the joint's armature, and
-    it arrives after √(2·gap·J/τ) under a constant torque (the dead-zone picture of Nordin & Gutman 2002, Automatica 38,
+    While it crosses, the link feels no torque. The motor is a free rotor there: its inertia is the joint's armature,
+    and it arrives after √(2·gap·J/τ) under a constant torque (the dead zone of Nordin & Gutman 2002, Automatica 38,
     with a rigid, plastic contact).
     """
 
@@ -125,24 +125,24 @@ def supply_share(physics: Physics, power: Array) -> Array:
 class CommandLink:
     """Commands travel: each packet arrives after delay + jitter, or never; the newest arrived one is in force."""
 
-    SLOTS = 16
-
-    def __init__(self, physics: Physics) -> None:
+    def __init__(self, physics: Physics, dt: float) -> None:
+        """Packets are sent every dt s; as many are kept as can be on the way at once, and the one in force."""
         self.p = physics
+        self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
 
     def reset(self, ctrl: Array) -> None:
         """All packets so far asked for ctrl, (N, n) rad."""
         count = len(ctrl)
-        self.packets = np.repeat(ctrl[:, None], self.SLOTS, axis=1)
-        self.arrival = np.full((count, self.SLOTS), -np.inf)
-        self.sent = np.full(self.SLOTS, -1)
+        self.packets = np.repeat(ctrl[:, None], self.slots, axis=1)
+        self.arrival = np.full((count, self.slots), -np.inf)
+        self.sent = np.full(self.slots, -1)
         self.count = 0
         self.newest = np.full(count, -1)
         self.current = ctrl.copy()
 
     def send(self, ctrl: Array, time: float, chance: Array) -> None:
         """Put a packet on the way at `time` s; chance (N, 2) is uniform in [0, 1): jitter, loss."""
-        slot = self.count % self.SLOTS
+        slot = self.count % self.slots
         self.packets[:, slot] = ctrl
         late = self.p.delay[:, 0] + self.p.jitter[:, 0] * chance[:, 0]
         self.arrival[:, slot] = np.where(chance[:, 1] < self.p.drop[:, 0], np.inf, time + late)

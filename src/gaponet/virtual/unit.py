@@ -98,7 +98,7 @@ class VirtualRobot:
         self._limits = qpos_range(model)
         self.backlash = Backlash(p, model.dof_armature)
         self.thermal = Thermal(p)
-        self.link = CommandLink(p)
+        self.link = CommandLink(p, self.dt)
         self._supply = np.ones((self.num_envs, 1))
 
     def reset(self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None) -> None:
@@ -265,6 +265,8 @@ def _models(
         if key not in made:
             model = build_model(robot, mass, side, dt, locked)
             model.opt.timestep = timestep
+            if len(set(model.dof_treeid.tolist())) == 1:  # nothing to split: looking for islands costs a tenth
+                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
             _edit(model, robot, unit, locked)
             made[key] = model
     return [made[id(u), m, s] for u, (m, s) in zip(units, payloads, strict=True)]

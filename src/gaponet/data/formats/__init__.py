@@ -26,6 +26,7 @@ Array = np.ndarray
 FORMATS = {
     "sage": "SAGE folder: control.csv and state_motor.csv beside each other",
     "table": "CSV or Parquet with named columns, a file or a folder of files",
+    "lerobot": "LeRobotDataset v3.0 folder: meta/info.json",
 }
 TABLES = (".csv", ".parquet")
 
@@ -34,6 +35,8 @@ def detect(path: Path) -> str:
     """The format of a file or folder."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
+    if path.is_dir() and any(next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json")):
+        return "lerobot"
     if path.is_dir() and any(next(path.rglob(name), None) for name in ("control.csv", "state_motor.csv")):
         return "sage"
     files = [path] if path.is_file() else path.iterdir()
@@ -56,7 +59,8 @@ def read_logs(path: Path, robot: RobotSpec, fmt: str | None = None, **options: A
         robot: Whose joint names and units apply.
         fmt: One of FORMATS; default by looking.
         options: joint_map {log name: robot name}. For tables also columns (a TOML file that maps column names),
-            position_unit and time_unit. None counts as not given; one that the format does not know is refused.
+            position_unit and time_unit; for LeRobot sets position_unit. None counts as not given; one that the format
+            does not know is refused.
     """
     reader = _reader(path, fmt)
     given = {name: value for name, value in options.items() if value is not None}

@@ -1,0 +1,182 @@
+"""gaponet data: card, split, figures, export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.markup import escape
+
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+from gaponet.data.store import Dataset
+
+
+def card(
+    dataset: tyro.conf.Positional[Path],
+    licence: str | None = None,
+    source: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Count and measure what a dataset holds; writes card.json and CARD.md into it.
+
+    Args:
+        dataset: Dataset folder.
+        licence: Record this licence in dataset.json, e.g. CC-BY-4.0; "" takes it away.
+        source: Record where the data come from: a paper, a laboratory, an address.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.card import make_card, write_card
+    from gaponet.data.card_text import card_text
+
+    out, data = Out(json), Dataset(dataset)
+    stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
+    if stated:
+        data.state(**stated)
+    with bar("reading") as update:
+        made = make_card(data, update)
+    write_card(data, made, card_text(made))
+    show_card(out, made)
+    out.say(f"written: {escape(str(dataset / 'CARD.md'))}, {escape(str(dataset / 'card.json'))}")
+    out.result(made)
+
+
+def split(
+    dataset: tyro.conf.Positional[Path],
+    by: Literal["motion", "unit", "payload"],
+    holdout: tuple[str, ...] = (),
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
+
+    Args:
+        dataset: Dataset folder.
+        by: What the test part has and the others have not.
+        holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.card import count
+    from gaponet.data.split import make_split, require_distinct_samples, write_split
+
+    out, data = Out(json), Dataset(dataset)
+    parts = make_split(data, by, holdout)
+    with bar("comparing") as update:
+        require_distinct_samples(data, parts, update)
+    path = write_split(data, parts, by, holdout)
+    rows: dict[str, dict[str, Any]] = {part: count(entries) | members(entries) for part, entries in parts.items()}
+    columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
+    virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
+    out.table(f"{escape(data.path.name)} by {by}{virtual}; parts share no recording", columns, [
+        [part, f"{r['sequences']:,}", f"{r['hours']:.2f}", f"{r['frames']:,}", str(r["motions"]),
+         escape(some(r["units"])), some(r["payloads_kg"])]
+        for part, r in rows.items()
+    ])  # fmt: skip
+    out.say(f"written: {escape(str(path))}")
+    out.result({"split": str(path), "by": by, "parts": rows})
+
+
+def figures(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Draw the dataset: joint ranges, composition, torque and temperature, real against twin, gap against payload.
+
+    Sequences without a twin that a figure needs are replayed first.
+
+    Args:
+        dataset: Dataset folder.
+        out: Folder for the pictures, each as SVG and PNG.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    from gaponet.eval.draw_dataset import draw_all
+    from gaponet.robot import load_robot
+
+    screen, data = Out(json), Dataset(dataset)
+    spec = load_robot(robot or data.robot_name)
+    with bar("drawing") as update:
+        written, left_out = draw_all(data, spec, out, update)
+    for path in written:
+        screen.say(f"written: {escape(str(path))}")
+    for name, reason in left_out.items():
+        screen.say(f"[yellow]left out[/]  {name}: {escape(reason)}")
+    screen.result({"figures": [str(path) for path in written], "left_out": left_out})
+
+
+def export(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    format: Literal["lerobot"] = "lerobot",
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Write a dataset in another format; gaponet import reads it back without loss.
+
+    Args:
+        dataset: Dataset folder.
+        out: New folder.
+        format: lerobot: LeRobotDataset v3.0, one set for each rate and choice of channels.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.formats.lerobot_export import export_lerobot
+
+    screen, data = Out(json), Dataset(dataset)
+    with bar("exporting") as update:
+        sets = export_lerobot(data, out, update)
+    screen.table(f"{escape(str(out))}: LeRobotDataset v3.0", ["set", "episodes", "frames", "fps"], [
+        [escape(str(s.path)), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in sets
+    ])  # fmt: skip
+    screen.say(f"Back: gaponet import {escape(str(out))} --format lerobot --robot {data.robot_name} --out NEW")
+    screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
+
+
+# Each is run while the command line is parsed; what is left to call is nothing.
+Action = (
+    Annotated[None, tyro.conf.subcommand("card", constructor=card)]
+    | Annotated[None, tyro.conf.subcommand("split", constructor=split)]
+    | Annotated[None, tyro.conf.subcommand("figures", constructor=figures)]
+    | Annotated[None, tyro.conf.subcommand("export", constructor=export)]
+)
+
+
+def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+    """What a dataset holds: its card, splits, pictures and export."""
+
+
+def show_card(out: Out, made: dict[str, Any]) -> None:
+    """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
+    from gaponet.data.card import NOT_STATED
+    from gaponet.data.card_text import TITLES, headline, number
+
+    out.say(f"[bold]{escape(headline(made))}[/]")
+    for name, shares in made["shares"].items():
+        out.table("", [TITLES[name], "sequences", "hours", "frames", "motions"], [
+            [escape(key), f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", str(c["motions"])]
+            for key, c in shares.items()
+        ])  # fmt: skip
+    repeated = made["repeatability"]
+    if repeated["channels"]:
+        spread = ", ".join(f"{name} {number(c['mean'])} {c['unit']}" for name, c in repeated["channels"].items())
+        out.say(
+            f"repeatability (std over {repeated['sequences']} repetitions in {repeated['groups']} groups): {spread}"
+        )
+    else:
+        out.say("repeatability: no motion was repeated with the same command, unit and payload")
+    for name in ("licence", "source"):
+        ask = f"; set it with gaponet data card DIR --{name} …" if made[name] == NOT_STATED else ""
+        out.say(f"{name}: {escape(made[name])}{ask}")
+
+
+def members(entries: list[Any]) -> dict[str, list[str]]:
+    """Which units and payloads."""
+    return {
+        "units": sorted({e.meta.unit_id for e in entries}),
+        "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
+    }
+
+
+def some(names: list[str]) -> str:
+    """Up to four, and how many more."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -1,0 +1,89 @@
+"""Repeatability: how much a robot differs from itself when it is asked for the same thing again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+
+Array = np.ndarray
+
+SAME_COMMAND = 1e-3  # rad; repetitions whose commands differ by more somewhere were not asked for the same thing
+MOVED = 0.02  # rad; joints commanded to move by less say nothing
+CHANNELS = {"qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+
+
+class Repetitions:
+    """Row-by-row spread over repetitions of one motion by one unit with one payload, taken in one at a time.
+
+    Repetitions are compared from their first rows on, as far as the shortest goes.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0  # with the first one's command
+        self.others = 0  # with another command
+        self._ctrl: Array = np.zeros((0, 0))
+        self._mean: dict[str, Array] = {}
+        self._squares: dict[str, Array] = {}
+
+    def add(self, sequence: Sequence) -> None:
+        """Take in a repetition (Welford's update, so that nothing but sums is kept)."""
+        arrays = {c: x.astype(float) for c in CHANNELS if (x := getattr(sequence, c)) is not None}
+        if self.count == 0:
+            self.count, self._ctrl, self._mean = 1, sequence.ctrl, arrays
+            self._squares = {c: np.zeros_like(x) for c, x in arrays.items()}
+            return
+        rows = min(len(self._ctrl), len(sequence))
+        if np.abs(self._ctrl[:rows] - sequence.ctrl[:rows]).max() > SAME_COMMAND:
+            self.others += 1
+            return
+        self.count += 1
+        self._ctrl = self._ctrl[:rows]
+        for name in [c for c in self._mean if c in arrays]:
+            mean, value = self._mean[name][:rows], arrays[name][:rows]
+            step = value - mean
+            self._mean[name] = mean + step / self.count
+            self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
+
+    @property
+    def moved(self) -> Array:
+        """Which joints were commanded to move, (n)."""
+        return np.ptp(self._ctrl, axis=0) > MOVED
+
+    def variance(self, channel: str) -> Array | None:
+        """Over repetitions, averaged over rows, (n); None where the channel was not recorded."""
+        squares = self._squares.get(channel)
+        return None if squares is None else squares.mean(axis=0) / (self.count - 1)
+
+
+def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str, Any]:
+    """Root-mean-square standard deviation over repetitions, by channel and joint.
+
+    Args:
+        groups: Of 2 repetitions or more each.
+        joint_names: (n).
+
+    Returns:
+        groups, sequences, and channels {name: {unit, mean over joints that moved, joints {name: value}}}; a joint that
+        no group moved is left out.
+    """
+    moved = np.array([g.moved for g in groups]).reshape(-1, len(joint_names))
+    channels = {}
+    for name, unit in CHANNELS.items():
+        variances = [(g.variance(name), m) for g, m in zip(groups, moved, strict=True)]
+        found = [(np.where(m, v, np.nan)) for v, m in variances if v is not None]
+        values = {}
+        for j, joint in enumerate(joint_names):
+            column = np.array([v[j] for v in found])
+            if np.isfinite(column).any():
+                values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
+        if values:
+            channels[name] = {"unit": unit, "mean": float(np.mean(list(values.values()))), "joints": values}
+    return {
+        "groups": len(groups),
+        "sequences": sum(g.count for g in groups),
+        "left_out_other_command": sum(g.others for g in groups),
+        "channels": channels,
+    }

@@ -1,0 +1,148 @@
+"""Split files: which sequences are for training, validation (choosing) and test (reporting), by content hash.
+
+By motion, a fixed rule puts every repetition, payload and unit of a motion into one part. By unit or payload, the test
+part is what is held out, and validation is a part of the motions of the rest. Parts share no recording: neither one
+listed twice nor the same samples under another name, unit or payload.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gaponet.data.pair import hash_order
+from gaponet.data.store import Dataset, Entry, dataset_hash, write_text
+from gaponet.errors import DatasetError, UsageError
+
+Progress = Callable[[float, float, str], None]  # sequences done, total, motion
+Parts = dict[str, list[Entry]]
+
+FORMAT = 1
+PARTS = ("train", "val", "test")
+BY: dict[str, Callable[[Entry], str]] = {
+    "motion": lambda e: e.meta.motion,
+    "unit": lambda e: e.meta.unit_id,
+    "payload": lambda e: f"{e.meta.payload_mass:g}",
+}
+TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
+
+
+def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Parts:
+    """Divide a dataset's sequences.
+
+    Args:
+        dataset: What to divide.
+        by: motion, unit or payload.
+        holdout: Motions, units or payloads (kg) for the test part; default a quarter, by the hash of their names.
+
+    Returns:
+        train, val and test, none of them empty.
+
+    Raises:
+        UsageError: Something held out is not there, or nothing is left for a part.
+    """
+    key = BY[by]
+    held = _held_out(dataset, by, holdout)
+    rest = [e for e in dataset.entries if key(e) not in held]
+    motions = hash_order(e.meta.motion for e in rest)
+    chosen = set(motions[: max(1, round(len({e.meta.motion for e in dataset.entries}) * VAL_SHARE))])
+    parts = {
+        "train": [e for e in rest if e.meta.motion not in chosen],
+        "val": [e for e in rest if e.meta.motion in chosen],
+        "test": [e for e in dataset.entries if key(e) in held],
+    }
+    for part in PARTS:
+        if not parts[part]:
+            raise UsageError(
+                f"{dataset.path}: holding out {by} {', '.join(sorted(held))} leaves nothing for {part} "
+                f"({len(motions)} motion(s) remain); hold out less"
+            )
+    return parts
+
+
+def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...]) -> set[str]:
+    values = hash_order(map(BY[by], dataset.entries))
+    if by == "payload":
+        holdout = tuple(_kilograms(text) for text in holdout)
+    for value in holdout:
+        if value not in values:
+            raise UsageError(f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}")
+    if len(values) < 2:
+        raise UsageError(f"{dataset.path}: one {by} only ({', '.join(values)}); split it by another property")
+    return set(holdout or values[: max(1, round(len(values) * TEST_SHARE))])
+
+
+def _kilograms(text: str) -> str:
+    try:
+        return f"{float(text):g}"
+    except ValueError:
+        raise UsageError(f"--holdout {text}: payloads are numbers, kg") from None
+
+
+def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress | None = None) -> None:
+    """Refuse parts that share samples, whatever unit or payload these are filed under.
+
+    Content hashes contain unit and payload: a log imported twice, for two units, has two. So commands and states are
+    read and hashed without them, one sequence at a time.
+    """
+    seen: dict[str, tuple[str, Entry]] = {}
+    total, done = sum(map(len, parts.values())), 0
+    for part, entries in parts.items():
+        for entry in entries:
+            arrays = dataset.channels(entry, ("ctrl", "qpos"))
+            digest = hashlib.sha256(arrays["ctrl"].tobytes() + arrays["qpos"].tobytes()).hexdigest()
+            other, twin = seen.setdefault(digest, (part, entry))
+            if other != part:
+                raise DatasetError(
+                    f"{dataset.path}: '{entry.id}' ({part}) and '{twin.id}' ({other}) hold the same samples; delete "
+                    "the line of the wrong one from sequences.jsonl"
+                )
+            done += 1
+            if progress:
+                progress(done, total, entry.meta.motion)
+
+
+def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...] = ()) -> Path:
+    """Write splits/<by>[-<held out>].json in the dataset folder; the same call writes the same file."""
+    name = re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join([by, *holdout]))[:100]
+    path = dataset.path / "splits" / f"{name}.json"
+    path.parent.mkdir(exist_ok=True)
+    record: dict[str, Any] = {
+        "format": FORMAT,
+        "robot": dataset.robot_name,
+        "dataset_hash": dataset_hash(dataset.entries),
+        "by": by,
+        "held_out": sorted({BY[by](e) for e in parts["test"]}),
+        "virtual": any(e.meta.virtual for e in dataset.entries),
+        "parts": {part: {e.id: e.hash for e in parts[part]} for part in PARTS},
+    }
+    write_text(path, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    return path
+
+
+def read_split(path: str | Path, dataset: Dataset) -> Parts:
+    """Entries of a dataset by a split file; sequences found are those with the same content, whatever their name.
+
+    Raises:
+        DatasetError: Not a split file, a sequence of it is not in the dataset, or parts share one.
+    """
+    try:
+        record = json.loads(Path(path).read_text(encoding="utf-8"))
+        hashes: dict[str, dict[str, str]] = {part: record["parts"][part] for part in PARTS}
+    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+        raise DatasetError(f"{path}: not a split file ({error}); make one with gaponet data split") from None
+    parts: Parts = {part: [] for part in PARTS}
+    taken: dict[str, str] = {}
+    for part, listed in hashes.items():
+        for name, digest in listed.items():
+            entry = dataset.find(digest)
+            if entry is None:
+                raise DatasetError(f"{path}: '{name}' is not in {dataset.path}; split that dataset anew")
+            if taken.setdefault(digest, part) != part:
+                raise DatasetError(f"{path}: '{name}' is in {taken[digest]} and in {part}; split the dataset anew")
+            parts[part].append(entry)
+    return parts

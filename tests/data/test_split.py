@@ -1,0 +1,126 @@
+"""Splits: parts share no recording, whatever it is filed under."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from logs import arm_sequence, late, wave
+
+from gaponet.data.pair import split_by_motion
+from gaponet.data.split import make_split, read_split, require_distinct_samples, write_split
+from gaponet.data.store import Dataset
+from gaponet.errors import DatasetError, UsageError
+
+
+@pytest.fixture
+def dataset(arm, tmp_path):
+    """Eight motions by three units with two payloads, all samples different."""
+    data, lag = Dataset.create(tmp_path / "data", arm), 0
+    for motion in "abcdefgh":
+        for unit in ("one", "two", "three"):
+            for payload in (0.0, 0.2):
+                lag += 1
+                ctrl = wave(60, 2, hertz=0.3 + 0.01 * lag)
+                data.append(arm_sequence(arm, ctrl, late(ctrl, 2), motion, payload, unit=unit))
+    return data
+
+
+def values(entries, field):
+    return {getattr(e.meta, field) for e in entries}
+
+
+def test_by_motion_is_the_rule_that_training_uses(dataset):
+    parts, rule = make_split(dataset, "motion"), split_by_motion(list("abcdefgh"))
+    assert values(parts["test"], "motion") == set(rule.test)
+    assert values(parts["val"], "motion") == set(rule.val)
+    assert values(parts["train"], "motion") == set(rule.train)
+    assert sum(map(len, parts.values())) == len(dataset)
+
+
+def test_held_out_units_are_in_the_test_part_alone(dataset):
+    parts = make_split(dataset, "unit", ("two",))
+    assert values(parts["test"], "unit_id") == {"two"}
+    assert values(parts["train"] + parts["val"], "unit_id") == {"one", "three"}
+    assert not values(parts["train"], "motion") & values(parts["val"], "motion")
+
+
+def test_payloads_are_numbers_however_they_are_written(dataset):
+    parts = make_split(dataset, "payload", ("0.20",))
+    assert values(parts["test"], "payload_mass") == {0.2}
+    assert values(parts["train"] + parts["val"], "payload_mass") == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("by", "holdout", "complaint"),
+    [
+        ("motion", ("dance",), "no motion 'dance' to hold out; it holds a, b, c, d, e, f, g, h"),
+        ("unit", ("one", "two", "three"), "holding out unit one, three, two leaves nothing for train"),
+        ("payload", ("heavy",), "--holdout heavy: payloads are numbers, kg"),
+        ("motion", tuple("abcdefg"), r"leaves nothing for train \(1 motion\(s\) remain\); hold out less"),
+    ],
+    ids=["stranger", "everything", "not a number", "too much"],
+)
+def test_what_cannot_be_held_out_is_refused(dataset, by, holdout, complaint):
+    with pytest.raises(UsageError, match=complaint):
+        make_split(dataset, by, holdout)
+
+
+def test_one_unit_cannot_be_split_by_unit(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    data.append(arm_sequence(arm, wave(60, 2), wave(60, 2)))
+    with pytest.raises(UsageError, match=r"one unit only \(a\); split it by another property"):
+        make_split(data, "unit")
+
+
+def test_the_same_samples_under_another_unit_are_found(dataset):
+    twice = dataset.read(dataset.entries[0])
+    dataset.append(replace(twice, meta=replace(twice.meta, unit_id="two")))
+    parts = make_split(dataset, "unit", ("two",))
+    with pytest.raises(DatasetError, match=r"'a-two-0kg-.*' \(test\) and 'a-one-0kg-.*' \(.*\) hold the same samples"):
+        require_distinct_samples(dataset, parts)
+
+
+def test_distinct_samples_pass_and_progress_is_told(dataset):
+    told = []
+    require_distinct_samples(dataset, make_split(dataset, "unit"), lambda *what: told.append(what))
+    assert told[-1][:2] == (len(dataset), len(dataset))
+
+
+def test_a_split_file_is_read_back(dataset):
+    parts = make_split(dataset, "unit", ("two",))
+    path = write_split(dataset, parts, "unit", ("two",))
+    assert path == dataset.path / "splits" / "unit-two.json"
+    assert read_split(path, Dataset(dataset.path)) == parts
+    record = json.loads(path.read_text())
+    assert (record["by"], record["held_out"], record["virtual"]) == ("unit", ["two"], False)
+
+
+def test_a_split_finds_sequences_by_content_whatever_their_order(dataset, arm, tmp_path):
+    path = write_split(dataset, make_split(dataset, "motion"), "motion")
+    copy = Dataset.create(tmp_path / "copy", arm)
+    for entry in reversed(dataset.entries):
+        copy.append(dataset.read(entry))
+    assert {e.hash for e in read_split(path, copy)["test"]} == {e.hash for e in read_split(path, dataset)["test"]}
+
+
+def test_a_split_of_another_dataset_is_refused_by_name(dataset, arm, tmp_path):
+    path = write_split(dataset, make_split(dataset, "motion"), "motion")
+    with pytest.raises(DatasetError, match=r"motion\.json: '.*' is not in .*other; split that dataset anew"):
+        read_split(path, Dataset.create(tmp_path / "other", arm))
+
+
+def test_a_split_file_with_a_sequence_in_two_parts_is_refused(dataset):
+    path = write_split(dataset, make_split(dataset, "motion"), "motion")
+    record = json.loads(path.read_text())
+    name, digest = next(iter(record["parts"]["test"].items()))
+    record["parts"]["train"][name] = digest
+    path.write_text(json.dumps(record))
+    with pytest.raises(DatasetError, match=r"is in train and in test; split the dataset anew"):
+        read_split(path, dataset)
+
+
+def test_what_is_no_split_file_is_refused(dataset, tmp_path):
+    (tmp_path / "x.json").write_text("[1]")
+    for path in (tmp_path / "x.json", tmp_path / "nowhere.json"):
+        with pytest.raises(DatasetError, match=r"not a split file .* make one with gaponet data split"):
+            read_split(path, dataset)
