@@ -8,7 +8,6 @@ RUN/delay_offset.json  the cheap baseline, same data        RUN/model/          
 from __future__ import annotations
 
 import copy
-import hashlib
 import json
 import os
 import platform
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 
 from gaponet.data.pair import require_disjoint, split_by_motion
-from gaponet.data.store import Dataset, Entry, write_text
+from gaponet.data.store import Dataset, Entry, dataset_hash, write_text
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.baselines import delay_offset
@@ -318,8 +317,3 @@ def split_entries(dataset: Dataset, holdout_units: tuple[str, ...] = ()) -> dict
         if not entries:
             raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {', '.join(holdout_units)}")
     return parts
-
-
-def dataset_hash(entries: list[Entry]) -> str:
-    """Identity of a set of recordings, in any order; 12 hex digits."""
-    return hashlib.sha256("".join(sorted(e.hash for e in entries)).encode()).hexdigest()[:12]
