@@ -15,8 +15,9 @@ def x(config, n, batch=7, scale=1.0):
 @pytest.mark.parametrize(
     "config",
     [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(sensors="off"), ModelConfig(branch_history=False, history=2),
-     ModelConfig(payload_input=False, stride=2)],
-    ids=["gaponet", "mlp", "sensors-off", "sensors-only", "no-payload"],
+     ModelConfig(payload_input=False, stride=2), ModelConfig(coupling="full"),
+     ModelConfig(coupling="full", sensors="off", payload_input=False)],
+    ids=["gaponet", "mlp", "sensors-off", "sensors-only", "no-payload", "full", "full-off"],
 )  # fmt: skip
 def test_corrections_are_bounded_whatever_comes_in(config):
     net = build_network(config, 3)
@@ -33,7 +34,10 @@ def test_an_untrained_operator_hardly_corrects():
 
 
 def test_one_branch_net_serves_all_joints_and_the_size_is_the_papers():
-    net = build_network(ModelConfig(payload_input=False), 10)
+    config = ModelConfig(
+        payload_input=False, coupling="full", branch_hidden=(256, 256, 256), trunk_hidden=(128, 128, 128)
+    )
+    net = build_network(config, 10)
     assert net.branch[-1].out_features == 10 * 16
     assert net.branch[0].in_features == 20 * 2 * 10 + 140
     assert net.trunk[-1].out_features == 10 * 16
@@ -59,3 +63,27 @@ def test_sampling_sensors_changes_the_answer_and_the_mean_does_not():
     assert torch.equal(net(data), net(data))
     net.sample_sensors = True
     assert not torch.equal(net(data), net(data))
+
+
+def test_joints_meet_only_through_their_sensors():
+    config, n = ModelConfig(sensors="off", history=2), 3
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight)
+    a = x(config, n)
+    b = a.clone()
+    b[:, [1, n + 1]] += 0.5  # joint 1's position and velocity
+    changed = (net(b) - net(a)).abs().max(dim=0).values
+    assert changed[1] > 1e-3
+    assert changed[[0, 2]].max() == 0
+
+
+def test_a_joint_reads_its_own_sensors():
+    config, n = ModelConfig(num_probes=4), 3
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight)
+    z = torch.zeros(1, config.observation_dim(n) + n)
+    sensors = torch.zeros(1, 4, 2, n)
+    before = net._joint_inputs(z, sensors.reshape(1, -1))[0]
+    sensors[0, 2, 1, 2] = 1.0  # probe 2, velocity, joint 2
+    after = net._joint_inputs(z, sensors.reshape(1, -1))[0]
+    assert [int(i) for i in (after - before).nonzero()[0]] == [0, 2, n + 2 * 2 + 1]

@@ -35,12 +35,15 @@ class ModelConfig:
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""
+    coupling: Literal["joint", "full"] = "joint"
+    """joint: branch and trunk are shared by the joints and take one joint at a time; postures never recorded do not
+    lead them astray (docs/log.md). full: the paper's, every joint sees every joint. The mlp is always full."""
     num_basis: int = 16
     """p, basis functions per joint."""
-    branch_hidden: tuple[int, ...] = (256, 256, 256)
-    """Hidden layers of the branch net."""
-    trunk_hidden: tuple[int, ...] = (128, 128, 128)
-    """Hidden layers of the trunk net."""
+    branch_hidden: tuple[int, ...] = (128, 128)
+    """Hidden layers of the branch net; the paper's full coupling has 256 256 256."""
+    trunk_hidden: tuple[int, ...] = (64, 64)
+    """Hidden layers of the trunk net; the paper's full coupling has 128 128 128."""
     sensor_hidden: tuple[int, ...] = (256, 256)
     """Hidden layers of the sensor predictor."""
     mlp_hidden: tuple[int, ...] = (512, 256, 128)
@@ -50,6 +53,11 @@ class ModelConfig:
         for field in ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max"):
             if getattr(self, field) <= 0:
                 raise UsageError(f"{field} is {getattr(self, field)}; it must be positive")
+
+    @property
+    def joint_wise(self) -> bool:
+        """Whether one joint at a time passes through branch and trunk."""
+        return self.kind == "gaponet" and self.coupling == "joint"
 
     def observation_dim(self, n: int) -> int:
         """2n + 3nH (+ 1 with payload)."""

@@ -100,41 +100,76 @@ class Bounded(nn.Module):
 
 
 class OperatorNet(nn.Module):
-    """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), an unstacked DeepONet."""
+    """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), an unstacked DeepONet.
+
+    Coupling "joint": one branch and one trunk, shared by all joints, take what belongs to a joint and its name.
+    What other joints do reaches it through its sensors. Coupling "full": the paper's, every joint sees every joint.
+    """
+
+    which: Tensor
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
         self.predictor = SensorPredictor(config, n) if config.sensors == "predicted" else None
-        seen = config.observation_dim(n) if (config.branch_history or self.predictor is None) else 0
-        sensed = config.sensor_dim(n) if self.predictor is not None else 0
-        self.sees_observation = seen > 0
-        self.branch = dense(sensed + seen, config.branch_hidden, n * config.num_basis)
-        self.query_dim = 2 * n + int(config.payload_input)
-        self.trunk = dense(self.query_dim, config.trunk_hidden, n * config.num_basis, last=0.003)
+        self.sees_observation = config.branch_history or self.predictor is None
+        self.per_joint = config.joint_wise
+        self.register_buffer("which", torch.eye(n), persistent=False)
+        sensed, seen, asked = self.input_dims(config, n)
+        outputs = config.num_basis * (1 if self.per_joint else n)
+        self.branch = dense(
+            sensed * (self.predictor is not None) + seen * self.sees_observation + n * self.per_joint,
+            config.branch_hidden,
+            outputs,
+        )
+        self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, last=0.003)
         self.bias = nn.Parameter(torch.zeros(n))
         self.bounded = Bounded(config.delta_max)
         # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is
         # unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
         self.sample_sensors = False
 
+    @staticmethod
+    def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
+        """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
+        payload = int(config.payload_input)
+        if config.joint_wise:
+            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + payload
+        return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
+
     def forward(self, x: Tensor) -> Tensor:
         """x = [o_t | a_t], (B, observation_dim + n) → Δa, (B, n), rad."""
-        n, z = self.n, self.features(x)
-        parts = []
-        if self.predictor is not None:
-            mean, log_var = self.predictor(z)
-            if self.sample_sensors:
-                mean = mean + torch.randn_like(mean) * (0.5 * log_var).exp()
-            parts.append(mean)
-        if self.sees_observation:
-            parts.append(z[:, :-n])
-        branch = self.branch(torch.cat(parts, dim=1)).reshape(-1, n, self.config.num_basis)
-        # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
-        query = [z[:, :n], z[:, -n:]] + ([z[:, -n - 1 : -n]] if self.config.payload_input else [])
-        trunk = self.trunk(torch.cat(query, dim=1)).reshape(-1, n, self.config.num_basis)
+        z = self.features(x)
+        sensors = self.sensors(z) if self.predictor is not None else None
+        see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
+        shape = (-1, self.n, self.config.num_basis)
+        branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
+
+    def sensors(self, z: Tensor) -> Tensor:
+        """Predicted sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities."""
+        assert self.predictor is not None
+        mean, log_var = self.predictor(z)
+        return mean + torch.randn_like(mean) * (0.5 * log_var).exp() if self.sample_sensors else mean
+
+    def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
+        n = self.n
+        see = ([] if sensors is None else [sensors]) + ([z[:, :-n]] if self.sees_observation else [])
+        # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
+        ask = [z[:, :n], z[:, -n:]] + ([z[:, -n - 1 : -n]] if self.config.payload_input else [])
+        return torch.cat(see, dim=1), torch.cat(ask, dim=1)
+
+    def _joint_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
+        n, past = self.n, self.n * (2 + 3 * self.config.history)
+        which = self.which.expand(z.shape[0], n, n)
+        payload = [z[:, past : past + 1].unsqueeze(1).expand(-1, n, 1)] if self.config.payload_input else []
+        see = [which]
+        if sensors is not None:
+            see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
+        if self.sees_observation:
+            see += [z[:, :past].reshape(-1, 2 + 3 * self.config.history, n).transpose(1, 2), *payload]
+        return torch.cat(see, dim=2), torch.cat([which, z[:, -n:].unsqueeze(2), *payload], dim=2)
 
 
 class DeltaMLP(nn.Module):
