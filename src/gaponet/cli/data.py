@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 from rich.markup import escape
 
+from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 from gaponet.data.signals import FAST
@@ -83,10 +84,9 @@ def doctor(
         json: One JSON object on stdout.
     """
     from gaponet.data.doctor import diagnose, inventory
-    from gaponet.data.store import Dataset
 
-    out, data = Out(json), Dataset(dataset)
-    spec = load_robot(robot or data.robot_name)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
         diagnosis = diagnose(data, spec, update)
     out.say(f"[bold]{spec.name}[/], {escape(inventory(data))}")

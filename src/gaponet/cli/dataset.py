@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.markup import escape
 
+from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 from gaponet.data.store import Dataset
@@ -93,10 +94,9 @@ def figures(
         json: One JSON object on stdout.
     """
     from gaponet.eval.draw_dataset import draw_all
-    from gaponet.robot import load_robot
 
-    screen, data = Out(json), Dataset(dataset)
-    spec = load_robot(robot or data.robot_name)
+    screen = Out(json)
+    data, spec = open_dataset(dataset, robot)
     with bar("drawing") as update:
         written, left_out = draw_all(data, spec, out, update)
     for path in written:

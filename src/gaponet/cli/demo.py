@@ -50,7 +50,9 @@ def demo(
         dataset = Dataset(out / "dataset")
         gap(out / "dataset", robot)
     for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
-        run_training(dataset, robot, out / model.kind, TrainConfig(model, warm_start=QUICK), limit, False, holdout)
+        run_training(
+            dataset, load_robot(robot), out / model.kind, TrainConfig(model, warm_start=QUICK), limit, False, holdout
+        )
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))

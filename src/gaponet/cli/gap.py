@@ -7,9 +7,10 @@ from typing import Any
 
 import tyro
 
+from gaponet.cli.inputs import names, open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot import RobotSpec
 
 
 def pair(
@@ -22,12 +23,11 @@ def pair(
         robot: Robot name or folder, if not the package's robot of the dataset.
         json: One JSON object on stdout.
     """
-    from gaponet.data.store import Dataset
     from gaponet.sim.model import model_hash
     from gaponet.sim.pairing import pair_dataset
 
-    out, data = Out(json), Dataset(dataset)
-    spec = load_robot(robot or data.robot_name)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
     with bar("replaying") as update:
         made = pair_dataset(data, spec, lambda done, total: update(done, total, "control steps"))
     out.say(f"{made} twins made, {len(data) - made} were there; simulator {model_hash(spec)} in {dataset}")
@@ -48,13 +48,12 @@ def gap(
         motions: Only these, separated by commas.
         json: One JSON object on stdout.
     """
-    from gaponet.data.store import Dataset
     from gaponet.gap import runs, summary
     from gaponet.sim.model import model_hash
     from gaponet.sim.pairing import pair_dataset
 
-    out, data = Out(json), Dataset(dataset)
-    spec = load_robot(robot or data.robot_name)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
     data.require_robot(spec)
     entries = data.select(names(motions))
     with bar("replaying") as update:
@@ -96,11 +95,6 @@ def show_methods(out: Out, result: dict[str, Any], robot: RobotSpec) -> None:
         out.table(f"MPJAE, mrad by {group}", [title, *methods], [
             [key, *(mrad(m[f"by_{group}"][key]["mpjae"]) for m in methods.values())] for key in keys
         ])  # fmt: skip
-
-
-def names(text: str) -> tuple[str, ...]:
-    """ "a, b" → ("a", "b")."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def mrad(value: float) -> str:

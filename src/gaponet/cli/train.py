@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from gaponet.cli.gap import mrad, names, show_methods
+from gaponet.cli.gap import mrad, show_methods
+from gaponet.cli.inputs import names, open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
-from gaponet.robot import load_robot
+from gaponet.robot import RobotSpec
 from gaponet.train.config import TrainConfig
 
 if TYPE_CHECKING:
+    from gaponet.data.store import Dataset
     from gaponet.model.artifact import GapModel
 
 
@@ -44,11 +46,10 @@ def train(
         config: Everything else.
         json: One JSON object on stdout.
     """
-    from gaponet.data.store import Dataset
-
     screen = Out(json)
+    data, spec = open_dataset(dataset, robot)
     config = replace(config, model=replace(config.model, kind=model))
-    trained = run_training(Dataset(dataset), robot, out, config, budget, resume, holdout_units)
+    trained = run_training(data, spec, out, config, budget, resume, holdout_units)
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
@@ -63,15 +64,12 @@ def train(
 
 
 def run_training(
-    data: object, robot: str | None, out: Path, config: TrainConfig, budget: str, resume: bool, holdout: tuple[str, ...]
+    data: Dataset, spec: RobotSpec, out: Path, config: TrainConfig, budget: str, resume: bool, holdout: tuple[str, ...]
 ) -> GapModel:
     """Train with a progress bar: reward, held-out MPJAE, throughput."""
-    from gaponet.data.store import Dataset
     from gaponet.train.budget import Budget
     from gaponet.train.run import Status, Trainer
 
-    assert isinstance(data, Dataset)
-    spec = load_robot(robot or data.robot_name)
     with bar(f"training {config.model.kind}") as update:
 
         def show(s: Status) -> None:
@@ -102,12 +100,11 @@ def evaluate(
         robot: Robot name or folder, if not the package's robot of the dataset.
         json: One JSON object on stdout.
     """
-    from gaponet.data.store import Dataset
     from gaponet.eval.evaluate import evaluate as run_evaluation
     from gaponet.eval.evaluate import save
 
-    out, data = Out(json), Dataset(dataset)
-    spec = load_robot(robot or data.robot_name)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
     with bar("evaluating") as update:
         evaluation = run_evaluation(
             [run, *also], data, spec, names(motions),

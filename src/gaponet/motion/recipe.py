@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from gaponet.errors import UsageError
+from gaponet.packaged import load_toml
 
 RECIPES = Path(__file__).parent / "recipes"
 
@@ -72,16 +72,7 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
     Raises:
         UsageError: No such recipe, or a field is unknown, missing or empty; with the file and what to write.
     """
-    path = RECIPES / f"{name_or_path}.toml"
-    if not path.is_file():
-        path = Path(name_or_path)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in RECIPES.glob("*.toml")))
-        raise UsageError(f"no recipe '{name_or_path}': in the package are {known}; or give a .toml file")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    path, table = load_toml("recipe", RECIPES, name_or_path)
     known_fields = [f.name for f in fields(Recipe)]
     for key in table:
         if key not in known_fields:

@@ -9,7 +9,6 @@ file they are drawn when the fleet is loaded, by the same rule.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.errors import UsageError
+from gaponet.packaged import load_toml
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
@@ -74,16 +74,7 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     Raises:
         UsageError: No such fleet, or the file is not one; with the file and what is wrong.
     """
-    path = FLEETS / f"{name_or_path}.toml"
-    if not path.is_file():
-        path = Path(name_or_path)
-    if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in FLEETS.glob("*.toml")))
-        raise UsageError(f"no fleet '{name_or_path}': in the package are {known}; or give a .toml file")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    path, table = load_toml("fleet", FLEETS, name_or_path)
     seed, laws = header(table, path)
     saved = table.get("robot", {}).get(robot.name)
     if saved is None:
