@@ -6,6 +6,8 @@ from arm import TOML, XML, write_arm
 
 from gaponet.errors import JointMismatchError, RobotError
 from gaponet.robot import available, load_robot
+from gaponet.robot_folder import save_robot
+from gaponet.sim.model import build_model, model_hash
 
 
 def test_the_package_holds_h1_2_and_so101():
@@ -87,3 +89,25 @@ def test_a_folder_without_mjcf_says_where_to_put_it(tmp_path):
     (tmp_path / "arm" / "robot.xml").unlink()
     with pytest.raises(RobotError, match=r"robot\.xml is missing beside it"):
         load_robot(tmp_path / "arm")
+
+
+def test_identified_values_survive_a_folder_and_the_nominal_robot_stays_known(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    fitted = robot.with_servos({"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}})
+    save_robot(fitted, tmp_path / "fitted")
+    back = load_robot(tmp_path / "fitted")
+    assert model_hash(back) == model_hash(fitted) != model_hash(robot)
+    assert model_hash(back.nominal) == model_hash(robot)
+    model = build_model(back)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.05, 0.11])
+    np.testing.assert_allclose(model.actuator_biasprm[1, :2], [-0.125, -12.5])
+    np.testing.assert_allclose(model.actuator_delay, [0.0, 0.03])
+    save_robot(back.nominal, tmp_path / "again")
+    assert load_robot(tmp_path / "again").nominal is None
+
+
+def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(RobotError, match=r"identified\.wing"):
+        write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")
+    with pytest.raises(RobotError, match="mass = 3"):
+        write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")

@@ -7,10 +7,11 @@ by writing such a folder; no code is needed.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import functools
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ Array = np.ndarray
 
 BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
+MJCF_FIELDS = ("damping", "armature", "frictionloss")  # NaN where the MJCF's value stands
+IDENTIFIED = (*MJCF_FIELDS, "delay", "offset")
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,11 @@ class RobotSpec:
         payload_mounts: Where payloads go.
         dt: Control period, s.
         timestep: Physics step at that control period, s; dt / timestep is an exact integer.
+        damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
+            where the MJCF's stands.
+        delay: From command to servo, (n), s.
+        offset: Of the servo's zero: it aims at command + offset, (n), rad.
+        nominal: The robot before identification, where parameters were identified (sim/identify.py).
     """
 
     name: str
@@ -66,15 +74,27 @@ class RobotSpec:
     payload_mounts: tuple[PayloadMount, ...]
     dt: float
     timestep: float
+    damping: Array = field(default_factory=lambda: np.array(np.nan))
+    armature: Array = field(default_factory=lambda: np.array(np.nan))
+    frictionloss: Array = field(default_factory=lambda: np.array(np.nan))
+    delay: Array = field(default_factory=lambda: np.array(0.0))
+    offset: Array = field(default_factory=lambda: np.array(0.0))
+    nominal: RobotSpec | None = None
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
-        for field in ("kp", "kd", "effort_limit", "qpos_home"):
-            value = np.asarray(getattr(self, field), float)
-            if value.shape != (n,) or not np.isfinite(value).all():
-                raise RobotError(f"{self.name}: {field} must be {n} finite numbers, got shape {value.shape}")
+        for name in ("kp", "kd", "effort_limit", "qpos_home"):
+            if np.shape(getattr(self, name)) != (n,):
+                shape = np.shape(getattr(self, name))
+                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
+        for name in ("kp", "kd", "effort_limit", "qpos_home", *IDENTIFIED):
+            value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
+            if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
+                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
+            if name not in ("qpos_home", "offset") and (value < 0).any():
+                raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
             value.flags.writeable = False
-            object.__setattr__(self, field, value)
+            object.__setattr__(self, name, value)
         if len(set(self.joint_names)) != n:
             raise RobotError(f"{self.name}: a joint name appears twice in {', '.join(self.joint_names)}")
         if not self.operated:
@@ -90,6 +110,14 @@ class RobotSpec:
     def decimation(self) -> int:
         """Physics steps per control period."""
         return round(self.dt / self.timestep)
+
+    def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
+        """The same robot with identified values: joint → any of kp, damping, armature, frictionloss, delay, offset."""
+        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in ("kp", *IDENTIFIED)}
+        for joint, values in servos.items():
+            for name, value in values.items():
+                changed[name][self.index([joint])[0]] = value
+        return dataclasses.replace(self, **changed, nominal=self.nominal or self)
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -182,7 +210,7 @@ def _spec(table: dict[str, Any], toml: Path, mjcf: Path) -> RobotSpec:
     for i, mount in enumerate(mounts):
         _require(mount, {"side": str, "body": str, "pos": list}, f"{toml}: [[payload_mount]] {i + 1}")
     names = tuple(j["name"] for j in joints)
-    return RobotSpec(
+    robot = RobotSpec(
         name=table["name"],
         description=table.get("description", table["name"]),
         mjcf=mjcf,
@@ -198,11 +226,22 @@ def _spec(table: dict[str, Any], toml: Path, mjcf: Path) -> RobotSpec:
         dt=float(table["dt"]),
         timestep=float(table["timestep"]),
     )
+    return robot.with_servos(_servos(table["identified"], robot, toml)) if "identified" in table else robot
+
+
+def _servos(table: Any, robot: RobotSpec, toml: Path) -> dict[str, dict[str, float]]:
+    for joint, values in table.items():
+        if joint not in robot.joint_names or not isinstance(values, dict):
+            raise RobotError(f"{toml}: [identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
+        for name, value in values.items():
+            if name not in ("kp", *IDENTIFIED) or not isinstance(value, (int, float)):
+                raise RobotError(f"{toml}: [identified.{joint}] {name} = {value}: give kp, {', '.join(IDENTIFIED)}")
+    return table
 
 
 def _require(table: dict[str, Any], fields: dict[str, Any], where: str) -> None:
-    for field, kind in fields.items():
-        if field not in table:
-            raise RobotError(f"{where}: '{field}' is missing; add {field} = ...")
-        if not isinstance(table[field], kind):
-            raise RobotError(f"{where}: '{field}' has the wrong type ({type(table[field]).__name__})")
+    for name, kind in fields.items():
+        if name not in table:
+            raise RobotError(f"{where}: '{name}' is missing; add {name} = ...")
+        if not isinstance(table[name], kind):
+            raise RobotError(f"{where}: '{name}' has the wrong type ({type(table[name]).__name__})")

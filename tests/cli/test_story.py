@@ -60,6 +60,17 @@ def test_eval_of_a_training_motion_says_that_it_is_one(place, capsys):
     assert "not held-out" in err
 
 
+def test_identify_writes_a_robot_folder_that_other_commands_take(place, capsys, tmp_path):
+    fitted = tmp_path / "fitted"
+    result, err = run(place, capsys, "identify", str(place / "data"), "--out", str(fitted), "--windows", "4")
+    assert result["joints"]["elbow"]["kp"] == pytest.approx(10.0, rel=0.1)
+    assert result["val_mpjae"]["identified"] < 0.2 * result["val_mpjae"]["nominal"]
+    assert "N·m/rad" in err
+    assert main(["gap", str(place / "data"), "--robot", str(fitted), "--json"]) == 0
+    gap = json.loads(capsys.readouterr().out)
+    assert gap["methods"]["nominal"]["mpjae"] < 0.002
+
+
 def test_the_report_is_one_offline_page(place, capsys):
     result, _ = run(place, capsys, "report", str(place / "gaponet"), "--also", str(place / "mlp"))
     page = (place / "gaponet" / "report.html").read_text(encoding="utf-8")

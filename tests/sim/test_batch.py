@@ -1,9 +1,13 @@
 """Many simulations step exactly as one does."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
+import pytest
 from arm import write_arm
 
+from gaponet.errors import UsageError
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model
 
@@ -39,3 +43,31 @@ def test_simulations_left_out_of_a_step_stand_still(tmp_path):
     sim.step(np.ones((3, 2)), np.array([0, 2]))
     assert (sim.qpos[1] == 0).all()
     assert (sim.qpos[[0, 2]] != 0).any(axis=1).all()
+
+
+def test_a_late_servo_does_what_a_prompt_one_does_with_commands_of_earlier(tmp_path):
+    robot = write_arm(tmp_path)
+    late = replace(robot, delay=[0.04, 0.0])
+    targets = np.random.default_rng(1).uniform(-1, 1, (25, 2))
+    shifted = targets.copy()
+    shifted[2:, 0] = targets[:-2, 0]
+    sims = [BatchSim(r, [(0.0, "both", 0.02)]) for r in (late, robot)]
+    for sim in sims:
+        sim.reset(slice(None), np.zeros(2), np.zeros(2), past=targets[None, 1::-1])
+    for t in range(2, len(targets)):
+        sims[0].step(targets[t][None])
+        sims[1].step(shifted[t][None])
+        # Between physics steps MuJoCo interpolates: the new target is fully there one physics step later.
+        np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
+    sims[0].reset(np.array([0]), np.zeros((1, 2)), np.zeros((1, 2)), past=targets[None, 1::-1])
+    sims[1].reset(np.array([0]), np.zeros((1, 2)), np.zeros((1, 2)))
+    for t in range(2, 6):
+        sims[0].step(targets[t][None])
+        sims[1].step(shifted[t][None])
+    np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
+
+
+def test_late_servos_want_to_know_what_is_on_its_way(tmp_path):
+    sim = BatchSim(replace(write_arm(tmp_path), delay=0.03), [(0.0, "both", 0.02)])
+    with pytest.raises(UsageError, match="past"):
+        sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))

@@ -7,13 +7,14 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.data.pair import require_disjoint
+from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import evaluate
 from gaponet.model.config import ModelConfig
 from gaponet.train.budget import Budget
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.train.run import Trainer, split_entries
+from gaponet.train.run import Trainer
 
 SMALL = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
@@ -128,3 +129,14 @@ def test_budgets(text, seconds, steps):
 def test_a_budget_that_makes_no_sense_is_refused(text):
     with pytest.raises(UsageError, match="--budget"):
         Budget.parse(text)
+
+
+def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(trained, robot, tmp_path):
+    data = trained[0]
+    fitted = robot.with_servos({j: {"kp": 11.0, "delay": 0.03} for j in robot.operated})
+    Trainer(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
+    result = evaluate([tmp_path / "run"], data, robot).result
+    assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "gaponet"]
+    assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
+    assert result["methods"]["identified"]["mpjae"] < 0.6 * result["methods"]["nominal"]["mpjae"]
+    assert result["methods"]["gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]

@@ -18,6 +18,7 @@ COMMANDS = {
     "gap": "gaponet.cli.gap:gap",
     "data": "gaponet.cli.dataset:data",
     "collect": "gaponet.cli.collect:collect",
+    "identify": "gaponet.cli.identify:identify",
     "train": "gaponet.cli.train:train",
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",

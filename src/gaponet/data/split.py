@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gaponet.data.pair import hash_order
+from gaponet.data.pair import hash_order, split_by_motion
 from gaponet.data.store import Dataset, Entry, dataset_hash, write_text
 from gaponet.errors import DatasetError, UsageError
 
@@ -29,6 +29,26 @@ BY: dict[str, Callable[[Entry], str]] = {
     "payload": lambda e: f"{e.meta.payload_mass:g}",
 }
 TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
+
+
+def split_entries(dataset: Dataset, holdout_units: tuple[str, ...] = ()) -> Parts:
+    """Entries per part: the fixed split by motion; units held out appear in the test part only, with its motions."""
+    units = {e.meta.unit_id for e in dataset.entries}
+    strangers = [u for u in holdout_units if u not in units]
+    if strangers:
+        raise UsageError(f"unit '{strangers[0]}' is not in {dataset.path}; it holds {', '.join(sorted(units))}")
+    split = split_by_motion([e.meta.motion for e in dataset.entries])
+    parts = {
+        part: [
+            e for e in dataset.entries
+            if e.meta.motion in getattr(split, part) and (part == "test" or e.meta.unit_id not in holdout_units)
+        ]
+        for part in ("train", "val", "test")
+    }  # fmt: skip
+    for part, entries in parts.items():
+        if not entries:
+            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {', '.join(holdout_units)}")
+    return parts
 
 
 def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Parts:

@@ -19,13 +19,13 @@ from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.gap import Run, runs, summary
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
-ORDER = ("nominal", "delay_offset", "mlp", "gaponet")  # of tables and figures
+ORDER = ("nominal", "delay_offset", "identified", "mlp", "gaponet")  # of tables and figures
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def evaluate(
         progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)
+    nominal = robot.nominal or robot
     models: dict[str, GapModel] = {}
     for path in runs_dirs:
         model = GapModel.load(path)
@@ -63,12 +64,13 @@ def evaluate(
         models[model.config.kind] = model
     entries, unseen = choose(runs_dirs[0], dataset, motions)
     sequences = dataset.sequences(entries)
-    for model, dt in itertools.product(models.values(), sorted({s.dt for s in sequences})):
-        model.require(robot, dt)
+    robots = {kind: _corrected(path, nominal) for kind, path in zip(models, runs_dirs, strict=True)}
+    for (kind, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
+        model.require(robots[kind], dt)
     done_runs: dict[str, list[Run]] = {}
     deltas: dict[str, list[Array]] = {}
-    for name, corrector in _methods(runs_dirs[0], models, robot):
-        twins = replay(sequences, robot, corrector, progress=partial(progress, name), lock_idle=True)
+    for name, simulator, corrector in _methods(runs_dirs[0], models, nominal, robots):
+        twins = replay(sequences, simulator, corrector, progress=partial(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             op = robot.operated_index
@@ -82,7 +84,7 @@ def evaluate(
         "unseen": unseen,
         "virtual": any(s.meta.virtual for s in sequences),
         "robot": robot.name,
-        "simulator_hash": model_hash(robot),
+        "simulator_hash": model_hash(nominal),
         "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
     }
@@ -140,13 +142,28 @@ def save(evaluation: Evaluation, run: Path) -> None:
     write_text(run / "metrics.json", json.dumps(finite(result), indent=1, ensure_ascii=False) + "\n")
 
 
-def _methods(run: Path, models: dict[str, GapModel], robot: RobotSpec) -> Iterator[tuple[str, Corrector | None]]:
-    yield "nominal", None
+def _corrected(run: Path, nominal: RobotSpec) -> RobotSpec:
+    """The simulator that a run's model corrects: the nominal one, or the identified one kept in the run."""
+    kept = load_robot(run / "robot") if (run / "robot" / "robot.toml").is_file() else nominal
+    return nominal if model_hash(kept) == model_hash(nominal) else kept
+
+
+def _methods(
+    run: Path, models: dict[str, GapModel], nominal: RobotSpec, robots: dict[str, RobotSpec]
+) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """Name, simulator and corrector of everything compared, in the order of ORDER."""
+    yield "nominal", nominal, None
     file = run / "delay_offset.json"
     if file.is_file():
-        yield "delay_offset", DelayOffset(**json.loads(file.read_text(encoding="utf-8"))).corrector(robot)
+        fitted = DelayOffset(**json.loads(file.read_text(encoding="utf-8")))
+        yield "delay_offset", nominal, fitted.corrector(nominal)
+    identified = {model_hash(r): r for r in robots.values() if r.nominal is not None}
+    if len(identified) > 1:
+        raise UsageError("the runs start from different identified simulators; compare those of one identification")
+    for robot in identified.values():
+        yield "identified", robot, None
     for kind in sorted(models, key=ORDER.index):
-        yield kind, models[kind].corrector(robot)
+        yield kind, robots[kind], models[kind].corrector(robots[kind])
 
 
 def _delta_summary(parts: list[Array], sequences: list[Sequence]) -> dict[str, float]:

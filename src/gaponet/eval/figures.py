@@ -10,11 +10,18 @@ from matplotlib.figure import Figure
 
 Array = np.ndarray
 
-NAMES = {"nominal": "nominal simulator", "delay_offset": "delay + offset", "mlp": "MLP", "gaponet": "GAPONet"}
+NAMES = {
+    "nominal": "nominal simulator",
+    "delay_offset": "delay + offset",
+    "identified": "identified simulator",
+    "mlp": "MLP",
+    "gaponet": "GAPONet",
+}
 COLOURS = {
     "recorded": "#111111",
     "nominal": "#8c8c8c",
     "delay_offset": "#d99000",
+    "identified": "#2a9d6f",
     "mlp": "#3b7dd8",
     "gaponet": "#c8102e",
 }

@@ -6,6 +6,8 @@ points; the oracle really steps the simulator, the predictor (model/deeponet.py)
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gaponet.model.config import ModelConfig
@@ -41,7 +43,8 @@ class ProbeOracle:
         self.offsets = probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
-        self.sim = BatchSim(robot, [c for c in conditions for _ in range(m)], nthread, locked)
+        prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
+        self.sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
         self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
 
     def __call__(self, qpos: Array, qvel: Array) -> Array:
@@ -57,7 +60,7 @@ class ProbeOracle:
         q, v = np.repeat(qpos, m, axis=0), np.repeat(qvel, m, axis=0)
         target = q.copy()
         target[:, op] += np.tile(self.offsets, (len(qpos), 1))
-        self.sim.reset(slice(None), q, v)
+        self.sim.reset(slice(None), q, v, past=target[:, None])
         self.sim.step(target)
         moved = self.sim.qpos[:, op] - q[:, op]
         sped = (self.sim.qvel[:, op] - v[:, op]) * np.repeat(self.dt, m)[:, None]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
+from mujoco.batch import MODEL_FIELDS, Batch
 
+from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 
@@ -29,8 +32,7 @@ class BatchSim:
         self.models = {c: build_model(robot, c[0], c[1], c[2], locked) for c in dict.fromkeys(conditions)}
         first = self.models[conditions[0]]
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
-        if len(self.models) > 1:
-            self.batch.set_models([self.models[c] for c in conditions])
+        expand_differences(self.batch, [self.models[c] for c in conditions])
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
         self.qpos: Array = self.batch.bind("qpos")
@@ -38,13 +40,25 @@ class BatchSim:
         self.ctrl: Array = self.batch.bind("ctrl")
         self.torque: Array = self.batch.bind("actuator_force")
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
+        self._late = CommandHistory(self.batch, first) if first.nhistory else None
         self.range = qpos_range(first)
 
-    def reset(self, ids: Array | slice, qpos: Array, qvel: Array) -> None:
-        """Put simulations `ids` into a state, (k, n) rad and rad/s."""
+    def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
+        """Put simulations `ids` into a state, (k, n) rad and rad/s.
+
+        Args:
+            ids: Which.
+            qpos, qvel: State, (k, n).
+            past: Targets of the control periods before, newest first, (k, depth, n) rad: what is still under way to
+                servos that are late (robot.delay); only they need it. The oldest counts for all before it.
+        """
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
         self._warmstart[ids] = 0.0
+        if self._late is not None:
+            if past is None:
+                raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
+            self._late.fill(ids, past, self.robot.decimation)
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
         """Hold position targets for one control period.
@@ -59,3 +73,50 @@ class BatchSim:
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""
         return self.batch.get_data(env)
+
+
+def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> None:
+    """Give every model field that differs between simulations its value for each; models (nsim), many the same."""
+    unique = list({id(m): m for m in models}.values())
+    if len(unique) == 1:
+        return
+    place = {id(m): i for i, m in enumerate(unique)}
+    rows = [place[id(m)] for m in models]
+    for name in sorted(MODEL_FIELDS):
+        values = [_field(m, name) for m in unique]
+        if values[0] is not None and any(not np.array_equal(v, values[0]) for v in values[1:]):
+            batch.expand(name)[:] = np.stack(values)[rows]
+
+
+def _field(model: mujoco.MjModel, name: str) -> Any:
+    """A model or option field; numbers among the options as arrays."""
+    if name.startswith("opt."):
+        value = getattr(model.opt, name[4:], None)
+        return None if value is None else np.asarray(value)
+    value = getattr(model, name, None)
+    return value if isinstance(value, np.ndarray) else None
+
+
+class CommandHistory:
+    """MuJoCo's buffer of past commands, of every simulation in a batch. Actuators all have the same length of it.
+
+    Layout of an actuator's part: one user number, the cursor, the samples' times, the samples (mj_initCtrlHistory).
+    """
+
+    def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
+        self.buffer: Array = batch.bind("history")
+        self.time: Array = batch.bind("time")
+        self.samples = int(model.actuator_history[0, 0])
+        self.timestep = model.opt.timestep
+        self.shape = (model.nu, 2 + 2 * self.samples)
+
+    def fill(self, ids: Array | slice, past: Array, decimation: int) -> None:
+        """Write past targets, newest first, each held for `decimation` physics steps; time starts at 0."""
+        self.time[ids] = 0.0
+        ago = np.arange(self.samples, 0, -1)  # oldest first
+        part = np.zeros((len(past), *self.shape))
+        part[:, :, 1] = self.samples - 1
+        part[:, :, 2 : 2 + self.samples] = -ago * self.timestep
+        frame = np.minimum((ago - 1) // decimation, past.shape[1] - 1)
+        part[:, :, 2 + self.samples :] = past[:, frame].transpose(0, 2, 1)
+        self.buffer[ids] = part.reshape(len(past), -1)

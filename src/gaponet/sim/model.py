@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from gaponet.errors import RobotError, UsageError
-from gaponet.robot import RobotSpec
+from gaponet.robot import IDENTIFIED, RobotSpec
 
 # Joint friction loss is a soft constraint in MuJoCo: with the default parameters a joint that should stick creeps.
 # These values hold it (tests/sim/test_model.py holds a loaded joint for 60 s), at no cost in speed.
@@ -48,6 +48,7 @@ def build_model(
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
+    _set_joints(spec, robot)
     _lock(spec, robot, locked)
     _add_actuators(spec, robot, locked)
     _add_payload(spec, robot, payload_mass, payload_side)
@@ -103,6 +104,9 @@ def model_hash(robot: RobotSpec) -> str:
     digest.update(robot.mjcf.read_bytes())
     for part in (robot.kp, robot.kd, robot.effort_limit):
         digest.update(np.ascontiguousarray(part, np.float64).tobytes())
+    servos = [np.ascontiguousarray(getattr(robot, field), np.float64) for field in IDENTIFIED]
+    if any(np.nan_to_num(s).any() for s in servos):
+        digest.update(b"".join(s.tobytes() for s in servos))
     digest.update(repr((robot.joint_names, robot.decimation, STIFF_SOLREF, STIFF_SOLIMP)).encode())
     return digest.hexdigest()[:12]
 
@@ -121,6 +125,18 @@ def _read(robot: RobotSpec) -> mujoco.MjSpec:
     return spec
 
 
+def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
+    """Identified values over the MJCF's."""
+    for i, name in enumerate(robot.joint_names):
+        joint = spec.joint(name)
+        for field in ("armature", "frictionloss"):
+            value = getattr(robot, field)[i]
+            if np.isfinite(value):
+                setattr(joint, field, value)
+        if np.isfinite(robot.damping[i]):
+            joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
+
+
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for name in locked:
         joint = spec.joint(name)
@@ -137,13 +153,19 @@ def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> Non
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    for name, kp, kd, limit in zip(robot.joint_names, robot.kp, robot.kd, robot.effort_limit, strict=True):
+    # One buffer length for all, so that models of one robot share a layout; none where nothing is late.
+    samples = math.ceil(robot.delay.max() / spec.option.timestep - 1e-9) + 1 if robot.delay.any() else 0
+    for i, name in enumerate(robot.joint_names):
         if name in locked:
             continue
+        kp, limit = robot.kp[i], robot.effort_limit[i]
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=kp, kv=kd)
+        actuator.set_to_position(kp=kp, kv=robot.kd[i])
+        actuator.biasprm[0] = kp * robot.offset[i]
         actuator.forcelimited = True
         actuator.forcerange = (-limit, limit)
+        if samples:
+            actuator.nsample, actuator.interp, actuator.delay = samples, 1, robot.delay[i]
 
 
 def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) -> None:

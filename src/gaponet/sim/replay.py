@@ -98,7 +98,7 @@ def _free_run(
     for i, s in enumerate(sequences):
         ctrl[: len(s), i] = s.ctrl
     first = [np.stack([getattr(s, name)[0, free] for s in sequences]) for name in ("qpos", "qvel")]
-    sim.reset(slice(None), first[0], first[1])
+    sim.reset(slice(None), first[0], first[1], past=ctrl[0][:, None, free])
     out[0, 0][:, free], out[1, 0][:, free] = sim.qpos, sim.qvel
     if corrector is not None:
         corrector.reset(sequences)

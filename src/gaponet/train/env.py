@@ -53,6 +53,8 @@ class DeltaEnv(VecEnv):
         self._load(sequences)
         self.sim = BatchSim(robot, [self.conditions[g] for g in self.group], nthread, self.locked)
         self.history = History(config, num_envs, self.num_actions)
+        shortest = min(c[2] for c in self.conditions)
+        self.depth = max(self.history.depth, 1 + int(np.ceil(robot.delay.max() / shortest)))  # periods still under way
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
@@ -96,8 +98,9 @@ class DeltaEnv(VecEnv):
             self.first[mine], self.last[mine] = self.seq_first[seq], self.seq_last[seq]
         self.row[ids] = self.rng.integers(self.first[ids], self.last[ids])
         t = self.row[ids]
-        self.sim.reset(ids, self.qpos[t], self.qvel[t])
-        before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.history.depth)
+        before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.depth)
+        self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
+        before = before[:, : self.history.depth]
         op = self.op
         self.history.reset(ids, self.qpos[before][..., op], self.qvel[before][..., op], self.ctrl[before][..., op])
         self.previous[ids] = 0.0

@@ -1,9 +1,10 @@
 """Inverse labels: the targets that would make the simulator follow the robot's recorded motion.
 
-The position actuator's force is kp·(u − q) − kd·q̇, so the target that produces a torque τ is u* = q + (τ + kd·q̇)/kp,
-with τ from the inverse dynamics of the payload-carrying model at low-pass filtered (q, q̇, q̈). The plant is stable about
-u*, so the label stays right when the simulated state has drifted from the recorded one: that is what lets a network be
-fitted on the states that it visits itself.
+The position actuator's force is kp·(u + offset − q) − kd·q̇, so the target that produces a torque τ is
+u* = q + (τ + kd·q̇)/kp − offset, sent ahead by the servo's delay where one is identified. τ comes from the inverse
+dynamics of the payload-carrying model at low-pass filtered (q, q̇, q̈). The plant is stable about u*, so the label stays
+right when the simulated state has drifted from the recorded one: that is what lets a network be fitted on the states
+that it visits itself.
 """
 
 from __future__ import annotations
@@ -29,7 +30,11 @@ def inverse_targets(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF
     tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, sequence.dt))
     tau += model.dof_frictionloss * np.tanh(qvel / FRICTION_SPEED)
     tau = np.clip(tau, -robot.effort_limit, robot.effort_limit)
-    return (qpos + (tau + robot.kd * qvel) / robot.kp).astype(np.float32)
+    target = qpos + (tau + robot.kd * qvel) / robot.kp - robot.offset
+    t = np.arange(len(target)) * sequence.dt
+    for j in np.flatnonzero(robot.delay):
+        target[:, j] = np.interp(t + robot.delay[j], t, target[:, j])
+    return target.astype(np.float32)
 
 
 def inverse_labels(sequence: Sequence, robot: RobotSpec, limit: float) -> Array:

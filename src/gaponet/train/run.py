@@ -3,6 +3,7 @@
 RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
 RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
 RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
+RUN/robot/             the simulator corrected
 """
 
 from __future__ import annotations
@@ -21,8 +22,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.data.pair import require_disjoint, split_by_motion
-from gaponet.data.store import Dataset, Entry, dataset_hash, write_text
+from gaponet.data.pair import require_disjoint
+from gaponet.data.split import split_entries
+from gaponet.data.store import Dataset, dataset_hash, write_text
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.baselines import delay_offset
@@ -30,6 +32,7 @@ from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
 from gaponet.robot import RobotSpec
+from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
 from gaponet.train.config import TrainConfig
@@ -110,7 +113,7 @@ class Trainer:
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
         self.nominal = self.validate(None)
-        self.baseline = delay_offset.fit(self.train_set, self.robot)
+        self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
             if not np.isfinite(self.best):
@@ -192,10 +195,14 @@ class Trainer:
     # ---- validation, checkpoints, card
 
     def validate(self, net: torch.nn.Module | None) -> float:
-        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator."""
+        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
+
+        Nominal is the simulator before identification, also where training starts from an identified one.
+        """
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
-        twins = replay(picked, self.robot, corrector, lock_idle=True)
+        simulator = self.robot if net is not None else self.robot.nominal or self.robot
+        twins = replay(picked, simulator, corrector, lock_idle=True)
         op = self.robot.operated_index
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 
@@ -258,6 +265,8 @@ class Trainer:
             "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
+        if self.robot.mjcf.parent.resolve() != (self.out / "robot").resolve():
+            save_robot(self.robot, self.out / "robot")
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
 
@@ -297,23 +306,3 @@ def torch_infer(net: torch.nn.Module) -> Callable[[Array], Array]:
             return net(torch.from_numpy(x)).numpy()
 
     return infer
-
-
-def split_entries(dataset: Dataset, holdout_units: tuple[str, ...] = ()) -> dict[str, list[Entry]]:
-    """Entries per part: the fixed split by motion; units held out appear in the test part only, with its motions."""
-    units = {e.meta.unit_id for e in dataset.entries}
-    strangers = [u for u in holdout_units if u not in units]
-    if strangers:
-        raise UsageError(f"unit '{strangers[0]}' is not in {dataset.path}; it holds {', '.join(sorted(units))}")
-    split = split_by_motion([e.meta.motion for e in dataset.entries])
-    parts = {
-        part: [
-            e for e in dataset.entries
-            if e.meta.motion in getattr(split, part) and (part == "test" or e.meta.unit_id not in holdout_units)
-        ]
-        for part in ("train", "val", "test")
-    }  # fmt: skip
-    for part, entries in parts.items():
-        if not entries:
-            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {', '.join(holdout_units)}")
-    return parts

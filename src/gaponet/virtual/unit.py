@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
-from mujoco.batch import MODEL_FIELDS, Batch
+from mujoco.batch import Batch
 
 from gaponet.robot import RobotSpec
+from gaponet.sim.batch import expand_differences
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.virtual.motor import Backlash, CommandLink, Thermal, cogging_torque, friction_limit, supply_share
 from gaponet.virtual.physics import Physics, stack
@@ -78,7 +78,7 @@ class VirtualRobot:
         self.everywhere = stack(units, np.arange(len(robot.joint_names)))
         models = _models(robot, units, payloads, self.dt, self.timestep, locked)
         self.batch = Batch(models[0], nsim=len(units), nthread=nthread)
-        _expand_differences(self.batch, models)
+        expand_differences(self.batch, models)
         self.num_envs, self.n = len(units), len(robot.joint_names)
         self._bind(models[0])
 
@@ -290,18 +290,3 @@ def _edit(model: mujoco.MjModel, robot: RobotSpec, unit: Physics, locked: tuple[
     if roll or pitch:  # what a level world looks like from a base that leans
         model.opt.gravity = g * np.array([np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)])
     mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> None:
-    """Give every model field that differs between rows its per-row values."""
-    unique = list(dict.fromkeys(models))
-    first = unique[0]
-    for name in sorted(MODEL_FIELDS):
-        values = {id(m): _field(m, name) for m in unique}
-        if values[id(first)] is not None and any(not np.array_equal(v, values[id(first)]) for v in values.values()):
-            batch.expand(name)[:] = np.stack([values[id(m)] for m in models])
-
-
-def _field(model: mujoco.MjModel, name: str) -> Any:
-    value = getattr(model.opt, name[4:], None) if name.startswith("opt.") else getattr(model, name, None)
-    return value if isinstance(value, np.ndarray) else None

@@ -1,0 +1,81 @@
+"""gaponet identify."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from rich.markup import escape
+
+from gaponet.cli.gap import mrad
+from gaponet.cli.inputs import open_dataset
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+
+UNITS = {
+    "kp": "N·m/rad", "damping": "N·m·s/rad", "frictionloss": "N·m", "armature": "kg·m²", "offset": "rad", "delay": "s",
+}  # fmt: skip
+
+
+def identify(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    windows: int = 40,
+    robot: str | None = None,
+    holdout_units: tuple[str, ...] = (),
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
+
+    The result is a robot folder: use it with --robot, e.g. gaponet train DATASET --robot OUT --out RUN.
+
+    Args:
+        dataset: Dataset folder.
+        out: Robot folder to write.
+        windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
+        robot: Robot name or folder to start from, if not the package's robot of the dataset.
+        holdout_units: Units to leave out, as in gaponet train.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.split import split_entries
+    from gaponet.robot_folder import save_robot
+    from gaponet.sim.identify import BOUNDS
+    from gaponet.sim.identify import identify as fit
+    from gaponet.sim.replay import replay
+
+    screen = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    data.require_robot(spec)
+    parts = split_entries(data, holdout_units)
+    with bar("identifying") as update:
+        found = fit(
+            data.sequences(parts["train"]), spec, windows,
+            progress=lambda done, total, rms: update(done, total, f"window RMS {mrad(rms)} mrad"),
+        )  # fmt: skip
+    save_robot(found.robot, out)
+    held, op = data.sequences(parts["val"]), spec.operated_index
+    nominal = spec.nominal or spec
+    error = {
+        name: float(np.mean([
+            np.abs(t.qpos - s.qpos)[1:, op].mean()
+            for s, t in zip(held, replay(held, simulator, lock_idle=True), strict=True)
+        ]))
+        for name, simulator in (("nominal", nominal), ("identified", found.robot))
+    }  # fmt: skip
+    values: dict[str, Any] = {
+        j: {f: float(getattr(found.robot, f)[spec.joint_names.index(j)]) for f in BOUNDS} for j in spec.operated
+    }
+    screen.table("Identified servos", ["joint", *(f"{f}, {UNITS[f]}" for f in BOUNDS)], [
+        [j, *(f"{v:.4g}" for v in values[j].values())] for j in spec.operated
+    ])  # fmt: skip
+    for warning in found.warnings:
+        screen.say(f"[yellow]warning[/]  {escape(warning)}")
+    screen.say(
+        f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions: nominal "
+        f"{mrad(error['nominal'])}, identified {mrad(error['identified'])} mrad "
+        f"({error['identified'] / error['nominal']:.2f})"
+    )
+    screen.say(f"robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")
+    screen.result({"joints": values, "val_mpjae": error, "warnings": list(found.warnings), "robot": str(out)})

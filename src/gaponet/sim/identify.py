@@ -1,0 +1,225 @@
+"""System identification: the servo parameters with which the simulator, running free, follows the recordings best.
+
+Per operated joint: gain, damping, dry friction, armature, zero offset, command delay. Nonlinear least squares on free
+runs of several seconds from recorded states; all finite differences of a Jacobian are stepped as one batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from gaponet.data.sequence import Sequence
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec
+from gaponet.sim.batch import BatchSim
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import idle_limbs
+
+Array = np.ndarray
+
+WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
+WINDOWS = 40
+EVALUATIONS = 20
+SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
+MAX_DELAY = 0.15  # s
+SETTLE = 0.1  # s: velocities at a window's start are measured ones
+
+# Parameter → (lower, upper, finite-difference step), as a multiple of the scale in `_scales`.
+BOUNDS = {
+    "kp": (0.2, 8.0, 0.02),
+    "damping": (0.0, 10.0, 0.02),
+    "frictionloss": (0.0, 10.0, 0.05),
+    "armature": (0.02, 10.0, 0.05),
+    "offset": (-10.0, 10.0, 0.1),
+    "delay": (0.0, MAX_DELAY / 0.02, 0.25),
+}
+
+
+@dataclass(frozen=True)
+class Identified:
+    """The fitted robot and what is known about the fit.
+
+    Attributes:
+        robot: The same robot with identified parameters.
+        before, after: RMS error of the windows, rad.
+        warnings: What the recordings do not determine, or what ended at a bound.
+        evaluations: Of the whole set of windows, Jacobians not counted.
+    """
+
+    robot: RobotSpec
+    before: float
+    after: float
+    warnings: tuple[str, ...]
+    evaluations: int
+
+
+def identify(
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    windows: int = WINDOWS,
+    nthread: int = 0,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+) -> Identified:
+    """Fit the parameters of all operated joints at once.
+
+    Args:
+        sequences: Recordings to fit on; validation and test motions stay out.
+        robot: Where to start from; its payloads' masses are taken as true.
+        windows: Free runs of 8 s, taken evenly from the recordings.
+        nthread: Threads, 0 for all cores.
+        progress: Called with evaluations done, at most, and the present RMS error in rad.
+    """
+    parts = cut(sequences, windows)
+    if not parts:
+        raise UsageError("no recording is longer than a second; identification needs longer ones")
+    problem = _Problem(parts, robot, nthread)
+    start = problem.start()
+    count = 0
+
+    def residual(x: Array) -> Array:
+        nonlocal count
+        count += 1
+        e = problem.errors(x[None])[0]
+        progress(count, EVALUATIONS, float(np.sqrt((e**2).mean())))
+        return e
+
+    low, high = problem.bounds()
+    fit = least_squares(
+        residual, start, problem.jacobian, bounds=(low, high), loss="soft_l1", f_scale=SOFT, max_nfev=EVALUATIONS,
+        xtol=1e-4, ftol=1e-4, x_scale="jac",
+    )  # fmt: skip
+    before, after = (float(np.sqrt((problem.errors(x[None])[0] ** 2).mean())) for x in (start, fit.x))
+    return Identified(problem.robot_of(fit.x), before, after, problem.doubts(fit.x, fit.jac, after), count)
+
+
+def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
+    """Windows of WINDOW seconds (shorter where a recording is), evenly picked."""
+    parts = []
+    for s in sequences:
+        rows = min(round(WINDOW / s.dt), len(s))
+        parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
+    parts = [p for p in parts if p.duration > 1.0]
+    return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+
+
+class _Problem:
+    """Windows, parameter vector ↔ robot, errors of many parameter vectors in one batch."""
+
+    def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
+        self.parts, self.robot, self.nthread = parts, robot, nthread
+        self.locked = idle_limbs(parts, robot)
+        self.op, self.n = robot.operated_index, len(robot.operated)
+        self.names = [(field, joint) for field in BOUNDS for joint in robot.operated]
+        self.conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
+        free = [j for j in robot.joint_names if j not in self.locked]
+        self.free, self.free_op = robot.index(free), np.array([free.index(j) for j in robot.operated])
+        rows = max(map(len, parts))
+        self.ctrl = np.stack([_held(s.ctrl[:, self.free], rows) for s in parts], axis=1).astype(float)
+        self.real = np.stack([_held(s.qpos[:, self.op], rows) for s in parts], axis=1).astype(float)
+        skip = np.array([[t >= SETTLE / s.dt and t < len(s) for s in parts] for t in range(rows)])
+        self.counted = np.repeat(skip[1:, :, None], self.n, axis=2)
+        model = build_model(robot)
+        dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
+        gain = robot.kp[self.op]
+        natural = gain * 0.05  # N·m·s/rad: a time constant of 50 ms
+        self.scale = {
+            "kp": gain,
+            "damping": np.maximum(model.dof_damping[dof], 0.2 * natural),
+            "frictionloss": np.maximum(model.dof_frictionloss[dof], 0.005 * gain),
+            "armature": np.maximum(model.dof_armature[dof], 1e-3),
+            "offset": np.full(self.n, 0.02),
+            "delay": np.full(self.n, 0.02),
+        }
+        self.first = {
+            "kp": gain, "damping": model.dof_damping[dof], "frictionloss": model.dof_frictionloss[dof],
+            "armature": model.dof_armature[dof], "offset": robot.offset[self.op], "delay": robot.delay[self.op],
+        }  # fmt: skip
+
+    def start(self) -> Array:
+        """The given robot, a little inside the bounds; one period late, since a delay of zero hides its gradient."""
+        first = self.first | {"delay": np.maximum(self.first["delay"], 0.02)}
+        low, high = self.bounds()
+        return np.clip(np.concatenate([first[f] / self.scale[f] for f in BOUNDS]), low + 1e-3, high - 1e-3)
+
+    def bounds(self) -> tuple[Array, Array]:
+        """(P,) each."""
+        return tuple(np.repeat([b[k] for b in BOUNDS.values()], self.n) for k in (0, 1))  # type: ignore[return-value]
+
+    def values(self, x: Array) -> dict[str, Array]:
+        """(…, P) → field: (…, n) in SI."""
+        parts = np.split(np.asarray(x), len(BOUNDS), axis=-1)
+        return {f: part * self.scale[f] for f, part in zip(BOUNDS, parts, strict=True)}
+
+    def robot_of(self, x: Array) -> RobotSpec:
+        """The robot with these parameters; joints that are not operated keep theirs."""
+        values = self.values(x)
+        return self.robot.with_servos(
+            {j: {f: float(f"{values[f][i]:.6g}") for f in BOUNDS} for i, j in enumerate(self.robot.operated)}
+        )
+
+    def errors(self, xs: Array) -> Array:
+        """Free-run errors q_sim − q_real of every counted row, (k, m), for parameter vectors (k, P)."""
+        k, m = len(xs), len(self.parts)
+        late = np.array(self.robot.delay)
+        late[self.op] = MAX_DELAY
+        sim = BatchSim(replace(self.robot, delay=late), self.conditions * k, self.nthread, self.locked)
+        self._write(sim, xs, m)
+        tile = np.tile(self.ctrl, (1, k, 1))
+        q0, v0 = (
+            np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel")
+        )
+        sim.reset(slice(None), q0, v0, past=tile[0][:, None])
+        out = np.empty((len(tile) - 1, k, m, self.n))
+        for t in range(len(out)):
+            sim.step(tile[t])
+            out[t] = sim.qpos[:, self.free_op].reshape(k, m, self.n) - self.real[t + 1]
+        return out.transpose(1, 0, 2, 3)[:, self.counted]
+
+    def _write(self, sim: BatchSim, xs: Array, m: int) -> None:
+        model, values = sim.models[self.conditions[0]], self.values(np.repeat(xs, m, axis=0))
+        joints = [model.joint(j) for j in self.robot.operated]
+        dof = np.array([j.dofadr[0] for j in joints])
+        act = np.array([model.actuator(j).id for j in self.robot.operated])
+        gain, bias = sim.batch.expand("actuator_gainprm"), sim.batch.expand("actuator_biasprm")
+        gain[:, act, 0], bias[:, act, 1] = values["kp"], -values["kp"]
+        bias[:, act, 0] = values["kp"] * values["offset"]
+        for name in ("damping", "frictionloss", "armature"):
+            sim.batch.expand(f"dof_{name}")[:, dof] = values[name]
+        sim.batch.expand("actuator_delay")[:, act] = values["delay"]
+
+    def jacobian(self, x: Array) -> Array:
+        """Forward differences towards the inside of the bounds, (m, P)."""
+        steps = np.repeat([b[2] for b in BOUNDS.values()], self.n)
+        steps = np.where(x + steps > self.bounds()[1], -steps, steps)
+        e = self.errors(np.concatenate([x[None], x + np.diag(steps)]))
+        return ((e[1:] - e[0]) / steps[:, None]).T
+
+    def doubts(self, x: Array, jac: Array, rms: float) -> tuple[str, ...]:
+        """Parameters at a bound, and those whose standard error exceeds half of what they may be."""
+        low, high = self.bounds()
+        found = []
+        # Errors of neighbouring rows are alike: about ten a second count as independent.
+        rows_per_error = max(1.0, 0.1 / float(np.median([s.dt for s in self.parts])))
+        covariance = np.linalg.pinv(jac.T @ jac) * rms**2 * rows_per_error
+        for (field, joint), value, error, a, b, scale in zip(
+            self.names, x, np.sqrt(np.diag(covariance)), low, high, np.concatenate(list(self.scale.values())),
+            strict=True,
+        ):  # fmt: skip
+            if (value - a < 1e-2 * (b - a) and a != 0) or b - value < 1e-2 * (b - a):
+                found.append(
+                    f"{joint}: {field} ended at its bound ({value * scale:.4g}); the model's form does not fit"
+                )
+            elif error > 0.5 * max(abs(value), 1.0):
+                found.append(
+                    f"{joint}: {field} {value * scale:.4g} ± {error * scale:.2g} is not determined by these logs"
+                )
+        return tuple(found)
+
+
+def _held(x: Array, rows: int) -> Array:
+    return np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])

@@ -1,0 +1,50 @@
+"""Identification finds the servo that made the recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import recordings, write_arm
+
+from gaponet.errors import UsageError
+from gaponet.sim.identify import cut, identify
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    robot = write_arm(tmp_path_factory.mktemp("arm"))
+    sequences = recordings(robot, 6, rows=200, kp=0.6, delay=2)
+    return robot, identify(sequences, robot, windows=6)
+
+
+def test_gain_and_delay_are_found(found):
+    robot, fit = found
+    np.testing.assert_allclose(fit.robot.kp, 0.6 * robot.kp, rtol=0.03)
+    np.testing.assert_allclose(fit.robot.delay, 0.04, atol=0.004)
+    np.testing.assert_allclose(fit.robot.offset, 0.0, atol=0.002)
+    assert fit.after < 0.05 * fit.before
+
+
+def test_the_nominal_robot_stays_what_it_is(tmp_path):
+    robot = write_arm(tmp_path)
+    fit = identify(recordings(robot, 4, rows=150), robot, windows=4)
+    np.testing.assert_allclose(fit.robot.kp, robot.kp, rtol=0.03)
+    assert fit.robot.delay.max() < 0.006  # a quarter of a control period
+    assert fit.after < 2e-3
+
+
+def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
+    robot = write_arm(tmp_path)
+    still = [replace(s, ctrl=np.zeros_like(s.ctrl)) for s in recordings(robot, 2, rows=100)]
+    still = [replace(s, qpos=np.zeros_like(s.qpos), qvel=np.zeros_like(s.qvel)) for s in still]
+    assert any("not determined" in w for w in identify(still, robot, windows=2).warnings)
+
+
+def test_windows_cover_all_recordings(tmp_path):
+    robot = write_arm(tmp_path)
+    sequences = recordings(robot, 5, rows=900)
+    parts = cut(sequences, 5)
+    assert len(parts) == 5
+    assert {p.meta.motion for p in parts} == {s.meta.motion for s in sequences}
+    with pytest.raises(UsageError, match="longer"):
+        identify([s.rows(slice(0, 20)) for s in sequences], robot)
