@@ -29,7 +29,7 @@ __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
 
 Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
 
-ROWS = 72  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
+ROWS = 144  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
 
 
 @dataclass(frozen=True)

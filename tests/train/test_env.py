@@ -76,7 +76,8 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
     before = env.get_observations()
-    env.qpos = env.qpos + 1.0
+    env.track[:, :4] += 1.0  # recorded q, q̇
+    env.now[:, :4] += 1.0
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])

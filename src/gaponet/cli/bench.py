@@ -14,7 +14,7 @@ def bench(
     what: tyro.conf.Positional[Literal["sim"]],
     robot: str = "so101",
     num_envs: int = 512,
-    rounds: int = 7,
+    rounds: int = 15,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Measure control steps per second; the ratio is what counts, machines differ.
@@ -23,7 +23,7 @@ def bench(
         what: sim.
         robot: Robot name or folder.
         num_envs: Simulations side by side.
-        rounds: Interleaved turns per contestant; medians are shown.
+        rounds: Interleaved turns of each; the fastest counts.
         json: One JSON object on stdout.
     """
     from gaponet.train.bench import bench_sim

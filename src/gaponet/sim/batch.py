@@ -29,7 +29,7 @@ class BatchSim:
         """One simulation per entry of `conditions`; nthread 0 uses all cores; n counts joints that are not locked."""
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
-        self.models = {c: build_model(robot, c[0], c[1], c[2], locked) for c in dict.fromkeys(conditions)}
+        self.models = {c: build_model(robot, c[0], c[1], c[2], locked, bare=True) for c in dict.fromkeys(conditions)}
         first = self.models[conditions[0]]
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
         expand_differences(self.batch, [self.models[c] for c in conditions])

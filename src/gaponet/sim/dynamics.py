@@ -26,10 +26,11 @@ def inverse_dynamics(model: mujoco.MjModel, qpos: Array, qvel: Array, qacc: Arra
     flags = model.opt.disableflags
     model.opt.disableflags = flags | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     tau = np.empty(np.shape(qpos))
+    q, v, a, out = data.qpos, data.qvel, data.qacc, data.qfrc_inverse  # views, looked up once
     for t in range(len(tau)):
-        data.qpos, data.qvel, data.qacc = qpos[t], qvel[t], qacc[t]
+        q[:], v[:], a[:] = qpos[t], qvel[t], qacc[t]
         mujoco.mj_inverse(model, data)
-        tau[t] = data.qfrc_inverse
+        tau[t] = out
     model.opt.disableflags = flags
     return tau
 

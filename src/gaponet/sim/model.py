@@ -25,6 +25,7 @@ def build_model(
     payload_side: str = "both",
     dt: float | None = None,
     locked: tuple[str, ...] = (),
+    bare: bool = False,
 ) -> mujoco.MjModel:
     """The nominal simulator of a robot with a payload.
 
@@ -38,12 +39,15 @@ def build_model(
         dt: Control period, s; default robot.dt.
         locked: Joints clamped at home; the model has no degree of freedom for them. On a fixed base, limbs that stand
             still cost time and change nothing (`idle_joints` finds them).
+        bare: For stepping, not for looking: without geoms that touch nothing and without the bodies of limbs that are
+            locked to the world. Moves the same, a sixth faster.
 
     Raises:
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
     spec = _read(robot)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: finding islands costs 10 %
     spec.option.timestep = (robot.dt if dt is None else _positive(dt)) / robot.decimation
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
@@ -51,6 +55,9 @@ def build_model(
     _set_joints(spec, robot)
     _lock(spec, robot, locked)
     _add_actuators(spec, robot, locked)
+    if bare:
+        spec.compiler.discardvisual = True
+        _remove_standing(spec, spec.worldbody, {mount.body for mount in robot.payload_mounts})
     _add_payload(spec, robot, payload_mass, payload_side)
     try:
         model = spec.compile()
@@ -148,6 +155,16 @@ def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> Non
         mujoco.mju_mulQuat(quat, np.array(joint.parent.quat), turn)
         joint.parent.pos, joint.parent.quat = np.array(joint.parent.pos) + offset, quat
         spec.delete(joint)
+
+
+def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:
+    """Delete what is fixed to a standing body and carries neither a joint nor a payload."""
+    for child in list(body.bodies):
+        limb = [child, *child.find_all("body")]
+        if not any(len(part.joints) or part.name in keep for part in limb):
+            spec.delete(child)
+        elif not len(child.joints):
+            _remove_standing(spec, child, keep)
 
 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:

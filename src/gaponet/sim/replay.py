@@ -15,6 +15,8 @@ from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import idle_joints, model_hash
 
 Array = np.ndarray
+CHUNK = 256  # simulations side by side
+
 Progress = Callable[[int, int], None]  # control steps done, total
 
 
@@ -49,19 +51,18 @@ def replay(
     Returns:
         One twin per sequence, in order.
     """
-    order = sorted(range(len(sequences)), key=lambda i: -len(sequences[i]))
+    locked = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     total = sum(len(s) - 1 for s in sequences)
     done = 0
     twins: dict[int, Twin] = {}
-    for chunk in _chunks(order, 256):
+    for chunk in _chunks(sequences, locked):
         part = [sequences[i] for i in chunk]
 
         def tell(k: int, before: int = done) -> None:
             if progress is not None:
                 progress(before + k, total)
 
-        locked = idle_limbs(part, robot) if lock_idle else ()
-        runs = _free_run(part, robot, corrector, nthread, tell, locked)
+        runs = _free_run(part, robot, corrector, nthread, tell, locked[chunk[0]])
         twins |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [twins[i] for i in range(len(sequences))]
@@ -69,15 +70,29 @@ def replay(
 
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
     """Joints of limbs that no command of these sequences moves away from home and that have no operated joint."""
-    away = np.stack([np.abs(s.ctrl - robot.qpos_home).max(axis=0) for s in sequences]).max(axis=0) > 1e-6
-    moved = {name for name, far in zip(robot.joint_names, away, strict=True) if far} | set(robot.operated)
-    return idle_joints(robot, tuple(moved))
+    return tuple(sorted(set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index))
 
 
-def _chunks(order: list[int], size: int) -> Iterator[list[int]]:
-    """Sequences of like length together, so that few simulations wait for a long one."""
-    for start in range(0, len(order), size):
-        yield order[start : start + size]
+def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:
+    """The same of each sequence alone."""
+    known: dict[frozenset[str], tuple[str, ...]] = {}
+    idle = []
+    for s in sequences:
+        away = np.abs(s.ctrl - robot.qpos_home).max(axis=0) > 1e-6
+        moved = frozenset(np.array(robot.joint_names)[away]) | set(robot.operated)
+        if moved not in known:
+            known[moved] = idle_joints(robot, tuple(moved))
+        idle.append(known[moved])
+    return idle
+
+
+def _chunks(sequences: ListOf[Sequence], locked: list[tuple[str, ...]]) -> Iterator[list[int]]:
+    """Sequences with the same limbs locked and of like length together, so that few simulations wait for a long one."""
+    for limbs in dict.fromkeys(locked):
+        group = [i for i, mine in enumerate(locked) if mine == limbs]
+        group.sort(key=lambda i: -len(sequences[i]))
+        for start in range(0, len(group), CHUNK):
+            yield group[start : start + CHUNK]
 
 
 def _free_run(

@@ -60,6 +60,7 @@ class DeltaEnv(VecEnv):
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
         self.last = np.zeros(num_envs, np.int64)
         self.previous = np.zeros((num_envs, self.num_actions), np.float32)
+        self.now = np.zeros((num_envs, self.track.shape[1]), np.float32)  # the recorded row, as in track
         self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
 
@@ -69,9 +70,12 @@ class DeltaEnv(VecEnv):
         free = [j for j in self.robot.joint_names if j not in self.locked]
         self.op = np.array([free.index(j) for j in self.robot.operated])
         self.ctrl, self.qpos, self.qvel = (
-            np.concatenate([getattr(s, name)[:, self.robot.index(free)] for s in sequences])
+            np.ascontiguousarray(np.concatenate([getattr(s, name)[:, self.robot.index(free)] for s in sequences]))
             for name in ("ctrl", "qpos", "qvel")
         )
+        # What every step looks up, of the operated joints: [q | q̇ | a], one row per recorded row.
+        recorded = [x[:, self.op] for x in (self.qpos, self.qvel, self.ctrl)]
+        self.track = np.ascontiguousarray(np.concatenate(recorded, axis=1), np.float32)  # take() copies anything else
         length = np.array([len(s) for s in sequences])
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
@@ -105,15 +109,15 @@ class DeltaEnv(VecEnv):
         self.history.reset(ids, self.qpos[before][..., op], self.qvel[before][..., op], self.ctrl[before][..., op])
         self.previous[ids] = 0.0
         self.episode_length_buf[ids] = 0
+        self.now[ids] = self.track[t]
 
     def get_observations(self) -> TensorDict:
         """Actor and critic observations of the present row."""
-        op = self.op
+        op, state = self.op, 2 * self.num_actions
         o = self.history.observe(self.sim.qpos[:, op], self.sim.qvel[:, op], self.payload)
-        actor = np.concatenate([o, self.ctrl[self.row][:, op]], axis=1)
-        now, then = self.row, self.row + 1
-        truth = [x[r][:, op] for r in (now, then) for x in (self.qpos, self.qvel)]
-        critic = np.concatenate([actor, *truth, self.condition_features], axis=1, dtype=np.float32)
+        actor = np.concatenate([o, self.now[:, state:]], axis=1)
+        then = self.track.take(self.row + 1, axis=0)
+        critic = np.concatenate([actor, self.now[:, :state], then[:, :state], self.condition_features], axis=1)
         return TensorDict(
             {"actor": torch.from_numpy(actor), "critic": torch.from_numpy(critic)}, batch_size=[self.num_envs]
         )
@@ -134,19 +138,23 @@ class DeltaEnv(VecEnv):
     def advance(self, delta: Array) -> None:
         """One control period of all simulations, without reward or reset; delta (num_envs, n_operated)."""
         op, n = self.op, self.sim
-        target = self.ctrl[self.row].astype(float)
+        target = self.ctrl.take(self.row, axis=0).astype(float)
         target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])
         self.history.push(n.qpos[:, op], n.qvel[:, op], target[:, op])
         n.step(target)
         self.row += 1
+        self.track.take(self.row, axis=0, out=self.now)
         self.episode_length_buf += 1
 
     def _reward(self, delta: Array) -> Array:
-        c, op = self.reward_config, self.op
-        error = self.sim.qpos[:, op] - self.qpos[self.row][:, op]
-        speed = self.sim.qvel[:, op] - self.qvel[self.row][:, op]
-        cost = c.position * (error**2).mean(1) + c.velocity * (speed**2).mean(1)
-        cost += c.delta * (delta**2).mean(1) + c.delta_rate * ((delta - self.previous) ** 2).mean(1)
+        c, op, n = self.reward_config, self.op, self.num_actions
+        terms = [
+            (c.position, self.sim.qpos[:, op] - self.now[:, :n]),
+            (c.velocity, self.sim.qvel[:, op] - self.now[:, n : 2 * n]),
+            (c.delta, delta),
+            (c.delta_rate, delta - self.previous),
+        ]
+        cost = sum(weight / n * np.einsum("ij,ij->i", x, x) for weight, x in terms)
         self.reward_sum -= float(cost.mean())
         self.reward_count += 1
         return (-cost).astype(np.float32)

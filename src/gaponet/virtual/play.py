@@ -83,7 +83,7 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
         reading = robots.read()
         seen[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
         robots.step(targets[t], np.arange(int((lengths > t).sum())))
-    models = {p: build_model(job.robot, *p, dt) for p in dict.fromkeys(payloads)}
+    models = {p: build_model(job.robot, *p, dt, bare=True) for p in dict.fromkeys(payloads)}
     sequences = []
     for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
         qpos, qvel, tau, temperature = seen[:, : len(c), i]

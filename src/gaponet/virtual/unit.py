@@ -263,10 +263,8 @@ def _models(
     for unit, (mass, side) in zip(units, payloads, strict=True):
         key = (id(unit), mass, side)
         if key not in made:
-            model = build_model(robot, mass, side, dt, locked)
+            model = build_model(robot, mass, side, dt, locked, bare=True)
             model.opt.timestep = timestep
-            if len(set(model.dof_treeid.tolist())) == 1:  # nothing to split: looking for islands costs a tenth
-                model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
             _edit(model, robot, unit, locked)
             made[key] = model
     return [made[id(u), m, s] for u, (m, s) in zip(units, payloads, strict=True)]
