@@ -4,9 +4,9 @@
 
 Plays some motions of the simlifter recipe (joint, upper body and whole body in the recipe's own shares, all payloads,
 units, rates and repetitions), then the twins of what was recorded, and prints one JSON object with × real time, memory,
-size on disk, and what that makes for the whole recipe. On a machine that does other work too, look at the figures per CPU
-second, which hold for each core that is free, and at mj_step_us, a plain MuJoCo loop on one core just before and after:
-the yardstick of how fast the machine was at the time.
+size on disk, and what that makes for the whole recipe. On a machine that does other work too, look at the figures per
+CPU second, which hold for each core that is free, and at mj_step_us, a plain MuJoCo loop on one core just before and
+after: the yardstick of how fast the machine was at the time.
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ def build_model(
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
     spec = _read(robot)
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: finding islands costs 10 %
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     spec.option.timestep = (robot.dt if dt is None else _positive(dt)) / robot.decimation
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF

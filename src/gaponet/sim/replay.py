@@ -51,7 +51,7 @@ def replay(
     Returns:
         One twin per sequence, in order.
     """
-    locked = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
+    locked: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
     total = sum(len(s) - 1 for s in sequences)
     done = 0
     twins: dict[int, Twin] = {}
