@@ -14,9 +14,14 @@ from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 
-UNITS = {
-    "kp": "N·m/rad", "damping": "N·m·s/rad", "frictionloss": "N·m", "armature": "kg·m²", "offset": "rad", "delay": "s",
-}  # fmt: skip
+COLUMNS = {  # field → heading, factor from SI
+    "kp": ("kp\nN·m/rad", 1.0),
+    "damping": ("damping\nN·m·s/rad", 1.0),
+    "frictionloss": ("friction\nN·m", 1.0),
+    "armature": ("armature\ng·m²", 1e3),
+    "offset": ("offset\nmrad", 1e3),
+    "delay": ("delay\nms", 1e3),
+}
 
 
 def identify(
@@ -67,8 +72,8 @@ def identify(
     values: dict[str, Any] = {
         j: {f: float(getattr(found.robot, f)[spec.joint_names.index(j)]) for f in BOUNDS} for j in spec.operated
     }
-    screen.table("Identified servos", ["joint", *(f"{f}, {UNITS[f]}" for f in BOUNDS)], [
-        [j, *(f"{v:.4g}" for v in values[j].values())] for j in spec.operated
+    screen.table("Identified servos", ["joint", *(COLUMNS[f][0] for f in BOUNDS)], [
+        [j, *(f"{v * COLUMNS[f][1]:.3g}" for f, v in values[j].items())] for j in spec.operated
     ])  # fmt: skip
     for warning in found.warnings:
         screen.say(f"[yellow]warning[/]  {escape(warning)}")

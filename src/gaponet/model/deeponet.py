@@ -13,16 +13,16 @@ from torch import Tensor, nn
 from gaponet.model.config import ModelConfig
 
 
-def dense(inputs: int, hidden: Sequence[int], outputs: int, last: float | None = None) -> nn.Sequential:
-    """Linear layers with ELU between; the last one starts within ±`last` where that is given."""
+def dense(inputs: int, hidden: Sequence[int], outputs: int, zero: bool = False) -> nn.Sequential:
+    """Linear layers with ELU between; with `zero` it starts by answering 0."""
     layers: list[nn.Module] = []
     for width in hidden:
         layers += [nn.Linear(inputs, width), nn.ELU()]
         inputs = width
     head = nn.Linear(inputs, outputs)
-    if last is not None:
-        nn.init.uniform_(head.weight, -last, last)
-        nn.init.uniform_(head.bias, -last, last)
+    if zero:
+        nn.init.zeros_(head.weight)
+        nn.init.zeros_(head.bias)
     return nn.Sequential(*layers, head)
 
 
@@ -123,7 +123,7 @@ class OperatorNet(nn.Module):
             config.branch_hidden,
             outputs,
         )
-        self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, last=0.003)
+        self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
         self.bounded = Bounded(config.delta_max)
         # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is
@@ -182,7 +182,7 @@ class DeltaMLP(nn.Module):
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
-        self.net = dense(self.features.dim, config.mlp_hidden, n, last=0.003)
+        self.net = dense(self.features.dim, config.mlp_hidden, n, zero=True)
         self.bounded = Bounded(config.delta_max)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -33,8 +33,8 @@ SETTLE = 0.1  # s: velocities at a window's start are measured ones
 BOUNDS = {
     "kp": (0.2, 8.0, 0.02),
     "damping": (0.0, 10.0, 0.02),
-    "frictionloss": (0.0, 10.0, 0.05),
-    "armature": (0.02, 10.0, 0.05),
+    "frictionloss": (0.0, 40.0, 0.05),
+    "armature": (0.002, 10.0, 0.05),
     "offset": (-10.0, 10.0, 0.1),
     "delay": (0.0, MAX_DELAY / 0.02, 0.25),
 }
