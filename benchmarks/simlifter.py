@@ -2,10 +2,10 @@
 
     python benchmarks/simlifter.py [--motions 16] [--nproc 2]
 
-1. Speed and size. Plays some motions of the simlifter recipe (joint, upper body and whole body in the recipe's own
-   shares, all payloads, units, rates and repetitions; 16 motions are a tenth of it), then the twins of what was
-   recorded. On a machine that does other work too, look at the figures per CPU second, which hold for each core that is
-   free, and at mj_step_us, a plain MuJoCo loop on one core just before and after: how fast the machine was at the time.
+1. Speed and size. Plays some motions of the simlifter recipe with their twins (joint, upper body, whole body in the
+   recipe's own shares, all payloads, units, rates and repetitions; 16 motions: a tenth of it). On a machine that does
+   other work too, look at the figure per CPU second, which holds for each core that is free, and at mj_step_us, a plain
+   MuJoCo loop on one core just before and after: how fast the machine was at the time.
 2. Gap. Units 1 to 4, every payload, motions spread over the recipe: mean |q_sim − q_robot| by joint in free run of the
    nominal simulator, and the spread over repetitions beside it.
 
@@ -83,35 +83,26 @@ def speed(robot: RobotSpec, names: list[str], count: int, nproc: int) -> dict[st
         part = replace(recipe, motions=spread(names, count))
         done = collect(robot, load_fleet("default", robot), part, out, nproc=nproc)
         cpu.append(cpu_s())
-        size = sum(f.stat().st_size for f in out.rglob("*") if f.is_file())
-        dataset = Dataset(out)
-        channels = sorted(set.intersection(*(set(e.channels) for e in dataset.entries)))
-        start = time.monotonic()
-        for k in range(0, len(dataset), 256):
-            replay(dataset.sequences(dataset.entries[k : k + 256]), robot, nthread=nproc, lock_idle=True)
-        twins_s = time.monotonic() - start
-        cpu.append(cpu_s())
+        size, twins_size = (sum(f.stat().st_size for f in (out / d).rglob("*.parquet")) for d in (".", "twins"))
+        channels = sorted(set.intersection(*(set(e.channels) for e in Dataset(out).entries)))
     recorded_s = done.hours * 3600
     length = {name: library.make(name).duration for name in names}
     hours = sum(length[t.motion] for t in takes(recipe, names)) / 3600
-    both = recorded_s / (done.wall_s + twins_s)
     return {
         "motions": part.motions,
         "sequences": done.written,
         "hours": done.hours,
         "channels": channels,
-        "fleet_times_real_time": done.times_real_time,
-        "twins_times_real_time": recorded_s / twins_s,
-        "both_times_real_time": both,
-        "fleet_per_cpu_s": recorded_s / (cpu[1] - cpu[0]),
-        "both_per_cpu_s": recorded_s / (cpu[2] - cpu[0]),
+        "times_real_time": done.times_real_time,
+        "recorded_s_per_cpu_s": recorded_s / (cpu[1] - cpu[0]),
         "load_average_before": load,
         "mj_step_us": [*yardstick, mj_step_us()],
         "peak_memory_gib": memory_gib(),
         "bytes_on_disk": size,
+        "bytes_of_twins": twins_size,
         "simlifter_sequences": len(takes(recipe, names)),
         "simlifter_hours": hours,
-        "simlifter_wall_minutes": hours * 60 / both,
+        "simlifter_wall_minutes": hours * 60 / done.times_real_time,
         "simlifter_gb": size / recorded_s * hours * 3.6e-6,
     }
 
@@ -123,7 +114,7 @@ def gap(robot: RobotSpec, names: list[str], nproc: int) -> tuple[dict[str, Any],
         load_recipe("simlifter"), motions=spread(upper, 12), units=UNITS, rates=(50.0,), repetitions=2
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        collect(robot, load_fleet("default", robot), recipe, Path(folder) / "data", nproc=nproc)
+        collect(robot, load_fleet("default", robot), recipe, Path(folder) / "data", nproc=nproc, twins=False)
         sequences = Dataset(Path(folder) / "data").sequences()
     twins = replay(sequences, robot, nthread=nproc, lock_idle=True)
     both = runs(sequences, [t.qpos for t in twins], robot)
@@ -170,16 +161,11 @@ Regenerate: `python benchmarks/simlifter.py`.
 A tenth of the `simlifter` recipe: {s["sequences"]} sequences, {s["hours"]:.2f} h, with
 {", ".join(f"`{c}`" for c in s["channels"])}.
 
-| | × real time |
-| --- | ---: |
-| fleet (`gaponet collect`) | {s["fleet_times_real_time"]:.1f} |
-| nominal twins | {s["twins_times_real_time"]:.1f} |
-| both | {s["both_times_real_time"]:.1f} |
-
-Per CPU second {s["fleet_per_cpu_s"]:.1f} s of fleet, {s["both_per_cpu_s"]:.1f} s with twins. The machine at the
-time: one mj_step of the nominal H1-2 took {yard} µs before and after. Peak memory {s["peak_memory_gib"]:.2f} GiB,
-{s["bytes_on_disk"] / 1e6:.0f} MB on disk. The whole recipe at this rate: {s["simlifter_sequences"]} sequences,
-{s["simlifter_hours"]:.1f} h, {s["simlifter_wall_minutes"]:.0f} minutes, {s["simlifter_gb"]:.1f} GB.
+Robots and twins together: **{s["times_real_time"]:.1f} × real time**, {s["recorded_s_per_cpu_s"]:.1f} s recorded
+per CPU second. The machine at the time: one mj_step of the nominal H1-2 took {yard} µs before and after. Peak memory
+{s["peak_memory_gib"]:.2f} GiB, {s["bytes_on_disk"] / 1e6:.0f} MB on disk, {s["bytes_of_twins"] / 1e6:.0f} of them
+twins. The whole recipe at this rate: {s["simlifter_sequences"]} sequences, {s["simlifter_hours"]:.1f} h,
+{s["simlifter_wall_minutes"]:.0f} minutes, {s["simlifter_gb"]:.1f} GB.
 
 ## Gap of the nominal simulator, mrad
 
@@ -203,11 +189,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--motions", type=int, default=16, help="how many of the recipe's")
     parser.add_argument("--nproc", type=int, default=os.cpu_count())
+    parser.add_argument("--speed-only", action="store_true", help="print the speed and write nothing")
     parser.add_argument("--out", type=Path, default=DOCS)
     args = parser.parse_args()
     robot, recipe = load_robot("h1_2"), load_recipe("simlifter")
     names = list(dict.fromkeys(t.motion for t in takes(recipe, Library(robot).names(recipe.variants))))
     measured = speed(robot, names, args.motions, args.nproc)
+    if args.speed_only:
+        print(json.dumps(measured, indent=1))
+        return 0
     found, drawn = gap(robot, names, args.nproc)
     result = {"virtual": True, "speed": measured, "gap": found}
     args.out.mkdir(parents=True, exist_ok=True)

@@ -14,14 +14,18 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
+from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset, write_text
 from gaponet.errors import DatasetError
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.robot import RobotSpec
+from gaponet.sim.pairing import pair_dataset
+from gaponet.sim.replay import replay
 from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.play import Job, library, play
 
@@ -29,7 +33,7 @@ __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
 
 Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
 
-ROWS = 144  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
+ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ def collect(
     seed: int = 0,
     nproc: int = 0,
     progress: Progress | None = None,
+    twins: bool = True,
 ) -> Collected:
     """Record every take of a recipe that the dataset at `out` does not hold yet.
 
@@ -68,6 +73,7 @@ def collect(
         nproc: Processes; 0 for one per core, 1 for none beside this one. More than one starts fresh interpreters: a
             script that calls this needs `if __name__ == "__main__":`.
         progress: Called after each sequence.
+        twins: Store the nominal twin of each sequence beside it, limbs that stand still locked in both.
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.
@@ -84,9 +90,14 @@ def collect(
         present = {_key(m.motion, m.unit_id, m.payload_mass, dt, m.repetition) for m, dt in _listed(dataset)}
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
         written, seconds = 0, 0.0
-        jobs = [Job(robot, fleet, recipe, seed, tuple(part)) for part in _parts(missing)]
-        for sequence in _record(jobs, nproc or os.cpu_count() or 1):
-            dataset.append(sequence)
+        nproc = nproc or os.cpu_count() or 1
+        jobs = [Job(robot, fleet, recipe, seed, tuple(part)) for part in _parts(missing, nproc)]
+        if twins:
+            pair_dataset(dataset, robot, lock_idle=True)  # those that a killed run had no time for
+        for sequence, twin in _record(jobs, nproc, twins):
+            entry = dataset.append(sequence)
+            if twin is not None:
+                dataset.write_twin(entry, twin)
             written += 1
             seconds += sequence.duration
             if progress:
@@ -144,31 +155,42 @@ def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, see
         write_text(path, json.dumps(mine, indent=1) + "\n")
 
 
-def _parts(missing: list[Take]) -> Iterator[list[Take]]:
-    """Whole motions at one rate together, up to about ROWS takes."""
+def _parts(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
+    """Whole motions at one rate together; fewer of them towards the end, so that no process waits long for the last."""
     by_rate: dict[float, dict[str, list[Take]]] = {}
     for take in missing:
         by_rate.setdefault(take.rate, {}).setdefault(take.motion, []).append(take)
+    left = len(missing)
     for _, motions in sorted(by_rate.items()):  # by rate, so that a resumed run keeps the order
         part: list[Take] = []
         for group in motions.values():
-            if part and len(part) + len(group) > ROWS:
+            if part and len(part) + len(group) > min(max(left // (2 * nproc), ROWS[0]), ROWS[1]):
                 yield part
+                left -= len(part)
                 part = []
             part = part + group
         if part:
             yield part
+            left -= len(part)
 
 
-def _record(jobs: list[Job], nproc: int) -> Iterator[Sequence]:
+def _record(jobs: list[Job], nproc: int, twins: bool) -> Iterator[tuple[Sequence, Twin | None]]:
     """Sequences in the jobs' order, whichever process is first."""
     if nproc == 1 or len(jobs) < 2:
         for job in jobs:
-            yield from play(job)
+            yield from _played(job, twins)
         return
     with ProcessPoolExecutor(min(nproc, len(jobs)), get_context("spawn"), _leave_with, (os.getpid(),)) as pool:
-        for sequences in pool.map(play, jobs):
-            yield from sequences
+        for played in pool.map(partial(_played, twins=twins), jobs):
+            yield from played
+
+
+def _played(job: Job, twins: bool) -> list[tuple[Sequence, Twin | None]]:
+    """The takes of a job and their twins, on one core."""
+    sequences = play(job)
+    if not twins:
+        return [(s, None) for s in sequences]
+    return list(zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True))
 
 
 def _leave_with(parent: int) -> None:

@@ -22,7 +22,7 @@ def collect(
     nproc: int = 0,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset.
+    """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset, each with its nominal twin.
 
     Run again after an interruption: what is there is kept, what is missing is recorded, and the result is the same.
 

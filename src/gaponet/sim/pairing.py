@@ -11,11 +11,16 @@ BATCH = 64  # sequences replayed together; what an interruption can cost
 
 
 def pair_dataset(
-    dataset: Dataset, robot: RobotSpec, progress: Progress | None = None, entries: list[Entry] | None = None
+    dataset: Dataset,
+    robot: RobotSpec,
+    progress: Progress | None = None,
+    entries: list[Entry] | None = None,
+    lock_idle: bool = False,
 ) -> int:
     """Replay the sequences that have no twin for this simulator yet, and store the twins; returns how many.
 
-    All sequences, or only some. Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
+    All sequences, or only some; `lock_idle` as in replay.
+    Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
     """
     dataset.require_robot(robot)
     digest = model_hash(robot)
@@ -28,7 +33,7 @@ def pair_dataset(
             if progress is not None:
                 progress(before + k, total)
 
-        twins = replay(dataset.sequences(part), robot, progress=tell)
+        twins = replay(dataset.sequences(part), robot, progress=tell, lock_idle=lock_idle)
         for entry, twin in zip(part, twins, strict=True):
             dataset.write_twin(entry, twin)
         done += sum(e.rows - 1 for e in part)
