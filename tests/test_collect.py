@@ -18,6 +18,7 @@ from gaponet.errors import DatasetError, UsageError
 from gaponet.motion.library import Library
 from gaponet.motion.recipe import takes
 from gaponet.robot import load_robot
+from gaponet.sim.model import model_hash
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics
 
@@ -129,7 +130,7 @@ from gaponet.collect import Recipe, collect
 from gaponet.robot import load_robot
 from gaponet.virtual.fleet import load_fleet
 if __name__ == "__main__":
-    gaponet.collect.ROWS = 4  # four jobs: the last two are still being played when the first two are written
+    gaponet.collect.ROWS = (4, 4)  # four jobs: the last two are still being played when the first two are written
     robot = load_robot(sys.argv[1])
     recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
     collect(robot, load_fleet("default", robot), recipe, sys.argv[2], seed=5, nproc=2)
@@ -160,6 +161,8 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     assert list(hashes(out).items()) == list(hashes(whole[0]).items())
     assert len(list((out / "sequences").glob("*.parquet"))) == 16
     assert not list((out / "sequences").glob(".*"))
+    dataset = Dataset(out)
+    assert all(dataset.has_twin(entry, model_hash(spec)) for entry in dataset.entries)
 
 
 def _wait_for_orphans(session):

@@ -118,7 +118,7 @@ def _page(
     ratio = metrics["ratio_to_nominal"]
     body = [
         f"<h1>{html.escape(robot.description)}: {name}</h1><p>{tag} {_facts_line(card, metrics)}</p>",
-        f'<p class="lead">{_verdict(name, kind, methods, ratio)}</p>',
+        f'<p class="lead">{_verdict(draw.NAMES, kind, methods, ratio)}</p>',
         *(f'<div class="warn">{html.escape(text)}</div>' for text in warnings(card, metrics)),
         "<h2>Errors, whole-motion free run on held-out recordings</h2>" if metrics["unseen"]
         else "<h2>Errors, whole-motion free run (some recordings were used in training)</h2>",
@@ -191,12 +191,12 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
     return out
 
 
-def _verdict(name: str, kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
+def _verdict(names: dict[str, str], kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
     own, base = methods[kind]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
     change = f"{abs(1 - ratio[kind]) * 100:.0f} % {'less' if ratio[kind] <= 1 else 'MORE'} error"
-    text = f"{name} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
-    others = [f"{n} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
-    return text + (f" ({', '.join(o.replace('_', ' + ') for o in others)} mrad)." if others else ".")
+    text = f"{names[kind]} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
+    others = [f"{names[n]} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
+    return text + (f" ({', '.join(others)} mrad)." if others else ".")
 
 
 def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> str:
