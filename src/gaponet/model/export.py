@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import logging
 import warnings
 from pathlib import Path
 from typing import Any
@@ -36,13 +35,12 @@ def export(net: OperatorNet | DeltaMLP, folder: Path, card: dict[str, Any], samp
     folder.mkdir(parents=True, exist_ok=True)
     frozen = copy.deepcopy(net).eval()
     temporary = folder / f".{WEIGHTS}.tmp"
-    example = torch.from_numpy(samples[:2])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        # Through torch.export (dynamo=True) it takes 5 to 11 s instead of 0.2 and writes the same function.
         torch.onnx.export(
-            frozen, (example,), temporary, input_names=["x"], output_names=["delta"], dynamo=True, verbose=False,
-            external_data=False, dynamic_shapes={"x": {0: torch.export.Dim("batch")}},
+            frozen, (torch.from_numpy(samples[:2]),), temporary, input_names=["x"], output_names=["delta"],
+            dynamo=False, dynamic_axes={"x": {0: "batch"}, "delta": {0: "batch"}},
         )  # fmt: skip
     try:
         answer = infer_session(temporary)(samples)

@@ -1,4 +1,4 @@
-"""One training run, start to artifact: split, sensors, warm start, PPO, the best model on validation, export.
+"""One training run: split, sensors, warm start, PPO, the best model on validation, its gain, export.
 
 RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
 RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
@@ -37,6 +37,7 @@ from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
 from gaponet.train.config import TrainConfig
 from gaponet.train.env import DeltaEnv
+from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
 from gaponet.train.ppo import make_runner, update
 from gaponet.train.warm_start import WarmStart, fit_sensors
@@ -121,6 +122,7 @@ class Trainer:
             if self.config.warm_start.rounds > self.rounds_done:
                 self._warm_start()
             self._ppo()
+            self._shrink()
         except KeyboardInterrupt:
             self.interrupted = True
         return self.finish()
@@ -179,6 +181,15 @@ class Trainer:
         self.runner_state = runner.alg.save()
         self._consider()
 
+    def _shrink(self) -> None:
+        """Less of the best correction, joint by joint, where validation motions say so."""
+        self.stage = "gain"
+        self._tick()
+        self.net = build_network(self.config.model, self.n)
+        self.net.load_state_dict(self.best_state)
+        choose_gain(self.net, lambda: self.errors(self.net))
+        self._consider()
+
     def finish(self) -> GapModel:
         """Export the best model and write its card."""
         self.stage = "export"
@@ -194,17 +205,21 @@ class Trainer:
 
     # ---- validation, checkpoints, card
 
-    def validate(self, net: torch.nn.Module | None) -> float:
-        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
+    def errors(self, net: torch.nn.Module | None) -> Array:
+        """Mean |error| of each operated joint in whole-motion free runs over the validation motions, (n,) rad.
 
-        Nominal is the simulator before identification, also where training starts from an identified one.
+        None is the nominal simulator: before identification, also where training starts from an identified one.
         """
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
         twins = replay(picked, simulator, corrector, lock_idle=True)
         op = self.robot.operated_index
-        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
+        return np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean(0) for s, t in zip(picked, twins, strict=True)], axis=0)
+
+    def validate(self, net: torch.nn.Module | None) -> float:
+        """MPJAE of the same runs, rad."""
+        return float(self.errors(net).mean())
 
     def _consider(self) -> None:
         """Validate the present network, keep it if it is the best, write progress and checkpoint."""
@@ -288,6 +303,7 @@ class Trainer:
             val_mpjae={"model": self.best, "nominal": self.nominal},
             sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
             seed=self.config.seed,
+            gain=dict(zip(self.robot.operated, self.best_state["bounded.gain"].tolist(), strict=True)),
             excess_delay=max(self.baseline.delay.values()),
             steps=self.steps,
             seconds=round(self.seconds(), 1),

@@ -1,0 +1,87 @@
+"""gaponet runs."""
+
+from __future__ import annotations
+
+import json as js
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+
+
+def runs(
+    folder: tyro.conf.Positional[Path] = Path("."),
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """List the training runs below a folder with their held-out numbers, best first.
+
+    Args:
+        folder: Where to look; run folders may lie at any depth.
+        json: One JSON object on stdout.
+    """
+    found = [
+        _facts(p.parent, folder) for p in sorted(folder.rglob("config.json")) if (p.parent / "split.json").is_file()
+    ]
+    if not found:
+        raise UsageError(f"{folder}: no run here or below (a run has config.json and split.json); train one first")
+    found.sort(key=lambda r: r["val_ratio"] if r["val_ratio"] is not None else float("inf"))
+    screen = Out(json)
+    screen.table(
+        f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
+        ["run", "model", "seed", "minutes", "validation", "evaluated"],
+        [
+            [r["run"], r["model"], str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",
+             _error(r["val_mpjae"], r["val_ratio"]), _error(r["test_mpjae"], r["test_ratio"])]
+            for r in found
+        ],
+    )  # fmt: skip
+    if any(r["virtual"] for r in found):
+        screen.say("Runs marked V were trained on VIRTUAL robots.")
+    screen.result({"runs": found})
+
+
+def _facts(run: Path, folder: Path) -> dict[str, Any]:
+    """What the files of a run say; None where they do not say it yet."""
+    config = js.loads((run / "config.json").read_text(encoding="utf-8"))
+    card, metrics = _read(run / "model" / "card.json"), _read(run / "metrics.json")
+    kind, last = config["model"]["kind"], _last(run / "progress.jsonl")
+    val = card.get("val_mpjae", {"model": last.get("best"), "nominal": last.get("nominal_mpjae")})
+    own = metrics.get("methods", {}).get(kind, {}).get("mpjae")
+    virtual = bool(card.get("virtual", False))
+    return {
+        "run": str(run.relative_to(folder)) + (" V" if virtual else ""),
+        "model": kind,
+        "seed": config["seed"],
+        "robot": config["robot"],
+        "virtual": virtual,
+        "dataset_hash": config["dataset_hash"],
+        "simulator": card.get("simulator_hash") or metrics.get("simulator_hash"),
+        "hours": card.get("hours"),
+        "steps": card.get("steps", last.get("steps")),
+        "seconds": card.get("seconds", last.get("seconds")),
+        "finished": bool(card) and not card.get("interrupted", False),
+        "val_mpjae": val["model"],
+        "val_ratio": val["model"] / val["nominal"] if val["model"] and val["nominal"] else None,
+        "evaluated_on": metrics.get("dataset"),
+        "test_mpjae": own,
+        "test_ratio": metrics.get("ratio_to_nominal", {}).get(kind),
+    }
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return js.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def _last(path: Path) -> dict[str, Any]:
+    """The newest line of a training curve, and the best validation so far."""
+    if not path.is_file():
+        return {}
+    lines = [js.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return (lines[-1] | {"best": min(line["val_mpjae"] for line in lines)}) if lines else {}
+
+
+def _error(mpjae: float | None, ratio: float | None) -> str:
+    return "" if mpjae is None or ratio is None else f"{mpjae * 1e3:.2f} ({ratio:.2f})"
