@@ -91,15 +91,15 @@ class SensorPredictor(nn.Module):
 class Bounded(nn.Module):
     """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
 
-    The gain, (n,), is 1 while training; train/gain.py lowers it where less of a correction does better.
+    The gain is 1 while training; train/gain.py lowers it where less of a correction does better.
     """
 
     gain: Tensor
 
-    def __init__(self, delta_max: float, n: int) -> None:
+    def __init__(self, delta_max: float) -> None:
         super().__init__()
         self.delta_max = delta_max
-        self.register_buffer("gain", torch.ones(n))
+        self.register_buffer("gain", torch.tensor(1.0))
 
     def forward(self, y: Tensor) -> Tensor:
         return self.delta_max * torch.tanh(self.gain * y / self.delta_max)
@@ -131,7 +131,7 @@ class OperatorNet(nn.Module):
         )
         self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
-        self.bounded = Bounded(config.delta_max, n)
+        self.bounded = Bounded(config.delta_max)
         # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is
         # unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
         self.sample_sensors = False
@@ -189,7 +189,7 @@ class DeltaMLP(nn.Module):
         self.config, self.n = config, n
         self.features = Features(config, n)
         self.net = dense(self.features.dim, config.mlp_hidden, n, zero=True)
-        self.bounded = Bounded(config.delta_max, n)
+        self.bounded = Bounded(config.delta_max)
 
     def forward(self, x: Tensor) -> Tensor:
         """x = [o_t | a_t] → Δa, (B, n), rad."""

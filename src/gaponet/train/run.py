@@ -182,12 +182,12 @@ class Trainer:
         self._consider()
 
     def _shrink(self) -> None:
-        """Less of the best correction, joint by joint, where validation motions say so."""
+        """Less of the best correction where validation motions say so."""
         self.stage = "gain"
         self._tick()
         self.net = build_network(self.config.model, self.n)
         self.net.load_state_dict(self.best_state)
-        choose_gain(self.net, lambda: self.errors(self.net))
+        choose_gain(self.net, lambda: self.validate(self.net))
         self._consider()
 
     def finish(self) -> GapModel:
@@ -205,21 +205,17 @@ class Trainer:
 
     # ---- validation, checkpoints, card
 
-    def errors(self, net: torch.nn.Module | None) -> Array:
-        """Mean |error| of each operated joint in whole-motion free runs over the validation motions, (n,) rad.
+    def validate(self, net: torch.nn.Module | None) -> float:
+        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
 
-        None is the nominal simulator: before identification, also where training starts from an identified one.
+        Nominal is the simulator before identification, also where training starts from an identified one.
         """
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
         twins = replay(picked, simulator, corrector, lock_idle=True)
         op = self.robot.operated_index
-        return np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean(0) for s, t in zip(picked, twins, strict=True)], axis=0)
-
-    def validate(self, net: torch.nn.Module | None) -> float:
-        """MPJAE of the same runs, rad."""
-        return float(self.errors(net).mean())
+        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 
     def _consider(self) -> None:
         """Validate the present network, keep it if it is the best, write progress and checkpoint."""
@@ -303,7 +299,7 @@ class Trainer:
             val_mpjae={"model": self.best, "nominal": self.nominal},
             sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
             seed=self.config.seed,
-            gain=dict(zip(self.robot.operated, self.best_state["bounded.gain"].tolist(), strict=True)),
+            gain=self.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
             steps=self.steps,
             seconds=round(self.seconds(), 1),
