@@ -108,8 +108,12 @@ class RobotSpec:
 
     @property
     def decimation(self) -> int:
-        """Physics steps per control period."""
-        return round(self.dt / self.timestep)
+        """Physics steps per control period of dt."""
+        return self.steps_per(self.dt)
+
+    def steps_per(self, dt: float) -> int:
+        """Physics steps per control period of another length, s: as many as keep a step close to `timestep`."""
+        return max(1, round(dt / self.timestep))
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
         """The same robot with identified values: joint → any of kp, damping, armature, frictionloss, delay, offset."""

@@ -27,7 +27,7 @@ def test_a_batch_is_bit_identical_to_mj_step(tmp_path):
         data.qpos[:] = start[i]
         for target in targets:
             data.ctrl[:] = target[i]
-            mujoco.mj_step(model, data, robot.decimation)
+            mujoco.mj_step(model, data, robot.steps_per(dt))
         np.testing.assert_array_equal(sim.qpos[i], data.qpos)
         np.testing.assert_array_equal(sim.qvel[i], data.qvel)
 
@@ -38,8 +38,9 @@ def test_targets_beyond_the_joint_range_are_clipped(tmp_path):
     np.testing.assert_array_equal(sim.ctrl, [[1.5, -1.5]])
 
 
-def test_simulations_left_out_of_a_step_stand_still(tmp_path):
-    sim = BatchSim(write_arm(tmp_path), [(0.0, "both", 0.02)] * 3)
+@pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.02, 0.02, 0.01), (0.01, 0.02, 0.02)])
+def test_simulations_left_out_of_a_step_stand_still(tmp_path, rates):
+    sim = BatchSim(write_arm(tmp_path), [(0.0, "both", dt) for dt in rates])
     sim.step(np.ones((3, 2)), np.array([0, 2]))
     assert (sim.qpos[1] == 0).all()
     assert (sim.qpos[[0, 2]] != 0).any(axis=1).all()
@@ -65,6 +66,23 @@ def test_a_late_servo_does_what_a_prompt_one_does_with_commands_of_earlier(tmp_p
         sims[0].step(targets[t][None])
         sims[1].step(shifted[t][None])
     np.testing.assert_allclose(sims[0].qpos, sims[1].qpos, atol=2e-3)
+
+
+def test_late_servos_at_two_rates_step_together_as_each_does_alone(tmp_path):
+    late = replace(write_arm(tmp_path), delay=[0.05, 0.013])
+    conditions = [(0.0, "both", 0.02), (0.2, "both", 0.01), (0.0, "both", 0.02006)]
+    rng = np.random.default_rng(2)
+    past, targets = rng.uniform(-1, 1, (3, 6, 2)), rng.uniform(-1, 1, (20, 3, 2))
+    together = BatchSim(late, conditions)
+    alone = [BatchSim(late, [c]) for c in conditions]
+    together.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=past)
+    for i, sim in enumerate(alone):
+        sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)), past=past[i : i + 1])
+    for target in targets:
+        together.step(target)
+        for i, sim in enumerate(alone):
+            sim.step(target[i : i + 1])
+    np.testing.assert_array_equal(together.qpos, np.concatenate([sim.qpos for sim in alone]))
 
 
 def test_late_servos_want_to_know_what_is_on_its_way(tmp_path):

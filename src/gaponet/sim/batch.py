@@ -41,6 +41,8 @@ class BatchSim:
         self.torque: Array = self.batch.bind("actuator_force")
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
         self._late = CommandHistory(self.batch, first) if first.nhistory else None
+        self._nstep = np.array([robot.steps_per(c[2]) for c in conditions])
+        self._timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
@@ -58,7 +60,7 @@ class BatchSim:
         if self._late is not None:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
-            self._late.fill(ids, past, self.robot.decimation)
+            self._late.fill(ids, past, self._nstep[ids], self._timestep[ids])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
         """Hold position targets for one control period.
@@ -68,7 +70,13 @@ class BatchSim:
             ids: Only these simulations move, (k,) sorted; default all.
         """
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
-        self.batch.step(ids, nstep=self.robot.decimation)
+        first = int(self._nstep[0])
+        if (self._nstep == first).all():
+            self.batch.step(ids, nstep=first)
+            return
+        moving = np.arange(self.num_envs) if ids is None else ids
+        for n in np.unique(self._nstep[moving]):
+            self.batch.step(moving[self._nstep[moving] == n], nstep=int(n))
 
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""
@@ -107,16 +115,15 @@ class CommandHistory:
         self.buffer: Array = batch.bind("history")
         self.time: Array = batch.bind("time")
         self.samples = int(model.actuator_history[0, 0])
-        self.timestep = model.opt.timestep
         self.shape = (model.nu, 2 + 2 * self.samples)
 
-    def fill(self, ids: Array | slice, past: Array, decimation: int) -> None:
-        """Write past targets, newest first, each held for `decimation` physics steps; time starts at 0."""
+    def fill(self, ids: Array | slice, past: Array, nstep: Array, timestep: Array) -> None:
+        """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""
         self.time[ids] = 0.0
         ago = np.arange(self.samples, 0, -1)  # oldest first
         part = np.zeros((len(past), *self.shape))
         part[:, :, 1] = self.samples - 1
-        part[:, :, 2 : 2 + self.samples] = -ago * self.timestep
-        frame = np.minimum((ago - 1) // decimation, past.shape[1] - 1)
-        part[:, :, 2 + self.samples :] = past[:, frame].transpose(0, 2, 1)
+        part[:, :, 2 : 2 + self.samples] = -ago * timestep[:, None, None]
+        frame = np.minimum((ago - 1) // nstep[:, None], past.shape[1] - 1)  # (k, samples)
+        part[:, :, 2 + self.samples :] = np.take_along_axis(past, frame[:, :, None], axis=1).transpose(0, 2, 1)
         self.buffer[ids] = part.reshape(len(past), -1)

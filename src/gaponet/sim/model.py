@@ -30,7 +30,7 @@ def build_model(
     """The nominal simulator of a robot with a payload.
 
     Position actuators with the gains and torque limits of `robot.toml` replace whatever actuators the MJCF has, in the
-    order of `robot.joint_names`. The number of physics steps per control period is the robot's decimation at any dt.
+    order of `robot.joint_names`. The physics step is the robot's, stretched a little where it does not divide dt.
 
     Args:
         robot: The robot.
@@ -48,7 +48,8 @@ def build_model(
     """
     spec = _read(robot)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
-    spec.option.timestep = (robot.dt if dt is None else _positive(dt)) / robot.decimation
+    period = robot.dt if dt is None else _positive(dt)
+    spec.option.timestep = period / robot.steps_per(period)
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
@@ -170,8 +171,9 @@ def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    # One buffer length for all, so that models of one robot share a layout; none where nothing is late.
-    samples = math.ceil(robot.delay.max() / spec.option.timestep - 1e-9) + 1 if robot.delay.any() else 0
+    # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
+    shortest = min(0.75 * robot.timestep, spec.option.timestep)
+    samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
     for i, name in enumerate(robot.joint_names):
         if name in locked:
             continue
