@@ -83,11 +83,25 @@ def test_runs_lists_both_with_the_best_first(place, capsys):
     assert "no run here or below" in capsys.readouterr().err
 
 
+def test_the_budget_says_what_each_step_removes(place, capsys):
+    """The virtual arm is late and soft: delay and model remove error, and what is left is what eval finds."""
+    found, err = run(place, capsys, "budget", str(place / "gaponet"), str(place / "data"))
+    evaluated, _ = run(place, capsys, "eval", str(place / "gaponet"), str(place / "data"))
+    assert list(found["left"]) == ["nominal", "delay", "offset", "gaponet"]
+    assert found["left"]["delay"] < found["left"]["nominal"]
+    for step, method in (("nominal", "nominal"), ("offset", "delay_offset"), ("gaponet", "gaponet")):
+        assert found["left"][step] == pytest.approx(evaluated["methods"][method]["mpjae"])
+    assert found["floor"]["both"] < found["left"]["gaponet"]
+    assert "VIRTUAL" in err
+    assert (place / "gaponet" / "budget.png").stat().st_size > 10_000
+
+
 def test_the_report_is_one_offline_page(place, capsys):
     result, _ = run(place, capsys, "report", str(place / "gaponet"), "--also", str(place / "mlp"))
     page = (place / "gaponet" / "report.html").read_text(encoding="utf-8")
     assert result["report"].endswith("report.html")
     assert "VIRTUAL robot" in page
+    assert "Where the gap comes from" in page
     assert "these numbers say nothing about real hardware" in page
     assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
     assert "http" not in re.sub(r"http://www\.w3\.org|xmlns[^ >]*|http://purl\.org|https://matplotlib\.org", "", page)

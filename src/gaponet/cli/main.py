@@ -22,6 +22,7 @@ COMMANDS = {
     "train": "gaponet.cli.train:train",
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",
+    "budget": "gaponet.cli.budget:budget",
     "runs": "gaponet.cli.runs:runs",
     "demo": "gaponet.cli.demo:demo",
     "bench": "gaponet.cli.bench:bench",

@@ -64,7 +64,7 @@ def evaluate(
         models[model.config.kind] = model
     entries, unseen = choose(runs_dirs[0], dataset, motions)
     sequences = dataset.sequences(entries)
-    robots = {kind: _corrected(path, nominal) for kind, path in zip(models, runs_dirs, strict=True)}
+    robots = {kind: corrected_robot(path, nominal) for kind, path in zip(models, runs_dirs, strict=True)}
     for (kind, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
         model.require(robots[kind], dt)
     done_runs: dict[str, list[Run]] = {}
@@ -142,7 +142,7 @@ def save(evaluation: Evaluation, run: Path) -> None:
     write_text(run / "metrics.json", json.dumps(finite(result), indent=1, ensure_ascii=False) + "\n")
 
 
-def _corrected(run: Path, nominal: RobotSpec) -> RobotSpec:
+def corrected_robot(run: Path, nominal: RobotSpec) -> RobotSpec:
     """The simulator that a run's model corrects: the nominal one, or the identified one kept in the run."""
     kept = load_robot(run / "robot") if (run / "robot" / "robot.toml").is_file() else nominal
     return nominal if model_hash(kept) == model_hash(nominal) else kept

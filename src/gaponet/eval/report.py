@@ -73,7 +73,8 @@ def write_report(
     lines = (run / "progress.jsonl").read_text(encoding="utf-8").splitlines()
     curve = [json.loads(line) for line in lines if line.strip()]
     progress("drawing", 0, 1)
-    page = _page(model.card, config, metrics, arrays, curve, spec)
+    budget = _json(run / "budget.json") if (run / "budget.json").is_file() else None
+    page = _page(model.card, config, metrics, arrays, curve, spec, budget)
     path = run / "report.html"
     write_text(path, page)
     progress("drawing", 1, 1)
@@ -105,7 +106,9 @@ def _page(
     arrays: dict[str, Array],
     curve: list[dict[str, Any]],
     robot: RobotSpec,
+    budget: dict[str, Any] | None,
 ) -> str:
+    from gaponet.eval import budget_figure as draw_budget
     from gaponet.eval import figures as draw
 
     methods, kind = metrics["methods"], card["model"]["kind"]
@@ -129,6 +132,11 @@ def _page(
     if len(methods["nominal"]["by_payload"]) > 1:
         body.append(_figure(draw.by_payload(methods), "Payload in each hand."))
     body += ["</div>", "<h2>Trajectories</h2>", *_trajectories(arrays, metrics, robot)]
+    if budget is not None:
+        body += [
+            "<h2>Where the gap comes from</h2>",
+            _figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (white: adds to it)."),
+        ]
     body += [
         "<h2>Training</h2>", '<div class="row">',
         _figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),

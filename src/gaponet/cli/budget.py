@@ -1,0 +1,68 @@
+"""gaponet budget."""
+
+from __future__ import annotations
+
+import json as js
+from pathlib import Path
+
+import tyro
+
+from gaponet.cli.gap import mrad
+from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+
+
+def budget(
+    run: tyro.conf.Positional[Path],
+    dataset: tyro.conf.Positional[Path],
+    motions: str = "",
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Show where the gap comes from: what delay, offset, identification and the model each remove, and the floor.
+
+    Writes RUN/budget.json, budget.svg and budget.png; the report shows them.
+
+    Args:
+        run: Run folder of gaponet train; one trained with --robot of an identified simulator has that step too.
+        dataset: The dataset trained on (its test motions are used) or another.
+        motions: Only these, separated by commas.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    import matplotlib as mpl
+
+    from gaponet.data.store import write_text
+    from gaponet.eval.budget import gap_budget
+    from gaponet.eval.budget_figure import waterfall
+    from gaponet.eval.figures import STYLE
+
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    with bar("budget") as update:
+        found = gap_budget(run, data, spec, names(motions), lambda step, done, total: update(done, total, step))
+    write_text(run / "budget.json", js.dumps(found, indent=1) + "\n")
+    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
+        fig = waterfall(found)
+        for suffix in ("svg", "png"):
+            fig.savefig(run / f"budget.{suffix}", dpi=160)
+    steps = list(found["left"])
+    who = "VIRTUAL robot" if found["virtual"] else "real robot"
+    kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
+    out.table(
+        f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
+        ["", *steps, "floor"],
+        [
+            ["all joints", *(mrad(found["left"][s]) for s in steps), mrad(found["floor"]["both"])],
+            *(
+                [j, *(mrad(v["left"][s]) for s in steps), mrad(v["floor"]["both"])]
+                for j, v in found["by_joint"].items()
+            ),
+            *([f"{p} kg", *(mrad(v[s]) for s in steps), ""] for p, v in found["by_payload"].items()),
+        ],
+    )
+    if found["floor"]["repeatability"] is None:
+        out.say("floor: encoder only; no motion was recorded twice, so repeatability is unknown")
+    out.say(f"figure: {run / 'budget.png'}")
+    out.result(found)

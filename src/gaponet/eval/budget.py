@@ -1,0 +1,135 @@
+"""Where the gap comes from: what each step from the nominal simulator to the trained model removes, and the floor."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.repeatability import Repetitions, summary
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset
+from gaponet.errors import ModelError
+from gaponet.eval.evaluate import choose, corrected_robot
+from gaponet.gap import metrics, runs
+from gaponet.model.artifact import GapModel
+from gaponet.model.baselines.delay_offset import DelayOffset
+from gaponet.robot import RobotSpec
+from gaponet.sim.replay import Corrector, replay
+
+Array = np.ndarray
+
+
+def gap_budget(
+    run: Path,
+    dataset: Dataset,
+    robot: RobotSpec,
+    motions: tuple[str, ...] = (),
+    progress: Callable[[str, int, int], None] = lambda step, done, total: None,
+) -> dict[str, Any]:
+    """Mean |error| left after each step, in free run over whole motions that the run never saw.
+
+    Steps: nominal; delay (fitted on the training motions); offset (delay and offset); identified (where the run starts
+    from an identified simulator); the run's model.
+
+    Args:
+        run: Run folder; its split, baseline, simulator and model apply.
+        dataset: The one trained on, or another.
+        robot: The nominal simulator.
+        motions: Only these.
+        progress: Called with step, control steps done, total.
+
+    Returns:
+        {"left": {step: rad}, "by_joint": {joint: {"left": {step: rad}, "floor": {…}}}, "by_payload": {kg: {step: rad}},
+        "floor": {"encoder": rad, "repeatability": rad or None, "both": rad}, …}
+    """
+    dataset.require_robot(robot)
+    nominal = robot.nominal or robot
+    model = GapModel.load(run)
+    entries, unseen = choose(run, dataset, motions)
+    sequences = dataset.sequences(entries)
+    simulator = corrected_robot(run, nominal)
+    steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
+    fitted = _baseline(run)
+    only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
+    steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
+    if simulator.nominal is not None:
+        steps.append(("identified", simulator, None))
+    steps.append((model.config.kind, simulator, model.corrector(simulator)))
+    done = {}
+    for name, physics, corrector in steps:
+        twins = replay(sequences, physics, corrector, lock_idle=True, progress=partial(progress, name))
+        done[name] = runs(sequences, [t.qpos for t in twins], robot)
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    columns = {j: [i] for i, j in enumerate(robot.operated)}
+    floors = floor(sequences, robot)
+    return {
+        "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
+        "by_joint": {
+            j: {"left": {n: metrics(part, c)["mpjae"] for n, part in done.items()}, "floor": floors[j]}
+            for j, c in columns.items()
+        },
+        "by_payload": {
+            f"{p:g}": {
+                n: metrics([r for r in part if r.real.meta.payload_mass == p])["mpjae"] for n, part in done.items()
+            }
+            for p in payloads
+        },
+        "floor": {key: _mean([f[key] for f in floors.values()]) for key in ("encoder", "repeatability", "both")},
+        "virtual": any(s.meta.virtual for s in sequences),
+        "unseen": unseen,
+        "sequences": len(sequences),
+        "dataset": dataset.path.name,
+        "robot": robot.name,
+    }  # fmt: skip
+
+
+def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
+    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability" (None if unknown), "both"}, rad.
+
+    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition to
+    the next differs from its own mean by √(2/π)·σ on average, encoder included.
+    """
+    groups: dict[Any, Repetitions] = defaultdict(Repetitions)
+    for s in sequences:
+        m = s.meta
+        groups[m.motion, m.unit_id, m.payload_mass, m.payload_side, round(s.dt * 1e6)].add(s)
+    repeated = [g for g in groups.values() if g.count > 1]
+    spread = summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    found: dict[str, dict[str, float | None]] = {}
+    for joint, column in zip(robot.operated, robot.operated_index, strict=True):
+        encoder = encoder_step([s.qpos[:, column] for s in sequences]) / 4
+        again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
+        found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder, again or 0.0)}
+    return found
+
+
+def encoder_step(recordings: ListOf[Array]) -> float:
+    """The smallest step between distinct readings of one joint, rad; 0 where readings are continuous."""
+    values = np.unique(np.concatenate(recordings).astype(np.float64))
+    steps = np.diff(values)
+    steps = steps[steps > 2e-6]  # below: rounding of the stored float32
+    if steps.size < 10:
+        return 0.0
+    step = float(np.percentile(steps, 5))
+    off = np.abs(steps / step - np.round(steps / step))
+    return step if np.median(off) < 0.1 else 0.0
+
+
+def _mean(values: ListOf[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
+
+
+def _baseline(run: Path) -> DelayOffset:
+    file = run / "delay_offset.json"
+    try:
+        return DelayOffset(**json.loads(file.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError) as error:
+        raise ModelError(f"{file}: cannot be read ({error}); give a complete run folder of gaponet train") from None

@@ -1,0 +1,63 @@
+"""The gap budget as a waterfall."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from gaponet.eval.figures import COLOURS, figure, styled
+
+TITLES = {
+    "nominal": "nominal", "delay": "delay", "offset": "offset", "identified": "identifi-\ncation", "mlp": "MLP",
+    "gaponet": "GAPONet",
+}  # fmt: skip
+FILL = COLOURS | {"delay": "#d99000", "offset": "#b36b00"}
+COLUMNS = 4
+
+
+@styled
+def waterfall(budget: dict[str, Any]) -> Figure:
+    """What each step removes of the mean |error| (white: adds), the mean over joints first, and the floor."""
+    panels = {"all joints": {"left": budget["left"], "floor": budget["floor"]}} | budget["by_joint"]
+    steps = list(budget["left"])
+    columns = min(COLUMNS, len(panels))
+    rows = -(-len(panels) // columns)
+    fig = figure(2.55 * columns, 2.0 * rows + 0.55)
+    axes = fig.subplots(rows, columns, squeeze=False, sharey=True)
+    for ax in axes.flat[len(panels) :]:
+        ax.set_visible(False)
+    for i, (ax, (name, panel)) in enumerate(zip(axes.flat, panels.items(), strict=False)):
+        _panel(ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, 1e3 * panel["floor"]["both"])
+        ax.set_title(name.removesuffix("_joint").replace("_", " "))
+        if i % columns == 0:
+            ax.set_ylabel("MPJAE, mrad")
+        bottom = i + columns >= len(panels)
+        ax.set_xticks(range(len(steps) + 1), [*(TITLES[s] for s in steps), "left"] if bottom else [], fontsize=6.5)
+    who = "VIRTUAL " if budget["virtual"] else "real "
+    fig.suptitle(
+        f"{who}{budget['robot']}, {budget['sequences']} {'held-out' if budget['unseen'] else ''} recordings: "
+        "what each step removes; dashed: encoder and repeatability",
+        fontsize=9, x=0.01, ha="left",
+    )  # fmt: skip
+    return fig
+
+
+def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float) -> None:
+    before = left[steps[0]]
+    ax.bar(0, before, color=FILL["nominal"])
+    for k, step in enumerate(steps[1:], 1):
+        after = left[step]
+        adds = after > before
+        ax.bar(k, abs(before - after), bottom=min(before, after), color="white" if adds else FILL[step],
+               edgecolor=FILL[step], lw=1.0)  # fmt: skip
+        ax.plot([k - 0.6, k + 0.4], [before, before], color="#555555", lw=0.6)
+        before = after
+    ax.plot([len(steps) - 0.6, len(steps) + 0.4], [before, before], color="#555555", lw=0.6)
+    ax.bar(len(steps), before, color="#333333")
+    ax.annotate(f"{before:.1f}", (len(steps), before), ha="center", va="bottom", fontsize=7)
+    ax.annotate(f"{left[steps[0]]:.1f}", (0, left[steps[0]]), ha="center", va="bottom", fontsize=7)
+    if floor > 0:
+        ax.axhline(floor, ls=(0, (4, 2)), lw=0.8, color="#2a9d6f")
+    ax.grid(axis="x", visible=False)
+    ax.margins(y=0.12)
