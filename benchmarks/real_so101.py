@@ -13,7 +13,6 @@ import json
 import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -39,16 +38,16 @@ def gaponet(*words: object) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int], parallel: int) -> list[dict[str, Any]]:
+def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int]) -> list[dict[str, Any]]:
     """One evaluation per seed, all methods side by side."""
     data, fitted = work / "data", work / "identified"
     if not data.exists():
         gaponet("import", logs, "--robot", "so101", "--unit-id", "lab", "--payload-mass", 0, "--out", data)
     if not fitted.exists():
         gaponet("identify", data, "--out", fitted)
-    wanted = [(seed, run) for seed in seeds for run in budgets]
-    with ThreadPoolExecutor(parallel) as pool:
-        list(pool.map(lambda job: train(data, fitted, work / f"{job[1]}-{job[0]}", job[0], job[1], budgets), wanted))
+    for run in budgets:
+        for seed in seeds:
+            train(data, fitted, work / f"{run}-{seed}", seed, run, budgets)
     results = []
     for seed in seeds:
         result = gaponet("eval", work / f"gaponet-{seed}", data, "--also", work / f"mlp-{seed}")
@@ -142,12 +141,11 @@ def main() -> None:
     parser.add_argument("--budget", default="1300000")
     parser.add_argument("--mlp-budget", default="1000000")
     parser.add_argument("--identified-budget", default="420000", help="for GAPONet from the identified simulator")
-    parser.add_argument("--parallel", type=int, default=2, help="trainings at a time")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    budgets = {"gaponet": args.budget, "mlp": args.mlp_budget, "gaponet_from_identified": args.identified_budget}
-    results = measure(args.logs, args.work, budgets, args.seeds, args.parallel)
+    budgets = {"gaponet": args.budget, "gaponet_from_identified": args.identified_budget, "mlp": args.mlp_budget}
+    results = measure(args.logs, args.work, budgets, args.seeds)
     DOCS.mkdir(parents=True, exist_ok=True)
     first = results[0]
     text = (

@@ -44,28 +44,6 @@ class WarmStartConfig:
 
 
 @dataclass(frozen=True)
-class GradientConfig:
-    """Descent of the free-run error through the simulator (train/gradient.py)."""
-
-    num_envs: int = 256
-    """Simulations."""
-    horizon: int = 24
-    """Control periods between cuts of the graph; states go on."""
-    learning_rate: float = 3e-4
-    """AdamW step size, decayed to a tenth over the budget."""
-    weight_decay: float = 0.01
-    """AdamW weight decay."""
-    beta: float = 0.005
-    """Error beyond which the loss is linear, rad."""
-    delta: float = 0.02
-    """Price of a large correction, 1/rad²."""
-    delta_rate: float = 0.1
-    """Price of a jerky correction, 1/rad²."""
-    max_grad_norm: float = 1.0
-    """Longest gradient."""
-
-
-@dataclass(frozen=True)
 class PPOConfig:
     """PPO of rsl_rl, start values of the method."""
 
