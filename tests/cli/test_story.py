@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import pytest
 from arm import recordings, write_arm
@@ -96,6 +97,17 @@ def test_the_budget_says_what_each_step_removes(place, capsys):
     assert (place / "gaponet" / "budget.png").stat().st_size > 10_000
 
 
+def test_a_calibrated_unit_is_shown_without_and_with(place, capsys):
+    shutil.copytree(place / "gaponet", place / "calibrated")
+    found, err = run(place, capsys, "calibrate", str(place / "calibrated"), str(place / "data"), "--seconds", "8")
+    assert found["after"] <= found["before"]
+    assert "N·m/rad" in err
+    result, _ = run(place, capsys, "eval", str(place / "calibrated"), str(place / "data"))
+    assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet", "calibrated"]
+    assert result["calibrated_units"] == [found["unit_id"]]
+    assert result["unseen"] is True
+
+
 def test_the_report_is_one_offline_page(place, capsys):
     result, _ = run(place, capsys, "report", str(place / "gaponet"), "--also", str(place / "mlp"))
     page = (place / "gaponet" / "report.html").read_text(encoding="utf-8")
@@ -118,6 +130,7 @@ def test_the_report_is_one_offline_page(place, capsys):
         (["train", "{}/data", "--out", "{}/new", "--budget", "soon"], "--budget soon"),
         (["train", "{}/data", "--out", "{}/new", "--resume"], "nothing to resume"),
         (["report", "{}/data"], "give a run folder"),
+        (["calibrate", "{}/gaponet", "{}/data", "--unit", "nobody"], "holds units"),
         (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],

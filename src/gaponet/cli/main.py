@@ -20,6 +20,7 @@ COMMANDS = {
     "collect": "gaponet.cli.collect:collect",
     "identify": "gaponet.cli.identify:identify",
     "train": "gaponet.cli.train:train",
+    "calibrate": "gaponet.cli.calibrate:calibrate",
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",
     "budget": "gaponet.cli.budget:budget",

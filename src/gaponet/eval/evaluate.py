@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry, write_text
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.gap import Run, runs, summary
+from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec, load_robot
@@ -25,7 +27,7 @@ from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
-ORDER = ("nominal", "delay_offset", "identified", "mlp", "gaponet")  # of tables and figures
+ORDER = ("nominal", "delay_offset", "identified", "mlp", "gaponet", "calibrated")  # of tables and figures
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,11 @@ def evaluate(
         if name in models:
             op = robot.operated_index
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
+    calibrated = calibration.load(runs_dirs[0], next(iter(models.values())).weights_hash())
+    if any(s.meta.unit_id in calibrated for s in sequences):
+        kind = next(iter(models))
+        twins = _by_unit(sequences, models[kind], robots[kind], calibrated, partial(progress, "calibrated"))
+        done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
     result = {
         "methods": {name: summary(part, robot) for name, part in done_runs.items()},
         "ratio_to_nominal": _ratios(done_runs),
@@ -86,6 +93,7 @@ def evaluate(
         "robot": robot.name,
         "simulator_hash": model_hash(nominal),
         "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
+        "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
     }
     return Evaluation(result, done_runs, deltas)
@@ -95,6 +103,7 @@ def choose(run: Path, dataset: Dataset, motions: tuple[str, ...]) -> tuple[list[
     """Entries to evaluate and whether none of them was used in training or for choosing."""
     split = read_split(run)
     known = {h for part in ("train", "val") for h in split[part].values()}
+    known |= {h for c in calibration.load(run, GapModel.load(run).weights_hash()).values() for h in c.logs}
     if motions:
         entries = dataset.select(motions)
     else:
@@ -164,6 +173,24 @@ def _methods(
         yield "identified", robot, None
     for kind in sorted(models, key=ORDER.index):
         yield kind, robots[kind], models[kind].corrector(robots[kind])
+
+
+def _by_unit(
+    sequences: list[Sequence],
+    model: GapModel,
+    simulator: RobotSpec,
+    calibrated: dict[str, calibration.Calibration],
+    progress: Callable[[int, int], None],
+) -> list[Twin]:
+    """The model in each unit's own simulator; in the common one where a unit is not calibrated."""
+    twins: dict[int, Twin] = {}
+    for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
+        rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
+        physics = calibrated[unit].robot(simulator) if unit in calibrated else simulator
+        part = replay([sequences[i] for i in rows], physics, model.corrector(simulator), lock_idle=True)
+        twins |= dict(zip(rows, part, strict=True))
+        progress(len(twins), len(sequences))
+    return [twins[i] for i in range(len(sequences))]
 
 
 def _delta_summary(parts: list[Array], sequences: list[Sequence]) -> dict[str, float]:

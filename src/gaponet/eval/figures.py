@@ -16,6 +16,7 @@ NAMES = {
     "identified": "identified simulator",
     "mlp": "MLP",
     "gaponet": "GAPONet",
+    "calibrated": "calibrated to the unit",
 }
 COLOURS = {
     "recorded": "#111111",
@@ -24,6 +25,7 @@ COLOURS = {
     "identified": "#2a9d6f",
     "mlp": "#3b7dd8",
     "gaponet": "#c8102e",
+    "calibrated": "#6a1b9a",
 }
 
 STYLE = {

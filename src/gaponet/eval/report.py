@@ -173,7 +173,7 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
     if not metrics["unseen"]:
         out.append("Some recordings were used in training or for choosing the model: not a held-out result.")
-    better = [n for n, m in methods.items() if n != kind and m["mpjae"] <= own]
+    better = [n for n, m in methods.items() if n not in (kind, "calibrated") and m["mpjae"] <= own]
     if better:
         out.append(f"The model does not beat {', '.join(better).replace('_', ' + ')}: do not use it.")
     seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]

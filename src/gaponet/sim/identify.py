@@ -18,7 +18,7 @@ from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model
-from gaponet.sim.replay import idle_limbs
+from gaponet.sim.replay import Corrector, idle_limbs
 
 Array = np.ndarray
 
@@ -64,6 +64,9 @@ def identify(
     windows: int = WINDOWS,
     nthread: int = 0,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+    fields: tuple[str, ...] = tuple(BOUNDS),
+    corrector: Corrector | None = None,
+    prior: float = 0.0,
 ) -> Identified:
     """Fit the parameters of all operated joints at once.
 
@@ -73,11 +76,14 @@ def identify(
         windows: Free runs of 8 s, taken evenly from the recordings.
         nthread: Threads, 0 for all cores.
         progress: Called with evaluations done, at most, and the present RMS error in rad.
+        fields: Which parameters; the others stay the robot's.
+        corrector: Corrects the targets on the way, as in replay.
+        prior: Price of leaving the robot's own values, rad per scale: for logs too short to determine everything.
     """
     parts = cut(sequences, windows)
     if not parts:
         raise UsageError("no recording is longer than a second; identification needs longer ones")
-    problem = _Problem(parts, robot, nthread)
+    problem = _Problem(parts, robot, nthread, fields, corrector, prior)
     start = problem.start()
     count = 0
 
@@ -85,7 +91,7 @@ def identify(
         nonlocal count
         count += 1
         e = problem.errors(x[None])[0]
-        progress(count, EVALUATIONS, float(np.sqrt((e**2).mean())))
+        progress(count, EVALUATIONS, float(np.sqrt((e[: problem.rows] ** 2).mean())))
         return e
 
     low, high = problem.bounds()
@@ -93,7 +99,9 @@ def identify(
         residual, start, problem.jacobian, bounds=(low, high), loss="soft_l1", f_scale=SOFT, max_nfev=EVALUATIONS,
         xtol=1e-4, ftol=1e-4, x_scale="jac",
     )  # fmt: skip
-    before, after = (float(np.sqrt((problem.errors(x[None])[0] ** 2).mean())) for x in (start, fit.x))
+    before, after = (
+        float(np.sqrt((problem.errors(x[None])[0, : problem.rows] ** 2).mean())) for x in (problem.own(), fit.x)
+    )
     return Identified(problem.robot_of(fit.x), before, after, problem.doubts(fit.x, fit.jac, after), count)
 
 
@@ -110,11 +118,21 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
 class _Problem:
     """Windows, parameter vector ↔ robot, errors of many parameter vectors in one batch."""
 
-    def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
+    def __init__(
+        self,
+        parts: list[Sequence],
+        robot: RobotSpec,
+        nthread: int,
+        fields: tuple[str, ...],
+        corrector: Corrector | None,
+        prior: float,
+    ) -> None:
         self.parts, self.robot, self.nthread = parts, robot, nthread
+        self.limits = {f: BOUNDS[f] for f in fields}
+        self.corrector, self.prior = corrector, prior
         self.locked = idle_limbs(parts, robot)
         self.op, self.n = robot.operated_index, len(robot.operated)
-        self.names = [(field, joint) for field in BOUNDS for joint in robot.operated]
+        self.names = [(field, joint) for field in fields for joint in robot.operated]
         self.conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
         free = [j for j in robot.joint_names if j not in self.locked]
         self.free, self.free_op = robot.index(free), np.array([free.index(j) for j in robot.operated])
@@ -123,6 +141,7 @@ class _Problem:
         self.real = np.stack([_held(s.qpos[:, self.op], rows) for s in parts], axis=1).astype(float)
         skip = np.array([[t >= SETTLE / s.dt and t < len(s) for s in parts] for t in range(rows)])
         self.counted = np.repeat(skip[1:, :, None], self.n, axis=2)
+        self.rows = int(self.counted.sum())  # of the residual: simulated errors; those of the prior follow
         model = build_model(robot)
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         gain = robot.kp[self.op]
@@ -142,28 +161,37 @@ class _Problem:
 
     def start(self) -> Array:
         """The given robot, a little inside the bounds; one period late, since a delay of zero hides its gradient."""
-        first = self.first | {"delay": np.maximum(self.first["delay"], 0.02)}
+        return self._inside(self.first | {"delay": np.maximum(self.first["delay"], 0.02)})
+
+    def own(self) -> Array:
+        """The given robot."""
+        return self._inside(self.first)
+
+    def _inside(self, values: dict[str, Array]) -> Array:
         low, high = self.bounds()
-        return np.clip(np.concatenate([first[f] / self.scale[f] for f in BOUNDS]), low + 1e-3, high - 1e-3)
+        return np.clip(np.concatenate([values[f] / self.scale[f] for f in self.limits]), low + 1e-3, high - 1e-3)
 
     def bounds(self) -> tuple[Array, Array]:
         """(P,) each."""
-        return tuple(np.repeat([b[k] for b in BOUNDS.values()], self.n) for k in (0, 1))  # type: ignore[return-value]
+        return tuple(np.repeat([b[k] for b in self.limits.values()], self.n) for k in (0, 1))  # type: ignore[return-value]
 
     def values(self, x: Array) -> dict[str, Array]:
-        """(…, P) → field: (…, n) in SI."""
-        parts = np.split(np.asarray(x), len(BOUNDS), axis=-1)
-        return {f: part * self.scale[f] for f, part in zip(BOUNDS, parts, strict=True)}
+        """(…, P) → field: (…, n) in SI; fields that are not fitted as they are."""
+        x = np.asarray(x)
+        parts = np.split(x, len(self.limits), axis=-1)
+        fitted = {f: part * self.scale[f] for f, part in zip(self.limits, parts, strict=True)}
+        shape = (*x.shape[:-1], self.n)
+        return {f: np.broadcast_to(own, shape) for f, own in self.first.items()} | fitted
 
     def robot_of(self, x: Array) -> RobotSpec:
         """The robot with these parameters; joints that are not operated keep theirs."""
         values = self.values(x)
         return self.robot.with_servos(
-            {j: {f: float(f"{values[f][i]:.6g}") for f in BOUNDS} for i, j in enumerate(self.robot.operated)}
+            {j: {f: float(f"{values[f][i]:.6g}") for f in self.limits} for i, j in enumerate(self.robot.operated)}
         )
 
     def errors(self, xs: Array) -> Array:
-        """Free-run errors q_sim − q_real of every counted row, (k, m), for parameter vectors (k, P)."""
+        """Free-run errors q_sim − q_real of counted rows, then the prior's, (k, m), of parameter vectors (k, P)."""
         k, m = len(xs), len(self.parts)
         late = np.array(self.robot.delay)
         late[self.op] = MAX_DELAY
@@ -175,10 +203,21 @@ class _Problem:
         )
         sim.reset(slice(None), q0, v0, past=tile[0][:, None])
         out = np.empty((len(tile) - 1, k, m, self.n))
+        if self.corrector is not None:
+            self.corrector.reset(self.parts * k)
         for t in range(len(out)):
-            sim.step(tile[t])
+            sim.step(tile[t] if self.corrector is None else self._corrected(t, tile[t], sim))
             out[t] = sim.qpos[:, self.free_op].reshape(k, m, self.n) - self.real[t + 1]
-        return out.transpose(1, 0, 2, 3)[:, self.counted]
+        errors = out.transpose(1, 0, 2, 3)[:, self.counted]
+        return np.concatenate([errors, self.prior * (xs - self.own())], axis=1) if self.prior else errors
+
+    def _corrected(self, t: int, target: Array, sim: BatchSim) -> Array:
+        assert self.corrector is not None
+        full = np.zeros((3, len(target), len(self.robot.joint_names)))
+        full[:2] = self.robot.qpos_home
+        for place, now in zip(full, (target, sim.qpos, sim.qvel), strict=True):
+            place[:, self.free] = now
+        return self.corrector.correct(t, *full)[:, self.free]
 
     def _write(self, sim: BatchSim, xs: Array, m: int) -> None:
         model, values = sim.models[self.conditions[0]], self.values(np.repeat(xs, m, axis=0))
@@ -194,7 +233,7 @@ class _Problem:
 
     def jacobian(self, x: Array) -> Array:
         """Forward differences towards the inside of the bounds, (m, P)."""
-        steps = np.repeat([b[2] for b in BOUNDS.values()], self.n)
+        steps = np.repeat([b[2] for b in self.limits.values()], self.n)
         steps = np.where(x + steps > self.bounds()[1], -steps, steps)
         e = self.errors(np.concatenate([x[None], x + np.diag(steps)]))
         return ((e[1:] - e[0]) / steps[:, None]).T
@@ -204,12 +243,13 @@ class _Problem:
         low, high = self.bounds()
         found = []
         # Errors of neighbouring rows are alike: about ten a second count as independent.
+        jac = jac[: self.rows]
         rows_per_error = max(1.0, 0.1 / float(np.median([s.dt for s in self.parts])))
         covariance = np.linalg.pinv(jac.T @ jac) * rms**2 * rows_per_error
+        scales = np.concatenate([self.scale[f] for f in self.limits])
         for (field, joint), value, error, a, b, scale in zip(
-            self.names, x, np.sqrt(np.diag(covariance)), low, high, np.concatenate(list(self.scale.values())),
-            strict=True,
-        ):  # fmt: skip
+            self.names, x, np.sqrt(np.maximum(np.diag(covariance), 0.0)), low, high, scales, strict=True
+        ):
             if (value - a < 1e-2 * (b - a) and a != 0) or b - value < 1e-2 * (b - a):
                 found.append(
                     f"{joint}: {field} ended at its bound ({value * scale:.4g}); the model's form does not fit"

@@ -1,0 +1,68 @@
+"""gaponet calibrate."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import tyro
+
+from gaponet.cli.gap import mrad
+from gaponet.cli.identify import COLUMNS
+from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+
+
+def calibrate(
+    run: tyro.conf.Positional[Path],
+    dataset: tyro.conf.Positional[Path],
+    unit: str = "",
+    motions: str = "",
+    seconds: float = 30.0,
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Fit what is particular to one unit (gain, friction, zero offset, delay of each joint) from a short log of it.
+
+    The trained model stays as it is. gaponet eval then shows the unit without and with its calibration.
+
+    Args:
+        run: Run folder of gaponet train.
+        dataset: Recordings of the unit, perhaps among others.
+        unit: Which one, where the dataset holds several.
+        motions: Only these, separated by commas; default: those that the run was trained on, so that its test motions
+            stay unseen, or all, where the unit played none of them.
+        seconds: How much of the recordings to use, in windows of 8 s.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    from gaponet.errors import UsageError
+    from gaponet.eval.evaluate import corrected_robot
+    from gaponet.model import calibration
+    from gaponet.model.artifact import GapModel
+
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    data.require_robot(spec)
+    model = GapModel.load(run)
+    simulator = corrected_robot(run, spec.nominal or spec)
+    units = sorted({e.meta.unit_id for e in data.entries})
+    if unit not in units and (unit or len(units) != 1):
+        raise UsageError(f"--unit {unit or '(none)'}: {dataset} holds units {', '.join(units)}; name one")
+    entries = [e for e in data.select(names(motions)) if e.meta.unit_id == (unit or units[0])]
+    if not motions:
+        trained = set(model.card["motions"]["train"])
+        entries = [e for e in entries if e.meta.motion in trained] or entries
+    with bar("calibrating") as update:
+        found = calibration.calibrate(
+            model, simulator, data.sequences(entries), seconds,
+            lambda done, total, rms: update(done, total, f"window RMS {mrad(rms)} mrad"),
+        )  # fmt: skip
+    path = calibration.save(found, run)
+    out.table(f"Unit {found.unit_id}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
+        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
+    ])  # fmt: skip
+    out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; {path}")
+    out.say(f"next: gaponet eval {run} {dataset}")
+    out.result(asdict(found))

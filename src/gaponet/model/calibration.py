@@ -1,0 +1,106 @@
+"""What is particular to one unit, beside a model: a small file per unit in RUN/calibration/.
+
+No model can know a unit's zero offsets, friction level, gain and delay before it has seen the unit. They are fitted to
+half a minute of its log, as servo parameters of the simulator under the trained correction; the network stays as it is.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import write_text
+from gaponet.errors import ModelError, UsageError
+from gaponet.model.artifact import GapModel
+from gaponet.robot import RobotSpec
+from gaponet.sim.identify import WINDOW, identify
+
+FIELDS = ("kp", "frictionloss", "offset", "delay")
+PRIOR = 0.1  # rad per scale: outweighed by a few seconds of log that show something else
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """One unit's servo parameters.
+
+    Attributes:
+        unit_id: Whose.
+        weights: Hash of the model.onnx that they were fitted under.
+        servos: Joint → kp N·m/rad, frictionloss N·m, offset rad, delay s.
+        logs: Content hashes of the recordings used.
+        seconds: How much of them.
+        before, after: RMS error of the windows fitted, rad.
+    """
+
+    unit_id: str
+    weights: str
+    servos: dict[str, dict[str, float]]
+    logs: tuple[str, ...]
+    seconds: float
+    before: float
+    after: float
+
+    def robot(self, simulator: RobotSpec) -> RobotSpec:
+        """The simulator of this unit."""
+        return simulator.with_servos(self.servos)
+
+
+def calibrate(
+    model: GapModel,
+    simulator: RobotSpec,
+    sequences: ListOf[Sequence],
+    seconds: float = 30.0,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+) -> Calibration:
+    """Fit a unit's parameters under a trained model.
+
+    Args:
+        model: Its correction is applied while fitting.
+        simulator: The one that the model corrects.
+        sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
+        seconds: How much is used.
+        progress: Called with evaluations done, at most, RMS error in rad.
+    """
+    units = sorted({s.meta.unit_id for s in sequences})
+    if len(units) != 1:
+        raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
+    found = identify(
+        sequences, simulator, max(1, round(seconds / WINDOW)), progress=progress, fields=FIELDS,
+        corrector=model.corrector(simulator), prior=PRIOR,
+    )  # fmt: skip
+    servos = {
+        j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
+        for j in simulator.operated
+    }
+    logs = tuple(s.content_hash() for s in sequences)
+    return Calibration(units[0], model.weights_hash(), servos, logs, seconds, found.before, found.after)
+
+
+def save(calibration: Calibration, run: Path) -> Path:
+    """RUN/calibration/UNIT.json."""
+    path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', calibration.unit_id)}.json"
+    path.parent.mkdir(exist_ok=True)
+    write_text(path, json.dumps(asdict(calibration), indent=1) + "\n")
+    return path
+
+
+def load(run: Path, weights: str) -> dict[str, Calibration]:
+    """Unit → calibration of this model; those of an earlier model in the same folder are refused."""
+    found = {}
+    for path in sorted((run / "calibration").glob("*.json")):
+        try:
+            raw = json.loads(path.read_text(encoding="utf-8"))
+            one = Calibration(**raw | {"logs": tuple(raw["logs"])})
+        except (ValueError, TypeError, KeyError) as error:
+            raise ModelError(f"{path}: damaged ({error}); run gaponet calibrate again") from None
+        if one.weights != weights:
+            raise ModelError(
+                f"{path}: made for another model ({one.weights}); delete it or run gaponet calibrate again"
+            )
+        found[one.unit_id] = one
+    return found

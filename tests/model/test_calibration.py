@@ -1,0 +1,68 @@
+"""A unit that differs from those trained on in gain and delay, and a model that corrects nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, record, write_arm
+
+from gaponet.errors import ModelError, UsageError
+from gaponet.model import calibration
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import export
+from gaponet.sim.replay import replay
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("robots") / "arm")
+
+
+@pytest.fixture(scope="module")
+def model(robot, tmp_path_factory):
+    config, folder = ModelConfig(history=2, num_probes=2), tmp_path_factory.mktemp("run") / "model"
+    net = build_network(config, 2).eval()
+    export(net, folder, make_card(config, robot, dt=[0.02]), np.zeros((4, net.features.dim), np.float32))
+    return GapModel.load(folder)
+
+
+@pytest.fixture(scope="module")
+def logs(robot):
+    return [record(robot, commands(450, seed), f"m{seed}", kp=0.6, delay=2) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def found(model, robot, logs):
+    return calibration.calibrate(model, robot, logs[:2], seconds=16.0)
+
+
+def test_gain_and_delay_of_the_unit_are_found(found, robot):
+    for i, joint in enumerate(robot.operated):
+        assert found.servos[joint]["kp"] == pytest.approx(0.6 * robot.kp[i], rel=0.2)
+        assert found.servos[joint]["delay"] == pytest.approx(0.04, abs=0.008)
+        assert abs(found.servos[joint]["offset"]) < 0.01
+    assert found.after < 0.1 * found.before
+
+
+def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs):
+    def error(simulator):
+        twin = replay(logs[2:], simulator, model.corrector(robot))[0]
+        return np.abs(twin.qpos - logs[2].qpos).mean()
+
+    assert error(found.robot(robot)) < 0.2 * error(robot)
+
+
+def test_a_calibration_is_read_as_it_was_written(found, tmp_path):
+    odd = replace(found, unit_id="lab/arm 2")
+    assert calibration.save(odd, tmp_path).name == "lab_arm_2.json"
+    assert calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
+    with pytest.raises(ModelError, match="made for another model"):
+        calibration.load(tmp_path, "0123456789ab")
+
+
+def test_recordings_of_two_units_are_refused(model, robot, logs):
+    other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
+    with pytest.raises(UsageError, match="give those of one unit"):
+        calibration.calibrate(model, robot, [logs[1], other])
