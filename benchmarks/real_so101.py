@@ -44,7 +44,8 @@ def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int]) -
     data, fitted = work / "data", work / "identified"
     if not data.exists():
         gaponet("import", logs, "--robot", "so101", "--unit-id", "lab", "--payload-mass", 0, "--out", data)
-    if not fitted.exists():
+    further = any("_from_identified" in run for run in budgets)
+    if further and not fitted.exists():
         gaponet("identify", data, "--out", fitted)
     for run in budgets:
         for seed in seeds:
@@ -52,8 +53,9 @@ def measure(logs: Path, work: Path, budgets: dict[str, str], seeds: list[int]) -
     results = []
     for seed in seeds:
         result = gaponet("eval", work / f"gaponet-{seed}", data, "--also", work / f"mlp-{seed}")
-        further = gaponet("eval", work / f"gaponet_from_identified-{seed}", data)["methods"]
-        result["methods"] |= {"identified": further["identified"], "identified_gaponet": further["gaponet"]}
+        if further:
+            found = gaponet("eval", work / f"gaponet_from_identified-{seed}", data)["methods"]
+            result["methods"] |= {"identified": found["identified"], "identified_gaponet": found["gaponet"]}
         results.append(result)
     return results
 
@@ -142,19 +144,22 @@ def main() -> None:
     parser.add_argument("--budget", default="614000")
     parser.add_argument("--mlp-budget", default="614000")
     parser.add_argument("--identified-budget", default="409000", help="for GAPONet from the identified simulator")
+    parser.add_argument("--nominal-only", action="store_true", help="without identification and what starts from it")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    budgets = {"gaponet": args.budget, "gaponet_from_identified": args.identified_budget, "mlp": args.mlp_budget}
+    budgets = {"gaponet": args.budget, "mlp": args.mlp_budget}
+    if not args.nominal_only:
+        budgets["gaponet_from_identified"] = args.identified_budget
     results = measure(args.logs, args.work, budgets, args.seeds)
     DOCS.mkdir(parents=True, exist_ok=True)
     first = results[0]
+    steps = ", ".join(f"{value} ({run.replace('_', ' ')})" for run, value in budgets.items())
     text = (
         f"# Real SO-101\n\nWhole-motion free run on {first['sequences']} held-out motions, mean ± std over seeds "
-        f"{args.seeds}; training budgets {args.budget} (GAPONet), {args.mlp_budget} (MLP) and "
-        f"{args.identified_budget} (GAPONet from the identified simulator) control steps; "
-        f"{date.today()}.\nSimulator {first['simulator_hash']}. Regenerate: "
-        f"`python benchmarks/real_so101.py LOGS WORK --budget {args.budget} --mlp-budget {args.mlp_budget}`.\n\n"
+        f"{args.seeds}; training budgets in control steps: {steps}; {date.today()}.\nSimulator "
+        f"{first['simulator_hash']}. Regenerate: `python benchmarks/real_so101.py LOGS WORK"
+        f"{' --nominal-only' if args.nominal_only else ''}`.\n\n"
         f"{table(results)}\n\nHeld-out motions: {', '.join(first['motions'])}.\n\n![](real_so101.svg)\n"
     )
     (DOCS / "real_so101.md").write_text(text, encoding="utf-8")
