@@ -10,7 +10,7 @@ from gaponet.train.gain import choose_gain
 @pytest.mark.parametrize(("ideal", "chosen"), [(1.3, 1.0), (0.55, 0.5), (0.0, 0.25)])
 def test_the_gain_with_the_least_error_is_kept(kind, ideal, chosen):
     net = build_network(ModelConfig(kind=kind), 3)
-    assert choose_gain(net, lambda: abs(net.bounded.gain.item() - ideal)) == chosen
+    assert choose_gain(net, lambda: abs(net.bounded.gain.item() - ideal), abs(1 - ideal)) == chosen
     assert net.bounded.gain.item() == chosen
 
 

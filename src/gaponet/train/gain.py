@@ -11,15 +11,21 @@ from collections.abc import Callable
 
 from gaponet.model.deeponet import DeltaMLP, OperatorNet
 
-GAINS = (1.0, 0.75, 0.5, 0.25)
+GAINS = (0.75, 0.5, 0.25)  # beside 1
 
 
-def choose_gain(net: OperatorNet | DeltaMLP, error: Callable[[], float]) -> float:
-    """Set the gain of GAINS with the least error, and return it; error() is that of the network as it then is."""
-    found = {}
+def choose_gain(net: OperatorNet | DeltaMLP, error: Callable[[], float], whole: float) -> float:
+    """Set the gain with the least error, and return it.
+
+    Args:
+        net: Its gain is changed in place.
+        error: That of the network as it is when called.
+        whole: The error with gain 1.
+    """
+    found = {1.0: whole}
     for gain in GAINS:
         net.bounded.gain.fill_(gain)
         found[gain] = error()
-    best = min(GAINS, key=lambda gain: found[gain])
+    best = min(found, key=lambda gain: found[gain])
     net.bounded.gain.fill_(best)
     return best

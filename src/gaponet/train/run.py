@@ -187,8 +187,8 @@ class Trainer:
         self._tick()
         self.net = build_network(self.config.model, self.n)
         self.net.load_state_dict(self.best_state)
-        choose_gain(self.net, lambda: self.validate(self.net))
-        self._consider()
+        if choose_gain(self.net, lambda: self.validate(self.net), self.best) < 1.0:
+            self._consider()
 
     def finish(self) -> GapModel:
         """Export the best model and write its card."""
