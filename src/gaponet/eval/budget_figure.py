@@ -13,16 +13,16 @@ TITLES = {
     "gaponet": "GAPONet",
 }  # fmt: skip
 FILL = COLOURS | {"delay": "#d99000", "offset": "#b36b00"}
-COLUMNS = 4
+COLUMNS = 4  # at most
 
 
 @styled
 def waterfall(budget: dict[str, Any]) -> Figure:
-    """What each step removes of the mean |error| (white: adds), the mean over joints first, and the floor."""
+    """What each step removes of the mean |error| (hollow: adds), the mean over joints first, and the floor."""
     panels = {"all joints": {"left": budget["left"], "floor": budget["floor"]}} | budget["by_joint"]
     steps = list(budget["left"])
-    columns = min(COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
+    rows = -(-len(panels) // COLUMNS)
+    columns = -(-len(panels) // rows)
     fig = figure(2.55 * columns, 2.0 * rows + 0.55)
     axes = fig.subplots(rows, columns, squeeze=False, sharey=True)
     for ax in axes.flat[len(panels) :]:
@@ -37,7 +37,7 @@ def waterfall(budget: dict[str, Any]) -> Figure:
     who = "VIRTUAL " if budget["virtual"] else "real "
     fig.suptitle(
         f"{who}{budget['robot']}, {budget['sequences']} {'held-out' if budget['unseen'] else ''} recordings: "
-        "what each step removes; dashed: encoder and repeatability",
+        "what each step removes (hollow: adds); dashed: encoder and repeatability",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
     return fig

@@ -135,7 +135,7 @@ def _page(
     if budget is not None:
         body += [
             "<h2>Where the gap comes from</h2>",
-            _figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (white: adds to it)."),
+            _figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (hollow: adds to it)."),
         ]
     body += [
         "<h2>Training</h2>", '<div class="row">',
