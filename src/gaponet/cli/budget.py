@@ -31,22 +31,17 @@ def budget(
         robot: Robot name or folder, if not the package's robot of the dataset.
         json: One JSON object on stdout.
     """
-    import matplotlib as mpl
-
     from gaponet.data.store import write_text
     from gaponet.eval.budget import gap_budget
     from gaponet.eval.budget_figure import waterfall
-    from gaponet.eval.figures import STYLE
+    from gaponet.eval.draw_dataset import save
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
     with bar("budget") as update:
         found = gap_budget(run, data, spec, names(motions), lambda step, done, total: update(done, total, step))
     write_text(run / "budget.json", js.dumps(found, indent=1) + "\n")
-    with mpl.rc_context(STYLE):  # type: ignore[arg-type]
-        fig = waterfall(found)
-        for suffix in ("svg", "png"):
-            fig.savefig(run / f"budget.{suffix}", dpi=160)
+    save(waterfall(found), run / "budget")
     steps = list(found["left"])
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"

@@ -36,7 +36,7 @@ def waterfall(budget: dict[str, Any]) -> Figure:
         ax.set_xticks(range(len(steps) + 1), [*(TITLES[s] for s in steps), "left"] if bottom else [], fontsize=6.5)
     who = "VIRTUAL " if budget["virtual"] else "real "
     fig.suptitle(
-        f"{who}{budget['robot']}, {budget['sequences']} {'held-out' if budget['unseen'] else ''} recordings: "
+        f"{who}{budget['robot']}, {budget['sequences']} {'held-out ' if budget['unseen'] else ''}recordings: "
         "what each step removes (hollow: adds); dashed: encoder and repeatability",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip

@@ -42,6 +42,7 @@ class BatchSim:
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
         self._late = CommandHistory(self.batch, first) if first.nhistory else None
         self._nstep = np.array([robot.steps_per(c[2]) for c in conditions])
+        self._one_rate = bool((self._nstep == self._nstep[0]).all())
         self._timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
 
@@ -70,9 +71,8 @@ class BatchSim:
             ids: Only these simulations move, (k,) sorted; default all.
         """
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
-        first = int(self._nstep[0])
-        if (self._nstep == first).all():
-            self.batch.step(ids, nstep=first)
+        if self._one_rate:
+            self.batch.step(ids, nstep=int(self._nstep[0]))
             return
         moving = np.arange(self.num_envs) if ids is None else ids
         for n in np.unique(self._nstep[moving]):
