@@ -140,3 +140,14 @@ def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(tr
     assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
     assert result["methods"]["identified"]["mpjae"] < 0.6 * result["methods"]["nominal"]["mpjae"]
     assert result["methods"]["gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]
+
+
+def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
+    def error(trainer, net):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+        fitted = net is not None and bool(net.trunk[-1].weight.any())
+        return 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
+
+    monkeypatch.setattr(Trainer, "validate", error)
+    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    assert model.card["gain"] == 0.5
+    assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)

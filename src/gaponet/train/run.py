@@ -102,6 +102,7 @@ class Trainer:
         torch.set_num_threads(config.torch_threads)
         self.net = build_network(config.model, self.n)
         self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
+        self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, better or not
         self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
         self.sensor_r2 = self.reward = self.val = self.nominal = float("nan")
         self.runner_state: dict[str, Any] | None = None
@@ -182,12 +183,14 @@ class Trainer:
         self._consider()
 
     def _shrink(self) -> None:
-        """Less of the best correction where validation motions say so."""
+        """Less of the best correction where validation motions say so, even where all of it does harm."""
+        if not np.isfinite(self.trained):
+            return
         self.stage = "gain"
         self._tick()
         self.net = build_network(self.config.model, self.n)
-        self.net.load_state_dict(self.best_state)
-        if choose_gain(self.net, lambda: self.validate(self.net), self.best) < 1.0:
+        self.net.load_state_dict(self.trained_state)
+        if choose_gain(self.net, lambda: self.validate(self.net), self.trained) < 1.0:
             self._consider()
 
     def finish(self) -> GapModel:
@@ -222,6 +225,8 @@ class Trainer:
         self.val = self.validate(self.net)
         if self.val < self.best:
             self.best, self.best_state = self.val, copy.deepcopy(self.net.state_dict())
+        if self.stage in ("warm start", "ppo") and self.val < self.trained:
+            self.trained, self.trained_state = self.val, copy.deepcopy(self.net.state_dict())
         line = {
             "stage": self.stage, "steps": self.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
             "val_mpjae": self.val, "nominal_mpjae": self.nominal,
@@ -249,6 +254,7 @@ class Trainer:
     def _save(self) -> None:
         state = {
             "net": self.net.state_dict(), "best_state": self.best_state, "best": self.best, "val": self.val,
+            "trained_state": self.trained_state, "trained": self.trained,
             "steps": self.steps, "seconds": self.seconds(), "rounds_done": self.rounds_done, "updates": self.updates,
             "sensor_r2": self.sensor_r2, "runner": self.runner_state, "rng": torch.get_rng_state(),
         }  # fmt: skip
@@ -264,6 +270,7 @@ class Trainer:
             reason = str(error).splitlines()[0]
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
         self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
+        self.trained_state, self.trained = state["trained_state"], state["trained"]
         self.steps, self.earlier = state["steps"], state["seconds"]
         self.rounds_done, self.updates, self.sensor_r2 = state["rounds_done"], state["updates"], state["sensor_r2"]
         self.runner_state = state["runner"]
