@@ -116,6 +116,11 @@ def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
     assert {e.meta.unit_id for e in parts["test"]} == {"a", "b"}
     with pytest.raises(UsageError, match="unit 'c' is not in"):
         split_entries(data, ("c",))
+    parts = split_entries(data, holdout_payloads=(0.2,))
+    assert {e.meta.payload_mass for e in parts["train"] + parts["val"]} == {0.0}
+    assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
+    with pytest.raises(UsageError, match=r"no recording with 3 kg .* it holds 0, 0.2 kg"):
+        split_entries(data, holdout_payloads=(3.0,))
 
 
 @pytest.mark.parametrize(

@@ -86,6 +86,8 @@ class TrainConfig:
     """Seed of everything random."""
     episode_s: float = 10.0
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
+    holdout_payloads: tuple[float, ...] = ()
+    """Payloads never trained on, kg; their test motions stay in the test part."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
     torch_threads: int = 1

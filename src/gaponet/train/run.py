@@ -94,7 +94,7 @@ class Trainer:
             budget,
             show,
         )
-        self.parts = split_entries(dataset, holdout_units)
+        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
