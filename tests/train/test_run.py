@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from arm import recordings, write_arm
+from arm import commands, record, recordings, write_arm
 
 from gaponet.data.pair import require_disjoint
 from gaponet.data.split import split_entries
@@ -116,6 +116,13 @@ def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
     assert {e.meta.unit_id for e in parts["test"]} == {"a", "b"}
     with pytest.raises(UsageError, match="unit 'c' is not in"):
         split_entries(data, ("c",))
+
+
+def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for seed in range(4):
+        for payload in (0.0, 0.2):
+            data.append(record(robot, commands(40, seed), f"motion{seed}", payload))
     parts = split_entries(data, holdout_payloads=(0.2,))
     assert {e.meta.payload_mass for e in parts["train"] + parts["val"]} == {0.0}
     assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
