@@ -88,5 +88,7 @@ class TrainConfig:
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
+    threads: int = 0
+    """Threads of the simulator; 0 for all cores."""
     torch_threads: int = 1
     """Threads of the learner; more of them fight with the simulator's pool."""
