@@ -23,6 +23,7 @@ COMMANDS = {
     "calibrate": "gaponet.cli.calibrate:calibrate",
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",
+    "compare": "gaponet.cli.compare:compare",
     "budget": "gaponet.cli.budget:budget",
     "runs": "gaponet.cli.runs:runs",
     "demo": "gaponet.cli.demo:demo",

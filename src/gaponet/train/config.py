@@ -90,5 +90,7 @@ class TrainConfig:
     """Payloads never trained on, kg; their test motions stay in the test part."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
+    threads: int = 0
+    """Threads of the simulator; 0 for all cores."""
     torch_threads: int = 1
     """Threads of the learner; more of them fight with the simulator's pool."""

@@ -115,7 +115,7 @@ class Trainer:
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
         self.nominal = self.validate(None)
-        self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot)
+        self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
             if not np.isfinite(self.best):
@@ -132,13 +132,11 @@ class Trainer:
 
     def _warm_start(self) -> None:
         config = self.config.warm_start
-        env = DeltaEnv(
-            self.train_set, self.robot, self.config.model, config.num_envs, 10**9, self.config.reward, self.config.seed
-        )
+        env = self._env(config.num_envs, 10**9, self.config.seed)
         if self.net.predictor is not None and self.rounds_done == 0:
             self.stage = "sensors"
             self._tick()
-            self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed)
+            self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed, self.config.threads)
         limit = 0.99 * self.config.model.delta_max
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed)
@@ -156,9 +154,7 @@ class Trainer:
             return
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
-        env = DeltaEnv(
-            self.train_set, self.robot, self.config.model, ppo.num_envs, steps, self.config.reward, self.config.seed + 1
-        )
+        env = self._env(ppo.num_envs, steps, self.config.seed + 1)
         runner = make_runner(env, self.config)
         if self.runner_state is not None:
             runner.alg.load(self.runner_state, None, True)
@@ -200,11 +196,14 @@ class Trainer:
         net = build_network(self.config.model, self.n)
         net.load_state_dict(self.best_state)
         net.eval()
-        env = DeltaEnv(
-            self.train_set, self.robot, self.config.model, max(64, len(self._conditions())), 10, self.config.reward
-        )
+        env = self._env(max(64, len(self._conditions())), 10, seed=0)
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
         return GapModel.load(self.out)
+
+    def _env(self, num_envs: int, episode_steps: int, seed: int) -> DeltaEnv:
+        """The training environment over the training motions."""
+        c = self.config
+        return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, c.reward, seed, c.threads)
 
     # ---- validation, checkpoints, card
 
@@ -216,7 +215,7 @@ class Trainer:
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
-        twins = replay(picked, simulator, corrector, lock_idle=True)
+        twins = replay(picked, simulator, corrector, self.config.threads, lock_idle=True)
         op = self.robot.operated_index
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 

@@ -28,6 +28,7 @@ def sensor_labels(
     conditions: list[Condition],
     locked: tuple[str, ...],
     seed: int,
+    nthread: int = 0,
 ) -> tuple[Tensor, Tensor]:
     """Standardised features and oracle answers: a third at recorded states, a third near them, a third anywhere.
 
@@ -42,10 +43,11 @@ def sensor_labels(
         conditions: Payload and period of each state.
         locked: Joints clamped in the simulator.
         seed: Of the perturbations.
+        nthread: Threads of the simulator, 0 for all cores.
     """
     rng = np.random.default_rng(seed)
     third = rng.integers(0, 3, len(qpos))
-    oracle, n = ProbeOracle(robot, net.config, conditions, locked=locked), net.n
+    oracle, n = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)

@@ -105,7 +105,7 @@ class WarmStart:
         return float(np.sqrt(total / config.gradient_steps))
 
 
-def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int) -> float:
+def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthread: int = 0) -> float:
     """Standardise on the environment's recorded start states, fit the predictor there; returns held-out R²."""
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
@@ -131,5 +131,6 @@ def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int) ->
         [env.conditions[g] for g in group[shuffled]],
         env.locked,
         seed,
+        nthread,
     )
     return fit_predictor(net, features, answers, seed)
