@@ -12,12 +12,12 @@ import torch
 
 from gaponet.errors import ModelError
 from gaponet.model.artifact import CARD, WEIGHTS, infer_session, write_card
-from gaponet.model.deeponet import DeltaMLP, OperatorNet
+from gaponet.model.layers import DeltaNet
 
 PARITY = 1e-5  # rad
 
 
-def export(net: OperatorNet | DeltaMLP, folder: Path, card: dict[str, Any], samples: np.ndarray) -> float:
+def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: np.ndarray) -> float:
     """Write model.onnx and card.json.
 
     Args:

@@ -40,7 +40,7 @@ from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
 from gaponet.train.ppo import make_runner, update
-from gaponet.train.warm_start import WarmStart, fit_sensors
+from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
 
 Array = np.ndarray
 
@@ -119,7 +119,7 @@ class Trainer:
         try:
             if not np.isfinite(self.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
-            if self.config.warm_start.rounds > self.rounds_done:
+            if recipe(self.config).rounds > self.rounds_done:
                 self._warm_start()
             self._ppo()
             self._shrink()
@@ -130,7 +130,7 @@ class Trainer:
     # ---- stages
 
     def _warm_start(self) -> None:
-        config = self.config.warm_start
+        config = recipe(self.config)
         env = DeltaEnv(
             self.train_set, self.robot, self.config.model, config.num_envs, 10**9, self.config.reward, self.config.seed
         )
@@ -151,7 +151,7 @@ class Trainer:
 
     def _ppo(self) -> None:
         ppo = self.config.ppo
-        if self._spent() >= 1:
+        if self._spent() >= 1 or self.config.model.kind == "inverse":
             return
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaponet.model.deeponet import OperatorNet
+from gaponet.model.layers import DeltaNet
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import Condition
@@ -20,7 +20,7 @@ POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states 
 
 
 def sensor_labels(
-    net: OperatorNet,
+    net: DeltaNet,
     robot: RobotSpec,
     x: Array,
     qpos: Array,
@@ -72,7 +72,7 @@ def shift_positions(shift: Array, history: int, dim: int) -> Array:
     return out
 
 
-def fit_predictor(net: OperatorNet, features: Tensor, answers: Tensor, seed: int) -> float:
+def fit_predictor(net: DeltaNet, features: Tensor, answers: Tensor, seed: int) -> float:
     """Gaussian likelihood on three quarters of the states; returns R² on the rest, averaged over sensor values.
 
     The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.

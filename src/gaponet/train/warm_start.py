@@ -3,31 +3,42 @@
 Fitted on recorded states alone, a policy meets other states as soon as it errs and errs more. So each round rolls the
 present policy out, labels every visited state with u* − a of its row (train/inverse.py: right wherever the state is,
 the plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven
-by the labels themselves and only seeds the second.
+by the labels themselves and only seeds the second; the inverse-label baseline stops after it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from gaponet.model.deeponet import DeltaMLP, OperatorNet
+from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
-from gaponet.train.config import WarmStartConfig
+from gaponet.train.config import TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.sensor_fit import STATES, fit_predictor, sensor_labels
 
 Array = np.ndarray
 
 
+def recipe(config: TrainConfig) -> WarmStartConfig:
+    """The warm start of a kind of model.
+
+    The inverse-label baseline has one round, on recorded motions that the labels lead along, undisturbed, with the
+    gradient steps of all rounds together.
+    """
+    warm = config.warm_start
+    if config.model.kind != "inverse" or not warm.rounds:
+        return warm
+    return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps, disturbance=0.0)
+
+
 class WarmStart:
     """The pool of visited states and the optimiser; `round` collects and fits once."""
 
-    def __init__(
-        self, net: OperatorNet | DeltaMLP, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int
-    ) -> None:
+    def __init__(self, net: DeltaNet, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int) -> None:
         """labels: Δa* of every row of the environment's data, (N, n)."""
         self.net, self.env, self.labels, self.config = net, env, labels, config
         self.generator = torch.Generator().manual_seed(seed)
@@ -82,7 +93,7 @@ class WarmStart:
         """
         self.collect(follow_labels=self.done == 0)
         if self.done == 0:
-            self.net.features.standardise.fit(self.net.features.relative(self.pool_x[0]))
+            self.net.fit_inputs(self.pool_x[0])
         x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
         config, net, total = self.config, self.net, 0.0
         net.train()
@@ -105,7 +116,7 @@ class WarmStart:
         return float(np.sqrt(total / config.gradient_steps))
 
 
-def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int) -> float:
+def fit_sensors(net: DeltaNet, env: DeltaEnv, robot: RobotSpec, seed: int) -> float:
     """Standardise on the environment's recorded start states, fit the predictor there; returns held-out R²."""
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
