@@ -82,6 +82,22 @@ def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tm
     assert set(ORDER) == set(NAMES) == set(COLOURS) - {"recorded"}
 
 
+@pytest.mark.parametrize(
+    "change", [{"sensors": "oracle"}, {"sensors": "learned"}, {"delta_hold": 2, "sensor_hold": 3}],
+    ids=["oracle", "learned", "held"],
+)  # fmt: skip
+def test_switches_of_the_operator_train_and_are_evaluated_as_they_ship(change, trained, robot, tmp_path):
+    config = replace(SMALL, model=replace(SMALL.model, **change), validate_every=1)
+    budget = Budget(steps=3 * 16 * 60 + 16 * 16)
+    model = Trainer(trained[0], robot, tmp_path / "run", config, budget).run()
+    assert model.card["simulator_only"] == ("sensors" in change)
+    assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    methods = evaluate([tmp_path / "run"], trained[0], robot).result["methods"]
+    assert methods["gaponet"]["mpjae"] < methods["nominal"]["mpjae"]
+    if change.get("sensors") != "oracle":
+        assert model.card["sensor_r2"]["mean"] > 0.3
+
+
 def test_the_card_says_what_the_model_is(trained):
     card = trained[2].card
     assert card["joint_names"] == ["shoulder", "elbow"]

@@ -117,6 +117,11 @@ class ModelConfig:
         return self.kind == "gaponet" and self.sensors in ("oracle", "learned")
 
     @property
+    def learns_points(self) -> bool:
+        """Whether a network chooses where the simulator is asked."""
+        return self.asks_simulator and self.sensors == "learned"
+
+    @property
     def keeps_observation(self) -> bool:
         """Whether x carries the observation of the last refresh, for what the sensors are predicted or chosen from."""
         return self.kind == "gaponet" and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
