@@ -88,7 +88,7 @@ def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tm
 )  # fmt: skip
 def test_switches_of_the_operator_train_and_are_evaluated_as_they_ship(change, trained, robot, tmp_path):
     config = replace(SMALL, model=replace(SMALL.model, **change), validate_every=1)
-    budget = Budget(steps=3 * 16 * 60 + 16 * 16)
+    budget = Budget(steps=3 * 16 * 60 + 3 * 16 * 16)
     model = Trainer(trained[0], robot, tmp_path / "run", config, budget).run()
     assert model.card["simulator_only"] == ("sensors" in change)
     assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
