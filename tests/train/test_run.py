@@ -1,6 +1,7 @@
 """Training runs, small: what is kept, what is refused, what survives an interruption."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from gaponet.data.pair import require_disjoint
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
-from gaponet.eval.evaluate import evaluate
+from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
+from gaponet.eval.figures import COLOURS, NAMES
 from gaponet.model.config import ModelConfig
 from gaponet.train.budget import Budget
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
@@ -50,6 +52,50 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
     assert result["unseen"]
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
     assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+@pytest.mark.parametrize("kind", ["mlp", "transformer", "fno", "inverse"])
+def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
+    data, run, _ = trained
+    config = replace(
+        SMALL,
+        model=replace(
+            SMALL.model,
+            kind=kind,
+            mlp_hidden=(64,),
+            fno_width=16,
+            fno_layers=1,
+            transformer_width=16,
+            transformer_layers=1,
+        ),
+    )
+    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
+    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    if kind == "inverse":  # one regression, no roll-outs of its own, no PPO
+        assert [line["stage"] for line in lines][:2] == ["start", "warm start"]
+        assert {line["steps"] for line in lines} == {0, 16 * 60}
+    else:
+        assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+        assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    result = evaluate([run, tmp_path / "run"], data, robot).result
+    assert [m for m in result["methods"] if m in LEARNED] == [kind, "gaponet"]
+    assert set(ORDER) == set(NAMES) == set(COLOURS) - {"recorded"}
+
+
+@pytest.mark.parametrize(
+    "change", [{"sensors": "oracle"}, {"sensors": "learned"}, {"delta_hold": 2, "sensor_hold": 3}],
+    ids=["oracle", "learned", "held"],
+)  # fmt: skip
+def test_switches_of_the_operator_train_and_are_evaluated_as_they_ship(change, trained, robot, tmp_path):
+    config = replace(SMALL, model=replace(SMALL.model, **change), validate_every=1)
+    budget = Budget(steps=3 * 16 * 60 + 3 * 16 * 16)
+    model = Trainer(trained[0], robot, tmp_path / "run", config, budget).run()
+    assert model.card["simulator_only"] == ("sensors" in change)
+    assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    methods = evaluate([tmp_path / "run"], trained[0], robot).result["methods"]
+    assert methods["gaponet"]["mpjae"] < methods["nominal"]["mpjae"]
+    if change.get("sensors") != "oracle":
+        assert model.card["sensor_r2"]["mean"] > 0.3
 
 
 def test_the_card_says_what_the_model_is(trained):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -12,6 +12,7 @@ from gaponet.cli.gap import mrad, show_methods
 from gaponet.cli.inputs import names, open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
+from gaponet.model.config import Kind
 from gaponet.robot import RobotSpec
 from gaponet.train.config import TrainConfig
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 def train(
     dataset: tyro.conf.Positional[Path],
     out: Path,
-    model: Literal["gaponet", "mlp"] = "gaponet",
+    model: Kind = "gaponet",
     budget: str = "10m",
     resume: tyro.conf.FlagCreatePairsOff[bool] = False,
     robot: str | None = None,
@@ -38,7 +39,7 @@ def train(
     Args:
         dataset: Dataset folder.
         out: Run folder.
-        model: gaponet, or the mlp baseline.
+        model: gaponet, or a baseline: mlp, transformer, fno, inverse.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
         robot: Robot name or folder, if not the package's robot of the dataset.

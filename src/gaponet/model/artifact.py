@@ -12,7 +12,8 @@ import numpy as np
 
 from gaponet.errors import ModelError
 from gaponet.model.config import ModelConfig
-from gaponet.model.corrector import DeltaCorrector, Infer
+from gaponet.model.corrector import DeltaCorrector
+from gaponet.model.inputs import Infer
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray
@@ -39,6 +40,7 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         "kd": [float(robot.kd[i]) for i in robot.operated_index],
         "simulator_hash": model_hash(robot),
         "model": asdict(config),
+        "simulator_only": config.asks_simulator,  # a bound to compare with, not for a robot
     } | facts
 
 
@@ -49,8 +51,8 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
-def infer_session(path: Path) -> Infer:
-    """An ONNX file as a function of numpy arrays, on one thread."""
+def infer_session(path: Path, output: str = "delta") -> Infer:
+    """An ONNX file as a function of numpy arrays, on one thread; models with learned points also have "offsets"."""
     try:
         import onnxruntime as ort
         from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
@@ -65,7 +67,7 @@ def infer_session(path: Path) -> Infer:
         raise ModelError(
             f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
         ) from None
-    return lambda x: session.run(None, {"x": x})[0]
+    return lambda x: session.run([output], {"x": x})[0]
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,8 @@ class GapModel:
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
         """For sim.replay and the aligned simulator; refuses a robot the model was not trained on."""
         self.require(robot)
-        return DeltaCorrector(self.infer, self.config, robot)
+        points = infer_session(self.path / WEIGHTS, "offsets") if self.config.learns_points else None
+        return DeltaCorrector(self.infer, self.config, robot, points)
 
     def weights_hash(self) -> str:
         """12 hex digits of model.onnx."""

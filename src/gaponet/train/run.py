@@ -31,6 +31,7 @@ from gaponet.model.baselines import delay_offset
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
+from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
@@ -40,7 +41,8 @@ from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
 from gaponet.train.ppo import make_runner, update
-from gaponet.train.warm_start import WarmStart, fit_sensors
+from gaponet.train.sensor_fit import Report, points_of, report_of
+from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
 
 Array = np.ndarray
 
@@ -104,7 +106,8 @@ class Trainer:
         self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
         self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, better or not
         self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
-        self.sensor_r2 = self.reward = self.val = self.nominal = float("nan")
+        self.reward = self.val = self.nominal = float("nan")
+        self.sensor_r2: Report | None = None
         self.runner_state: dict[str, Any] | None = None
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
@@ -120,7 +123,7 @@ class Trainer:
         try:
             if not np.isfinite(self.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
-            if self.config.warm_start.rounds > self.rounds_done:
+            if recipe(self.config).rounds > self.rounds_done:
                 self._warm_start()
             self._ppo()
             self._shrink()
@@ -131,7 +134,7 @@ class Trainer:
     # ---- stages
 
     def _warm_start(self) -> None:
-        config = self.config.warm_start
+        config = recipe(self.config)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         if self.net.predictor is not None and self.rounds_done == 0:
             self.stage = "sensors"
@@ -144,13 +147,15 @@ class Trainer:
         self.stage = "warm start"
         while warm.done < config.rounds and self._spent() < 1:
             warm.round(self._tick)
+            if self.sensor_r2 is not None:
+                self.sensor_r2 = warm.refresh_sensors(self.sensor_r2, self.config.threads)
             self.rounds_done = warm.done
             self.steps += config.num_envs * config.steps
             self._consider()
 
     def _ppo(self) -> None:
         ppo = self.config.ppo
-        if self._spent() >= 1:
+        if self._spent() >= 1 or self.config.model.kind == "inverse":
             return
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
@@ -161,6 +166,7 @@ class Trainer:
         else:
             runner.alg.actor.mlp.load_state_dict(self.best_state)
         self.net = runner.alg.actor.mlp
+        env.inputs.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         if self.net.predictor is not None:
             self.net.predictor.requires_grad_(False)
         trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
@@ -169,7 +175,7 @@ class Trainer:
                 p.requires_grad_(self.updates >= ppo.critic_warmup)
             update(runner)
             self.updates += 1
-            self.steps += ppo.num_envs * ppo.num_steps
+            self.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
             self.reward = env.mean_reward()
             self._tick()
             if self.updates % self.config.validate_every == 0:
@@ -207,17 +213,20 @@ class Trainer:
 
     # ---- validation, checkpoints, card
 
-    def validate(self, net: torch.nn.Module | None) -> float:
+    def validate(self, net: DeltaNet | None) -> float:
         """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
 
         Nominal is the simulator before identification, also where training starts from an identified one.
         """
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
-        corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
+        corrector = self._corrector(net) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
         twins = replay(picked, simulator, corrector, self.config.threads, lock_idle=True)
         op = self.robot.operated_index
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
+
+    def _corrector(self, net: DeltaNet) -> DeltaCorrector:
+        return DeltaCorrector(torch_infer(net), self.config.model, self.robot, points_of(net))
 
     def _consider(self) -> None:
         """Validate the present network, keep it if it is the best, write progress and checkpoint."""
@@ -271,7 +280,8 @@ class Trainer:
         self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
         self.trained_state, self.trained = state["trained_state"], state["trained"]
         self.steps, self.earlier = state["steps"], state["seconds"]
-        self.rounds_done, self.updates, self.sensor_r2 = state["rounds_done"], state["updates"], state["sensor_r2"]
+        self.rounds_done, self.updates = state["rounds_done"], state["updates"]
+        self.sensor_r2 = report_of(state["sensor_r2"])
         self.runner_state = state["runner"]
         torch.set_rng_state(state["rng"])
 
@@ -303,7 +313,7 @@ class Trainer:
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
             val_mpjae={"model": self.best, "nominal": self.nominal},
-            sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
+            sensor_r2=self.sensor_r2,
             seed=self.config.seed,
             gain=self.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
