@@ -20,8 +20,8 @@ from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import WINDOW, identify
 
-FIELDS = ("kp", "frictionloss", "offset", "delay")
-PRIOR = 0.1  # rad per scale: outweighed by a few seconds of log that show something else
+FIELDS = ("kp", "damping", "frictionloss", "offset", "delay")
+PRIOR = 0.3  # rad per scale: outweighed by a few seconds of log that show something else
 
 
 @dataclass(frozen=True)
