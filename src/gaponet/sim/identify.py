@@ -265,7 +265,7 @@ class _Problem:
         return [replace(s, meta=replace(s.meta, payload_mass=float(x[-1]))) for s in self.parts]
 
     def _prices(self) -> Array:
-        """Prior residual by parameter, (P, P), payload apart; what all joints do together costs TOGETHER of the rest."""
+        """Prior residual by parameter, (P, P), payload apart; what all joints do together costs TOGETHER of it."""
         common = np.full((self.n, self.n), (1 - TOGETHER) / self.n)
         blocks = [np.eye(self.n) - (common if f != "offset" else 0.0) for f in self.limits]
         return self.prior * np.asarray(block_diag(*blocks))
