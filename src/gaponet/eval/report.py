@@ -254,6 +254,8 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
         ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
+        ["sensors", "the simulator's own answers: a bound, not for a robot" if card.get("simulator_only") else
+         shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
         ["sensor predictor R²", _r2(r2)],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
         ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['init_std']:g} rad"],

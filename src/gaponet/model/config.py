@@ -52,7 +52,8 @@ class ModelConfig:
     sensor_target: Literal["delta", "absolute"] = "delta"
     """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
     sensor_hold: int = 1
-    """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh."""
+    """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh. With
+    delta_hold they are refreshed at the next decision."""
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""

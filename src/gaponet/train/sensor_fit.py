@@ -85,17 +85,17 @@ def sensor_labels(
     """
     rng = np.random.default_rng(seed)
     third = rng.integers(0, 3 if move else 1, len(qpos))
-    oracle, n = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n
+    oracle, n, at = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n, net.features.layout
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)
     q[np.ix_(near, op)] += rng.normal(0, POSITION_NOISE, (len(near), n))
     v[np.ix_(near, op)] += rng.normal(0, VELOCITY_NOISE, (len(near), n))
-    x[near, :n], x[near, n : 2 * n] = q[np.ix_(near, op)], v[np.ix_(near, op)]
+    x[near, at.q], x[near, at.v] = q[np.ix_(near, op)], v[np.ix_(near, op)]
     low, high = np.clip(robot.qpos_range[robot.operated_index].T, -np.pi, np.pi)
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
     q[np.ix_(far, op)] += shift
-    x[far] += shift_positions(shift, net.features.layout)
+    x[far] += shift_positions(shift, at)
     offsets = None
     if net.config.sensors == "learned":
         limit = net.config.probe_large
@@ -166,7 +166,7 @@ def explained(net: DeltaNet, asked: Asked, joints: tuple[str, ...]) -> Report:
 
 
 def report_of(stored: Report | float | None) -> Report | None:
-    """The report of a checkpoint; those of before 0.2 hold the mean alone, or not-a-number."""
+    """The report of a checkpoint; older ones hold the mean alone, or not-a-number."""
     if isinstance(stored, float):
         whole = {"mean": stored, "by_joint": {}, "by_probe": [], "fitted": stored, "visited": stored, "refits": 0}
         return whole if stored == stored else None

@@ -109,13 +109,12 @@ class WarmStart:
         allowed = self.config.sensor_refresh
         if allowed is None or self.net.predictor is None or not self.visited:
             return report
-        found = explained(self.net, self._ask_visited(STATES // 4, nthread, move=False), self.env.robot.operated)[
-            "mean"
-        ]
+        joints = self.env.robot.operated
+        found = explained(self.net, self._ask_visited(STATES // 4, nthread, move=False), joints)["mean"]
         if found >= report["fitted"] - allowed:
             return report | {"visited": found}
         asked = self._ask_visited(STATES, nthread, move=True)
-        new = fit_predictor(self.net, asked, self.env.robot.operated, self.seed + self.done, refit=True)
+        new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
         return new | {"refits": report["refits"] + 1}
 
     def _ask_visited(self, count: int, nthread: int, move: bool) -> Asked:
