@@ -86,7 +86,7 @@ def test_numpy_needs_neither_the_onnx_file_nor_onnxruntime(artifact, tmp_path, m
         (tmp_path / name).write_bytes((artifact / name).read_bytes())
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
     assert GapModel.load(tmp_path, "numpy").delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0).shape == (2,)
-    with pytest.raises(ModelError, match="no model.onnx"):
+    with pytest.raises(ModelError, match=r"no model\.onnx"):
         GapModel.load(tmp_path)
     with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]', or load with backend='numpy'"):
         GapModel.load(artifact)
@@ -169,6 +169,6 @@ def test_torchscript_of_other_weights_is_refused(artifact, tmp_path):
     for file in artifact.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
     np.savez(folder / "weights.npz", **fuse(trained(stride=2, num_basis=4)))
-    with pytest.raises(ModelError, match="TorchScript and .* differ by"):
+    with pytest.raises(ModelError, match=r"TorchScript and .* differ by"):
         export_torchscript(GapModel.load(folder), folder, tmp_path / "delta.pt")
     assert not (tmp_path / "delta.pt").exists()

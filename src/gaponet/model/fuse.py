@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import DeltaMLP, OperatorNet
 from gaponet.model.fused import CLAMP
 
