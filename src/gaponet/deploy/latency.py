@@ -23,7 +23,7 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
 
 
 def in_own_process(run: Path, calls: int, threads: int) -> str:
-    """The JSON of `measure` from a fresh interpreter whose numpy has one thread, which is fixed when numpy is loaded."""
+    """The JSON of `measure` from a fresh interpreter: how many threads numpy has is fixed when it is loaded."""
     code = (
         "import json, sys; from pathlib import Path; from gaponet.deploy.latency import measure; "
         "print(json.dumps(measure(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))))"

@@ -54,8 +54,8 @@ class DeltaLoop:
         q, v, a = (x.reshape(shape) if x.size == self.applied.size else x for x in map(np.asarray, (qpos, qvel, ctrl)))
         if not q.shape == v.shape == a.shape == shape:
             raise UsageError(
-                f"delta: qpos {np.shape(qpos)}, qvel {np.shape(qvel)}, ctrl {np.shape(ctrl)}; give the {self.n} operated "
-                f"joints of {self.num_envs} robots each; for another number of robots, reset() first"
+                f"delta: qpos {np.shape(qpos)}, qvel {np.shape(qvel)}, ctrl {np.shape(ctrl)}; give the {self.n} "
+                f"operated joints of {self.num_envs} robots each; for another number of robots, reset() first"
             )
         if self.any_fresh:
             self._begin(q, v, a)
@@ -68,6 +68,28 @@ class DeltaLoop:
         np.minimum(applied, self.high, out=applied)
         self.history.push(q, v, applied)
         return (applied - a).reshape(np.shape(ctrl))
+
+    def solve(
+        self, qpos: Array, qvel: Array, wanted: Array, payload_mass: Array, offset: Array, gain: float, iterations: int
+    ) -> Array:
+        """The inverse: u with u + Δa(u) = wanted, by u ← u + gain (wanted − u − Δa(u)); once per period.
+
+        Args:
+            qpos, qvel, wanted: (num_envs, n) rad, rad/s, rad.
+            payload_mass: (num_envs,) kg.
+            offset: u − wanted of the period before, (num_envs, n) rad; becomes this period's.
+            gain: In (0, 1].
+            iterations: Answers of the network.
+        """
+        if self.any_fresh:
+            self._begin(qpos, qvel, wanted)
+        self.history.observe(qpos, qvel, payload_mass, out=self.observation)
+        for _ in range(iterations):
+            self.action[:] = wanted + offset
+            self.bound.run()
+            offset -= gain * (offset + self.bound.delta)
+        self.history.push(qpos, qvel, wanted)
+        return wanted + offset
 
     def _begin(self, q: Array, v: Array, a: Array) -> None:
         ids = np.flatnonzero(self.fresh)
