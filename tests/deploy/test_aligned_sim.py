@@ -47,7 +47,9 @@ def test_it_is_the_replay_with_the_corrector(robot, model):
     sim.reset(*(np.stack([getattr(s, name)[0] for s in sequences]) for name in ("qpos", "qvel")))
     for t in range(39):
         sim.step(np.stack([s.ctrl[t] for s in sequences]))
-        np.testing.assert_allclose(sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(twins, sequences, strict=True)]), atol=1e-6)  # noqa: E501
+        np.testing.assert_allclose(
+            sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(twins, sequences, strict=True)]), atol=1e-6
+        )  # noqa: E501
         np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in twins]), atol=1e-6)
     assert np.abs(sim.delta).max() > 1e-3
 

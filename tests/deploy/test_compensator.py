@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from arm import commands, write_arm
+from arm import TOML, XML, commands, write_arm
 
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.errors import UsageError
@@ -142,6 +142,30 @@ def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     for end in (150, 300, 450):
         assert np.abs(np.diff(u[end - 20 : end], axis=0)).max() < 1e-3
         assert np.abs(q[end - 20 : end] - targets[end - 20 : end]).max() < 0.02
+
+
+def test_an_arm_that_swings_on_its_servos_is_not_stirred_up(tmp_path):
+    swinging = write_arm(
+        tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.0"), XML.replace('damping="0.5"', 'damping="0.05"')
+    )
+    model = GapModel(Path("exact"), make_card(CONFIG, swinging, dt=[0.02]), CONFIG, Exact())
+    targets = np.repeat([[0.3, -0.2], [-0.4, 0.5]], 400, axis=0)
+    calm = {}
+    for name, config in (("default", NOW), ("fast", replace(NOW, feedback=5.0, feedback_time=0.0))):
+        q, _ = play(WeakArm(swinging, 0.4, late=4), targets, Compensator(swinging, model, config), 0.4)
+        calm[name] = float(np.abs(np.diff(q[-100:], axis=0)).max())
+    assert calm["default"] < 1e-3 < calm["fast"]
+
+
+def test_a_lead_makes_up_for_dead_time(robot, model):
+    targets = commands(200, 1)
+    late = {}
+    for lead in (0, 3):
+        ahead = np.concatenate([targets[lead:], np.repeat(targets[-1:], lead, axis=0)])
+        compensator = Compensator(robot, model, replace(NOW, lead=lead))
+        q, _ = play(WeakArm(robot, 0.2, late=3), ahead, compensator, 0.2)
+        late[lead] = error(q, targets)
+    assert late[3] < 0.4 * late[0]
 
 
 def test_a_payload_that_nobody_announced_is_found(robot, model):

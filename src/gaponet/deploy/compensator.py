@@ -8,8 +8,10 @@ robot, and like the nominal one that is given u + G(u); so u + G(u) = a′ is so
 
 G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and what
 is sent does not depend on what is measured, so there is no loop that could become unstable, and noise does not reach the
-servos. (Asked at the measured state it was no nearer and four times rougher, docs/log.md.) What is then still missing is
-integrated slowly: of a position servo with dead time τ, feedback below 1/τ is stable with ample margin.
+servos. (Asked at the measured state it was no nearer and four times rougher, docs/log.md.)
+
+What is then still missing is integrated, slowly and low-passed: an arm with a load swings on its servo with little damping
+(3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1), and an integrator alone is unstable there above 2ζω, 2 1/s.
 """
 
 from __future__ import annotations
@@ -41,19 +43,27 @@ class CompensatorConfig:
     gain: float = 0.5
     """γ of an iteration; 0.5 converges wherever a change of u changes u + G(u) by a factor between 0 and 4."""
     iterations: int = 2
-    """Per control period, from the last period's answer."""
-    feedback: float = 1.0
+    """Per control period, from the last period's answer; 0 leaves the model out."""
+    feedback: float = 0.5
     """Integration of what is still missing, 1/s; 0 for none."""
+    feedback_time: float = 0.5
+    """Time constant of the low-pass before the integrator, s."""
     feedback_limit: float = 0.1
     """Largest integral, rad."""
     limit: float = 0.5
     """Largest |u − a|, rad."""
     blend: float = 1.0
     """From uncompensated to compensated after a start, s."""
+    lead: int = 0
+    """How many control periods early targets are given, where the motion is known ahead. Zero is causal."""
 
     def __post_init__(self) -> None:
-        if not (0 < self.gain <= 1 and self.iterations > 0 and self.limit > 0 and min(self.feedback, self.blend) >= 0):
-            raise UsageError("compensator: gain must be in (0, 1], iterations and limit positive, times not negative")
+        if not (
+            0 < self.gain <= 1
+            and self.limit > 0
+            and min(self.iterations, self.feedback, self.feedback_time, self.blend, self.lead) >= 0
+        ):
+            raise UsageError("compensator: gain must be in (0, 1], limit positive, the rest not negative")
 
 
 class Compensator:
@@ -125,12 +135,13 @@ class Compensator:
         a = self._all(target)
         self.loop.reset()
         self.offset = np.zeros((self.num_envs, len(self.op)))
-        self.integral, self.sent = np.zeros_like(self.offset), a[:, self.op]
+        self.integral, self.missing, self.sent = np.zeros_like(self.offset), np.zeros_like(self.offset), a[:, self.op]
         self.periods = 0
         rest = np.clip(a[:, self.free], *self.shadow.range.T)
         self._shadow_reset(rest)
         for _ in range(SETTLE):
             self._shadow_step(rest, self._wanted(rest[:, self.at]))
+        self._aimed = [self._shadow_qpos()] * (self.config.lead + 1)  # newest last
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """A payload was picked up or put down, kg; the shadow carries the nearest of `masses`."""
@@ -145,12 +156,13 @@ class Compensator:
         """Commands for the coming control period, rad.
 
         Args:
-            target: What the robot is asked for, rad.
+            target: What the robot is asked for, rad; with a lead, that many periods from now.
             qpos, qvel: Measured now, rad, rad/s; qpos None where no fresh state has arrived: feedback then waits.
             tau: Measured joint torque, N·m, for the payload estimate; default that of the servo law, kp (u − q) − kd q̇.
         """
         a_all = self._all(target)
         a = a_all[:, self.op]
+        self._aimed = [*self._aimed[1:], self._shadow_qpos()]
         if qpos is not None:
             self._observe(self._all(qpos)[:, self.op], qvel, tau)
         wanted = self._wanted(a)
@@ -168,9 +180,8 @@ class Compensator:
 
     @property
     def aimed(self) -> Array:
-        """Where the robot should be now, operated joints, rad: the shadow's positions."""
-        q = self.shadow.qpos[: self.num_envs, self.at]
-        return q[0] if self.single else q
+        """Where the robot should have been at the last step, operated joints, rad."""
+        return self._aimed[0][0] if self.single else self._aimed[0]
 
     # ---- parts
 
@@ -189,15 +200,20 @@ class Compensator:
     def _observe(self, q: Array, qvel: Array | None, tau: Array | None) -> None:
         """Integrate what is missing; anti-windup: not further where the command is at a limit."""
         config = self.config
-        missing = self.shadow.qpos[: self.num_envs, self.at] - q
         if self.periods:
-            further = missing * self.saturated > 0
-            grown = self.integral + config.feedback * self.dt * np.where(further, 0.0, missing)
+            # A blocked joint misses much; it must not take long to forget.
+            missing = np.clip(self._aimed[0] - q, -config.feedback_limit, config.feedback_limit)
+            self.missing += (missing - self.missing) * min(1.0, self.dt / max(config.feedback_time, self.dt))
+            further = self.missing * self.saturated > 0
+            grown = self.integral + config.feedback * self.dt * np.where(further, 0.0, self.missing)
             self.integral = np.clip(grown, -config.feedback_limit, config.feedback_limit)
         if not self.told:
             v = np.zeros_like(q) if qvel is None else self._all(qvel)[:, self.op]
             force = None if tau is None else self._all(tau)[:, self.op]
             self.set_payload(self.estimate.update(q, v, self.sent, force))
+
+    def _shadow_qpos(self) -> Array:
+        return self.shadow.qpos[: self.num_envs, self.at]
 
     def _shadow_reset(self, rest: Array) -> None:
         self.shadow.reset(self.ids, rest, 0.0)  # type: ignore[arg-type]
