@@ -49,7 +49,7 @@ def test_it_is_the_replay_with_the_corrector(robot, model):
         sim.step(np.stack([s.ctrl[t] for s in sequences]))
         np.testing.assert_allclose(
             sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(twins, sequences, strict=True)]), atol=1e-6
-        )  # noqa: E501
+        )
         np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in twins]), atol=1e-6)
     assert np.abs(sim.delta).max() > 1e-3
 

@@ -135,9 +135,16 @@ def test_commands_blend_in(robot, model):
 def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
     targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)
     arm, compensator = WeakArm(robot, 0.0, late, lost), Compensator(robot, model, NOW)
-    q, u = play(arm, targets, compensator, 0.0, {
-        200: lambda: (arm.load(1), compensator.set_payload(0.4)), 350: lambda: (arm.load(0), compensator.set_payload(0)),
-    })  # fmt: skip
+
+    def load(heavy, mass):
+        arm.load(heavy)
+        compensator.set_payload(mass)
+
+    def load(heavy, mass):
+        arm.load(heavy)
+        compensator.set_payload(mass)
+
+    q, u = play(arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)})
     assert np.abs(u - targets).max() <= NOW.limit + 1e-12
     for end in (150, 300, 450):
         assert np.abs(np.diff(u[end - 20 : end], axis=0)).max() < 1e-3

@@ -58,9 +58,9 @@ def measure(run: Path, calls: int = 3000, threads: int = 1) -> dict[str, Any]:
         turns[f"delta(), {name}"] = _delta(model, rng.normal(0, 0.3, (64, 3, n)))
     micro: dict[str, list[Array]] = {name: [] for name in turns}
     for _ in range(10):
-        for name, turn in turns.items():
-            micro[name].append(timed(turn, max(calls // 10, 10)))
-    calls_us = {name: quantiles(np.concatenate(times)) for name, times in micro.items()}
+        for what, turn in turns.items():
+            micro[what].append(timed(turn, max(calls // 10, 10)))
+    calls_us = {what: quantiles(np.concatenate(times)) for what, times in micro.items()}
     batch = {name: batch_speed(GapModel.load(run, name, threads), rng) for name in models}
     return {"run": str(run), "joints": n, "model": models["onnxruntime"].card["model"], "microseconds": calls_us,
             "batch": BATCH, "threads": threads, "deltas_per_s": batch}  # fmt: skip

@@ -144,6 +144,13 @@ def _name(part: str, layers: Layers) -> dict[str, Array]:
 class FusedNet(nn.Module):
     """The fused form in torch, for the exporters: x (B, dim) → Δa (B, n). All shapes but B are constants."""
 
+    relative: Tensor
+    mean: Tensor
+    scale: Tensor
+    bias: Tensor
+    total: Tensor
+    delta_max: Tensor
+
     def __init__(self, weights: dict[str, Array]) -> None:
         super().__init__()
         self.kind, self.n = str(weights["kind"]), len(weights["bias"])

@@ -141,9 +141,9 @@ def compare(module: Any, model: GapModel, num_envs: int = 3) -> float:
             ctrl = ctrl + rng.normal(0, 0.02, ctrl.shape)
             qvel = rng.normal(0, 0.3, ctrl.shape)
             qpos = qpos + 0.3 * (ctrl - qpos)
-            state = [np.float32(x) for x in (qpos, qvel, ctrl)]
-            theirs = module(*(torch.from_numpy(x) for x in (*state, payload))).numpy()
-            worst = max(worst, float(np.abs(theirs - loop.delta(*state, payload)).max()))
+            q, v, a = (x.astype(np.float32) for x in (qpos, qvel, ctrl))
+            theirs = module(*(torch.from_numpy(x) for x in (q, v, a, payload))).numpy()
+            worst = max(worst, float(np.abs(theirs - loop.delta(q, v, a, payload)).max()))
     return worst
 
 
