@@ -140,10 +140,6 @@ def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
         arm.load(heavy)
         compensator.set_payload(mass)
 
-    def load(heavy, mass):
-        arm.load(heavy)
-        compensator.set_payload(mass)
-
     q, u = play(arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)})
     assert np.abs(u - targets).max() <= NOW.limit + 1e-12
     for end in (150, 300, 450):

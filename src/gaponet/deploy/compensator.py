@@ -1,17 +1,17 @@
 """The inverse use: commands u that make the robot do what it was asked.
 
-A shadow, the nominal simulator, is given a′ and shows how the robot should move. The robot that is given u moves like the
-nominal simulator that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
+A shadow, the nominal simulator, is given a′ and shows how the robot should move. The robot that is given u moves like
+the nominal simulator that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
 
     aim "target":     a′ = a + gravity / kp at the shadow, so that it does not sag under arm and payload
     aim "simulator":  a′ = a, so that the robot does what the nominal simulator does, sag included
 
-G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and what
-is sent does not depend on what is measured: there is no loop that could become unstable, and noise does not reach the
-servos. (Asked at the measured state it was no nearer and four times rougher, docs/log.md.)
+G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and
+what is sent does not depend on what is measured: there is no loop that could become unstable, and noise does not reach
+the servos. (Asked at the measured state it was no nearer and four times rougher, docs/log.md.)
 
-What is then still missing is integrated, slowly and low-passed: a loaded arm swings on its servo with little damping (3 kg
-on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1), and an integrator alone is unstable there above 2ζω, 2 1/s.
+What is then still missing is integrated, slowly and low-passed: a loaded arm swings on its servo with little damping
+(3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1), and an integrator alone is unstable there above 2ζω, 2 1/s.
 """
 
 from __future__ import annotations
