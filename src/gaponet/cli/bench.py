@@ -32,13 +32,14 @@ def bench(
     """
     from gaponet.cli.aligned import aligned
     from gaponet.cli.latency import latency
-    from gaponet.train.bench import bench_sim
 
     out = Out(json)
     if what == "latency":
         return latency(run, out)
     if what == "aligned":
         return aligned(run, out, num_envs, rounds)
+    from gaponet.train.bench import bench_sim
+
     result = bench_sim(load_robot(robot), num_envs, rounds=rounds)
     out.table(f"{robot}, {num_envs} simulations", ["", "control steps/s", "of bare"], [
         [name, f"{r['control_steps_per_s']:,.0f}", f"{r['ratio'] * 100:.0f} %"] for name, r in result.items()
