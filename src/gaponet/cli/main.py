@@ -21,6 +21,7 @@ COMMANDS = {
     "identify": "gaponet.cli.identify:identify",
     "train": "gaponet.cli.train:train",
     "calibrate": "gaponet.cli.calibrate:calibrate",
+    "export": "gaponet.cli.export:export",
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",
     "compare": "gaponet.cli.compare:compare",

@@ -57,20 +57,23 @@ class History:
 
     def push(self, qpos: Array, qvel: Array, u: Array) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
-        self.frames[:, 1:] = self.frames[:, :-1]
+        for k in range(self.depth - 1, 0, -1):  # one by one: as a whole it would go through a temporary copy
+            self.frames[:, k] = self.frames[:, k - 1]
         n = self.n
         self.frames[:, 0, :n] = qpos
         self.frames[:, 0, n : 2 * n] = qvel
         self.frames[:, 0, 2 * n :] = u
 
-    def observe(self, qpos: Array, qvel: Array, payload_mass: Array) -> Array:
+    def observe(self, qpos: Array, qvel: Array, payload_mass: Array | float, out: Array | None = None) -> Array:
         """The observation, (num_envs, dim), float32.
 
         Args:
             qpos, qvel: State now, (num_envs, n).
             payload_mass: (num_envs,) kg.
+            out: Where to write it, of the same shape; default a new array.
         """
-        n, out = self.n, np.empty((len(self.frames), self.dim), np.float32)
+        n = self.n
+        out = np.empty((len(self.frames), self.dim), np.float32) if out is None else out
         out[:, :n] = qpos
         out[:, n : 2 * n] = qvel
         past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]

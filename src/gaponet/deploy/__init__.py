@@ -1,0 +1,1 @@
+"""Using a trained model: aligned simulator, compensator, the loop on a robot."""
