@@ -113,6 +113,26 @@ def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
     assert np.isfinite(GapModel.load(tmp_path).delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
 
 
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"branch": "stacked"}, {"payload_trunk": False}, {"payload_predictor": False}, {"sensor_hold": 2},
+        {"sensors": "oracle"}, {"sensors": "learned"}, {"kind": "transformer"}, {"kind": "fno"}, {"delta_hold": 2},
+        {"sensor_target": "absolute"}, {"kind": "mlp", "mlp_match": True},
+    ],
+)  # fmt: skip
+def test_every_kind_of_network_ships(robot, tmp_path, how):
+    net = trained(**how)
+    x = torch.randn(20, net.config.input_dim(2)).numpy()
+    assert export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), x) <= 1e-5
+    model = GapModel.load(tmp_path)
+    if net.config.asks_simulator or net.config.keeps_observation or net.config.delta_hold > 1:
+        with pytest.raises(ModelError, match="only sim.replay runs it"):
+            model.loop()
+    else:
+        assert model.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
+
+
 def test_a_loop_of_ones_own_gets_what_replay_applies(artifact, robot):
     model = GapModel.load(artifact)
     sequences = recordings(robot, 3, rows=30)
