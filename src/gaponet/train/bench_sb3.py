@@ -5,6 +5,7 @@ Imported only by the benchmark; stable-baselines3 and gymnasium are the `bench` 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from functools import partial
@@ -50,12 +51,22 @@ def _ppo(env: VecEnv, config: TrainConfig, num_steps: int) -> PPO:
     """Networks of the MLP's size, everything else as in ours; mini-batches are as many, not as large."""
     ppo, model = config.ppo, config.model
     return PPO(
-        "MlpPolicy", env, n_steps=num_steps, n_epochs=ppo.epochs,
-        batch_size=env.num_envs * num_steps // ppo.mini_batches, learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.lam, clip_range=ppo.clip,
+        "MlpPolicy",
+        env,
+        n_steps=num_steps,
+        n_epochs=ppo.epochs,
+        batch_size=env.num_envs * num_steps // ppo.mini_batches,
+        learning_rate=ppo.learning_rate,
+        gamma=ppo.gamma,
+        gae_lambda=ppo.lam,
+        clip_range=ppo.clip,
         device="cpu",
-        policy_kwargs={"net_arch": {"pi": list(model.mlp_hidden), "vf": list(ppo.critic_hidden)},
-                       "activation_fn": torch.nn.ELU},
-    )  # fmt: skip
+        policy_kwargs={
+            "net_arch": {"pi": list(model.mlp_hidden), "vf": list(ppo.critic_hidden)},
+            "activation_fn": torch.nn.ELU,
+            "log_std_init": math.log(ppo.init_std),
+        },
+    )
 
 
 def _spaces(config: ModelConfig, n: int) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
