@@ -4,7 +4,7 @@ import pytest
 
 from gaponet.errors import UsageError
 from gaponet.train.config import TrainConfig, WarmStartConfig
-from gaponet.train.variant import KINDS, parse_variant
+from gaponet.train.variant import KINDS, _read, parse_variant
 
 BASE = TrainConfig(warm_start=WarmStartConfig(rounds=7))
 
@@ -28,6 +28,11 @@ def test_fields_of_model_and_training_are_changed():
 
 def test_every_kind_of_model_can_be_named():
     assert [parse_variant(kind, BASE).kind for kind in KINDS] == list(KINDS)
+
+
+def test_a_field_that_may_be_absent_reads_none():
+    assert _read("none", float | None, "here") is None
+    assert _read("0.5", float | None, "here") == 0.5
 
 
 @pytest.mark.parametrize(
