@@ -97,6 +97,22 @@ def test_the_budget_says_what_each_step_removes(place, capsys):
     assert (place / "gaponet" / "budget.png").stat().st_size > 10_000
 
 
+def test_compare_puts_models_and_seeds_into_one_table_and_keeps_what_is_there(place, capsys):
+    words = ["compare", str(place / "data"), "--out", str(place / "compared"), "--seeds", "2", "--models", "mlp"]
+    words += [*TRAIN, "--budget", "900", "--warm-start.rounds", "1", "--identify"]
+    result, err = run(place, capsys, *words)
+    assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "mlp"]
+    assert [r["seed"] for r in result["methods"]["mlp"]["runs"]] == [0, 1]
+    assert result["unseen"] is True
+    assert result["methods"]["identified"]["mpjae"][0] < result["methods"]["nominal"]["mpjae"][0]
+    assert "VIRTUAL" in err
+    again, err = run(place, capsys, *words)
+    assert "2 of 2 runs are there already" in err
+    assert again == result
+    assert main([*words, "--budget", "901", "--robot", str(place / "arm")]) == 2
+    assert "another budget" in capsys.readouterr().err
+
+
 def test_a_calibrated_unit_is_shown_without_and_with(place, capsys):
     shutil.copytree(place / "gaponet", place / "calibrated")
     found, err = run(place, capsys, "calibrate", str(place / "calibrated"), str(place / "data"), "--seconds", "8")
@@ -130,6 +146,8 @@ def test_the_report_is_one_offline_page(place, capsys):
         (["train", "{}/data", "--out", "{}/new", "--budget", "soon"], "--budget soon"),
         (["train", "{}/data", "--out", "{}/new", "--resume"], "nothing to resume"),
         (["report", "{}/data"], "give a run folder"),
+        (["compare", "{}/data", "--out", "{}/new", "--models", "lstm"], "no model 'lstm'; there are"),
+        (["compare", "{}/data", "--out", "{}/new", "--models", "identified+mlp"], "add --identify"),
         (["calibrate", "{}/gaponet", "{}/data", "--unit", "nobody"], "holds units"),
         (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
     ],

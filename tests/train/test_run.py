@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from arm import commands, record, recordings, write_arm
 
+import gaponet.sim.batch
 from gaponet.data.pair import require_disjoint
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
@@ -150,6 +151,19 @@ def test_ctrl_c_leaves_a_usable_run_that_resumes(robot, tmp_path):
     assert not again.card["interrupted"]
     assert again.card["steps"] > model.card["steps"]
     assert again.card["val_mpjae"]["model"] <= model.card["val_mpjae"]["model"]
+
+
+def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
+    asked, batch = set(), gaponet.sim.batch.Batch
+
+    def note(*args, nthread, **rest):
+        asked.add(nthread)
+        return batch(*args, nthread=nthread, **rest)
+
+    monkeypatch.setattr(gaponet.sim.batch, "Batch", note)
+    data = dataset(tmp_path / "data", robot, rows=40)
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
+    assert asked == {1}
 
 
 def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):

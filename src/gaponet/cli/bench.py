@@ -1,7 +1,8 @@
-"""gaponet bench: speed of replay and environment against a bare Batch loop (sim), of a model (latency, aligned)."""
+"""gaponet bench: speed of simulation (sim), of training (train), and of a trained model (latency, aligned)."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -12,22 +13,25 @@ from gaponet.robot import load_robot
 
 
 def bench(
-    what: tyro.conf.Positional[Literal["sim", "latency", "aligned"]],
+    what: tyro.conf.Positional[Literal["sim", "train", "latency", "aligned"]],
     run: tyro.conf.Positional[Path] = Path("."),
     robot: str = "so101",
-    num_envs: int = 512,
-    rounds: int = 15,
+    model: Literal["gaponet", "mlp"] = "gaponet",
+    num_envs: int | None = None,
+    rounds: int | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Measure speed; of control steps per second the ratio is what counts, machines differ.
 
     Args:
-        what: sim: replay and training environment. latency: one correction of a trained model, on each runtime.
-            aligned: the aligned simulator against the nominal one.
+        what: sim: replay and environment. train: inference, collection, update, PPO as a whole, and stable-baselines3
+            where it is installed (pip install 'gaponet[bench]'). latency: one correction of a trained model, on each
+            runtime. aligned: the aligned simulator against the nominal one.
         run: Of gaponet train, for latency and aligned.
         robot: Robot name or folder.
-        num_envs: Simulations side by side.
-        rounds: Interleaved turns of each; the fastest counts.
+        model: Network that is trained.
+        num_envs: Simulations side by side; default 512, 1024 with train.
+        rounds: Interleaved turns of each; the fastest counts; default 15, 3 with train.
         json: One JSON object on stdout.
     """
     from gaponet.cli.aligned import aligned
@@ -37,11 +41,33 @@ def bench(
     if what == "latency":
         return latency(run, out)
     if what == "aligned":
-        return aligned(run, out, num_envs, rounds)
-    from gaponet.train.bench import bench_sim
+        return aligned(run, out, num_envs or 512, rounds or 15)
+    from gaponet.model.config import ModelConfig
+    from gaponet.train.bench import bench_sim, bench_train
+    from gaponet.train.config import TrainConfig
 
-    result = bench_sim(load_robot(robot), num_envs, rounds=rounds)
-    out.table(f"{robot}, {num_envs} simulations", ["", "control steps/s", "of bare"], [
-        [name, f"{r['control_steps_per_s']:,.0f}", f"{r['ratio'] * 100:.0f} %"] for name, r in result.items()
-    ])  # fmt: skip
-    out.result({"robot": robot, "num_envs": num_envs, "results": result})
+    spec = load_robot(robot)
+    columns = ["", "control steps/s", "of bare"]
+    if what == "sim":
+        speeds = bench_sim(spec, num_envs or 512, rounds=rounds or 15)
+        out.table(f"{robot}, {num_envs or 512} simulations", columns, _rows(speeds))
+        out.result({"robot": robot, "num_envs": num_envs or 512, "results": speeds})
+        return
+    baseline = all(find_spec(name) for name in ("stable_baselines3", "gymnasium"))
+    result = bench_train(spec, TrainConfig(ModelConfig(model)), num_envs or 1024, rounds or 3, baseline)
+    out.table(f"{robot}, {model}, {num_envs or 1024} simulations", columns, _rows(result["speeds"]))
+    ours = result["speeds"]["PPO"]["control_steps_per_s"]
+    out.say(
+        f"PPO: {result['share_of_expected'] * 100:.0f} % of the {result['expected']:,.0f} control steps/s that physics,"
+        f" inference and update allow; peak memory {result['peak_memory_bytes'] / 2**30:.2f} GiB"
+    )
+    for name in ("batched", "SubprocVecEnv") if baseline else ():
+        out.say(f"PPO is {ours / result['speeds'][f'stable-baselines3, {name}']['control_steps_per_s']:.1f} times "
+                f"as fast as stable-baselines3, {name}")  # fmt: skip
+    if not baseline:
+        out.say("stable-baselines3 is not installed and left out; pip install 'gaponet[bench]' to compare with it")
+    out.result({"robot": robot, "model": model, "num_envs": num_envs or 1024} | result)
+
+
+def _rows(speeds: dict[str, dict[str, float]]) -> list[list[str]]:
+    return [[name, f"{r['control_steps_per_s']:,.0f}", f"{r['ratio'] * 100:.0f} %"] for name, r in speeds.items()]

@@ -141,15 +141,16 @@ def _spread(method: Result, units: str, *path: str) -> tuple[float, float]:
 
 def main_table(result: Result) -> tuple[list[str], list[list[str]]]:
     """Columns and rows: one row per method."""
-    nominal = result["methods"]["nominal"]["mpjae"][0]
+    nominal = _spread(result["methods"]["nominal"], "known", "mpjae")[0]
     payloads, new = keys(result, "known", "by_payload"), keys(result, "new", "by_unit")
     columns = ["method", "weights", "MPJAE mrad", "of nominal", "Q_dis rad·s"]
     columns += ["worst payload"] if len(payloads) > 1 else []
     columns += ["new unit"] if new else []
     rows = []
     for m in result["methods"].values():
-        row = [m["title"], _count(m["parameters"]), _mrad(m["mpjae"])]
-        row += [f"{m['mpjae'][0] / nominal:.2f}" if nominal else "–", f"{_spread(m, 'known', 'q_dis')[0]:.2f}"]
+        mpjae = _spread(m, "known", "mpjae")
+        row = [m["title"], _count(m["parameters"]), _mrad(mpjae)]
+        row += [f"{mpjae[0] / nominal:.2f}" if nominal else "–", f"{_spread(m, 'known', 'q_dis')[0]:.2f}"]
         if len(payloads) > 1:
             by = {p: _spread(m, "known", "by_payload", p, "mpjae") for p in payloads}
             worst = max(by, key=lambda p: by[p][0])

@@ -1,9 +1,16 @@
-"""How much of the simulator's speed is left: bare Batch loop, replay and environment, interleaved in one run."""
+"""How much of the simulator's speed is left: bare Batch loop, environment, collection, PPO; interleaved in one run.
+
+All parts take turns, so that a machine that slows down slows all of them; of each the fastest turn counts, since other
+work on the machine only ever adds time.
+"""
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,65 +18,190 @@ import torch
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
-from gaponet.sim.replay import replay
-from gaponet.train.config import RewardConfig
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.replay import idle_limbs, replay
+from gaponet.train.config import FAST_PPO, RewardConfig, TrainConfig
 from gaponet.train.env import DeltaEnv
 
 Array = np.ndarray
+Turn = Callable[[], object]
+Speeds = dict[str, dict[str, float]]
+
+EPISODE_S = 10.0
 
 
-def bench_sim(robot: RobotSpec, num_envs: int = 512, steps: int = 40, rounds: int = 15) -> dict[str, dict[str, float]]:
-    """Control steps per second of each, and its ratio to the bare loop.
-
-    The three take turns, so that a machine that slows down slows all of them; of each the fastest turn counts, since
-    other work on the machine only ever adds time.
+def bench_sim(robot: RobotSpec, num_envs: int = 512, steps: int = 40, rounds: int = 15) -> Speeds:
+    """Control steps per second of bare loop, replay and environment, and the ratio to the bare loop.
 
     Args:
-        robot: The robot.
+        robot: The robot; limbs without an operated joint are locked, as in training.
         num_envs: Simulations side by side.
         steps: Control periods per turn.
         rounds: Turns each.
     """
     sequences = [_wander(robot, steps + 1, seed) for seed in range(num_envs)]
-    conditions = [(0.0, "both", robot.dt)] * num_envs
-    ctrl = np.stack([s.ctrl for s in sequences], axis=1).astype(float)
-    loop = BatchSim(robot, conditions)
-    motions = [_wander(robot, round(20 / robot.dt), seed) for seed in range(32)]  # as long as recorded ones
-    env = DeltaEnv(motions, robot, ModelConfig(), num_envs, 10**9, RewardConfig())
-    idle = torch.zeros(num_envs, env.num_actions)
+    env = _environment(robot, ModelConfig(), num_envs)
+    seconds = take_turns(
+        {
+            "bare Batch loop": _bare_loop(robot, num_envs, steps),
+            "replay": lambda: replay(sequences, robot, lock_idle=True),
+            "environment step": _idle_steps(env, steps),
+        },
+        rounds,
+    )
+    return _speeds({name: (num_envs * steps, best) for name, best in seconds.items()}, "bare Batch loop")
 
-    def run_bare() -> None:
-        loop.reset(slice(None), ctrl[0], np.zeros_like(ctrl[0]))
-        for t in range(steps):
-            loop.ctrl[:] = ctrl[t]
-            loop.batch.step(nstep=robot.decimation)
 
-    def run_env() -> None:
-        for _ in range(steps):
-            env.step(idle)
+def bench_train(
+    robot: RobotSpec, config: TrainConfig, num_envs: int = 1024, rounds: int = 3, baseline: bool = True
+) -> dict[str, Any]:
+    """Control steps per second of each part of PPO training, of the whole, and of stable-baselines3 on the same task.
 
-    turns: dict[str, Callable[[], object]] = {
-        "bare Batch loop": run_bare, "replay": lambda: replay(sequences, robot), "environment step": run_env,
-    }  # fmt: skip
+    "expected" is what the parts would give if nothing came between them: physics, inference and update, each once for
+    every control step.
+
+    Args:
+        robot: The robot; limbs without an operated joint are locked, as in training.
+        config: Model and PPO; threads.
+        num_envs: Simulations side by side.
+        rounds: Turns each, after one that does not count.
+        baseline: Whether stable-baselines3 takes part; it has to be installed.
+
+    Returns:
+        speeds by name, expected (control steps/s) and share of it, parameters, peak_memory_bytes.
+    """
+    from gaponet.train.ppo import make_runner, update
+
+    torch.set_num_threads(config.torch_threads)
+    config = replace(config, ppo=replace(config.ppo, num_envs=num_envs))
+    steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
+    env = _environment(robot, config.model, num_envs, config.threads)
+    runner = make_runner(env, config)
+    fast_steps = FAST_PPO.num_steps
+    fast = make_runner(env, replace(config, ppo=replace(FAST_PPO, num_envs=num_envs)))
+    turns: dict[str, Turn] = {
+        "bare Batch loop": _bare_loop(robot, num_envs, steps, config.threads),
+        "environment step": _idle_steps(env, steps),
+        "inference": lambda: _inference(runner, steps),
+        "collection": lambda: _collect(runner),
+        "update": lambda: _update(runner),
+        "PPO": lambda: update(runner),
+        "PPO, fast preset": lambda: update(fast),
+    }
+    counts = dict.fromkeys(turns, batch) | {"PPO, fast preset": num_envs * fast_steps}
+    if baseline:
+        from gaponet.train.bench_sb3 import batched, separate
+
+        model = batched(env, config)
+        turns["stable-baselines3, batched"] = lambda: model.learn(batch, reset_num_timesteps=False)
+        counts["stable-baselines3, batched"] = batch
+        single, samples, close = separate(robot, config, _motions(robot, 8))
+        turns["stable-baselines3, SubprocVecEnv"] = lambda: single.learn(samples, reset_num_timesteps=False)
+        counts["stable-baselines3, SubprocVecEnv"] = samples
+    try:
+        seconds = take_turns(turns, rounds)
+    finally:
+        if baseline:
+            close()
+    expected = batch / sum(seconds[part] for part in ("bare Batch loop", "inference", "update"))
+    speeds = _speeds({name: (counts[name], best) for name, best in seconds.items()}, "bare Batch loop")
+    return {
+        "speeds": speeds,
+        "expected": expected,
+        "share_of_expected": speeds["PPO"]["control_steps_per_s"] / expected,
+        "parameters": sum(p.numel() for p in runner.alg.actor.mlp.parameters()),
+        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def take_turns(turns: dict[str, Turn], rounds: int) -> dict[str, float]:
+    """Seconds of each one's fastest turn, in `rounds` rounds after one that does not count."""
     seconds: dict[str, list[float]] = {name: [] for name in turns}
     for _ in range(rounds + 1):
         for name, turn in turns.items():
             start = time.perf_counter()
             turn()
             seconds[name].append(time.perf_counter() - start)
-    speed = {name: num_envs * steps / min(s[1:]) for name, s in seconds.items()}
-    bare_speed = speed["bare Batch loop"]
-    return {name: {"control_steps_per_s": v, "ratio": v / bare_speed} for name, v in speed.items()}
+    return {name: min(s[1:]) for name, s in seconds.items()}
+
+
+def _speeds(done: dict[str, tuple[int, float]], base: str) -> Speeds:
+    """(control steps, s) of each → control steps per second and ratio to one of them."""
+    speed = {name: count / seconds for name, (count, seconds) in done.items()}
+    return {name: {"control_steps_per_s": v, "ratio": v / speed[base]} for name, v in speed.items()}
+
+
+def _environment(robot: RobotSpec, model: ModelConfig, num_envs: int, nthread: int = 0) -> DeltaEnv:
+    steps = round(EPISODE_S / robot.dt)
+    return DeltaEnv(_motions(robot, 32), robot, model, num_envs, steps, RewardConfig(), nthread=nthread)
+
+
+def _bare_loop(robot: RobotSpec, num_envs: int, steps: int, nthread: int = 0) -> Turn:
+    """The same simulations without anything around them."""
+    motions = [_wander(robot, steps + 1, seed) for seed in range(num_envs)]
+    locked = idle_limbs(motions, robot)
+    condition: Condition = (0.0, "both", robot.dt)
+    sim = BatchSim(robot, [condition] * num_envs, nthread, locked)
+    ctrl = np.stack([m.ctrl for m in motions], axis=1).astype(float)[..., robot.index(sim.joint_names)]
+    zero = np.zeros_like(ctrl[0])
+    past = ctrl[0][:, None]
+
+    def run() -> None:
+        sim.reset(slice(None), ctrl[0], zero, past)
+        for t in range(steps):
+            sim.ctrl[:] = ctrl[t]
+            sim.batch.step(nstep=robot.decimation)
+
+    return run
+
+
+def _idle_steps(env: DeltaEnv, steps: int) -> Turn:
+    idle = torch.zeros(env.num_envs, env.num_actions)
+
+    def run() -> None:
+        for _ in range(steps):
+            env.step(idle)
+
+    return run
+
+
+def _inference(runner: Any, steps: int) -> None:
+    """Actor, critic and sampling, nothing stored."""
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(steps):
+            runner.alg.act(obs)
+
+
+def _collect(runner: Any) -> None:
+    """The first half of rsl_rl's OnPolicyRunner.learn: what an update needs."""
+    runner.alg.storage.clear()
+    obs = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(runner.cfg["num_steps_per_env"]):
+            obs, reward, done, extras = runner.env.step(runner.alg.act(obs))
+            runner.alg.process_env_step(obs, reward, done, extras)
+        runner.alg.compute_returns(obs)
+
+
+def _update(runner: Any) -> None:
+    """The second half, on what _collect left."""
+    runner.alg.update()
+
+
+def _motions(robot: RobotSpec, count: int) -> list[Sequence]:
+    """As long as recorded ones."""
+    return [_wander(robot, round(20 / robot.dt), seed) for seed in range(count)]
 
 
 def _wander(robot: RobotSpec, rows: int, seed: int) -> Sequence:
-    """A slow random motion about home."""
+    """A slow random motion of the operated joints about home."""
     rng = np.random.default_rng(seed)
     t = np.arange(rows)[:, None] * robot.dt
-    n = len(robot.joint_names)
-    low, high = np.clip(robot.qpos_range.T, -1.5, 1.5)
-    wave = np.sin(2 * np.pi * rng.uniform(0.2, 1.0, n) * t + rng.uniform(0, 2 * np.pi, n))
-    ctrl = np.clip(robot.qpos_home + 0.3 * wave, low, high)
+    op = robot.operated_index
+    low, high = np.clip(robot.qpos_range[op].T, -1.5, 1.5)
+    wave = np.sin(2 * np.pi * rng.uniform(0.2, 1.0, len(op)) * t + rng.uniform(0, 2 * np.pi, len(op)))
+    ctrl = np.tile(robot.qpos_home, (rows, 1))
+    ctrl[:, op] = np.clip(ctrl[:, op] + 0.3 * wave, low, high)
     meta = SequenceMeta(robot.name, "bench", f"wander-{seed}", 0.0, virtual=True)
     return Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.gradient(ctrl, robot.dt, axis=0))

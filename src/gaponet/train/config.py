@@ -77,6 +77,10 @@ class PPOConfig:
     """Hidden layers of the critic."""
 
 
+FAST_PPO = PPOConfig(num_envs=1024, epochs=1, mini_batches=2)
+"""Half of the simulator's speed is left (gaponet bench train); for simulators and robots where samples are cheap."""
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """Everything a run needs to be repeated, beside the dataset."""

@@ -87,6 +87,8 @@ def _places(config: TrainConfig) -> Iterator[tuple[str, tuple[str, str]]]:
 
 def _read(text: str, hint: Any, where: str) -> Any:
     """A value of a field's type."""
+    if type(None) in get_args(hint):
+        return None if text == "none" else _read(text, get_args(hint)[0], where)
     if get_origin(hint) is tuple:
         return tuple(_read(part, get_args(hint)[0], where) for part in text.split(",") if part)
     options = get_args(hint) if get_origin(hint) is Literal else tuple(SWITCH) if hint is bool else ()

@@ -1,0 +1,165 @@
+"""The training task under stable-baselines3, to compare with: batched as ours, or one simulation per process.
+
+Imported only by the benchmark; stable-baselines3 and gymnasium are the `bench` extra.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from functools import partial
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+
+from gaponet.data.sequence import Sequence
+from gaponet.model.config import ModelConfig
+from gaponet.model.observation import History, frames_before
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import idle_limbs
+from gaponet.train.config import TrainConfig
+from gaponet.train.env import DeltaEnv
+
+Array = np.ndarray
+
+PROCESSES = 8
+PROCESS_STEPS = 256  # control periods per update and process
+
+
+def batched(env: DeltaEnv, config: TrainConfig) -> PPO:
+    """stable-baselines3's PPO on the environment that gaponet trains in."""
+    return _ppo(_Batched(env), config, config.ppo.num_steps)
+
+
+def separate(robot: RobotSpec, config: TrainConfig, motions: ListOf[Sequence]) -> tuple[PPO, int, Callable[[], None]]:
+    """The same on processes with one simulation each; the control steps of one of its updates; what ends them."""
+    make: list[Callable[[], gymnasium.Env]] = [
+        partial(SingleEnv, robot, motions, config.model, seed) for seed in range(PROCESSES)
+    ]
+    env = SubprocVecEnv(make, start_method="spawn")
+    return _ppo(env, config, PROCESS_STEPS), PROCESSES * PROCESS_STEPS, env.close
+
+
+def _ppo(env: VecEnv, config: TrainConfig, num_steps: int) -> PPO:
+    """Networks of the MLP's size, everything else as in ours; mini-batches are as many, not as large."""
+    ppo, model = config.ppo, config.model
+    return PPO(
+        "MlpPolicy",
+        env,
+        n_steps=num_steps,
+        n_epochs=ppo.epochs,
+        batch_size=env.num_envs * num_steps // ppo.mini_batches,
+        learning_rate=ppo.learning_rate,
+        gamma=ppo.gamma,
+        gae_lambda=ppo.lam,
+        clip_range=ppo.clip,
+        device="cpu",
+        policy_kwargs={
+            "net_arch": {"pi": list(model.mlp_hidden), "vf": list(ppo.critic_hidden)},
+            "activation_fn": torch.nn.ELU,
+            "log_std_init": math.log(ppo.init_std),
+        },
+    )
+
+
+def _spaces(config: ModelConfig, n: int) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+    """Of [o_t | a_t] and of Δa."""
+    return (
+        gymnasium.spaces.Box(-np.inf, np.inf, (config.observation_dim(n) + n,), np.float32),
+        gymnasium.spaces.Box(-config.delta_max, config.delta_max, (n,), np.float32),
+    )
+
+
+class _Batched(VecEnv):
+    """DeltaEnv as stable-baselines3 wants it."""
+
+    def __init__(self, env: DeltaEnv) -> None:
+        self.env = env
+        super().__init__(env.num_envs, *_spaces(env.config, env.num_actions))
+
+    def reset(self) -> Array:
+        self.env.reset()
+        return self.env.get_observations()["actor"].numpy()
+
+    def step_async(self, actions: Array) -> None:
+        self.actions = torch.from_numpy(actions)
+
+    def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
+        obs, reward, done, _ = self.env.step(self.actions)
+        ended = done.numpy()
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        observed = obs["actor"].numpy()
+        for i in np.flatnonzero(ended):
+            infos[i] = {"TimeLimit.truncated": True, "terminal_observation": observed[i]}
+        return observed, reward.numpy(), ended, infos
+
+    def close(self) -> None:
+        pass
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False] * self.num_envs
+
+
+class SingleEnv(gymnasium.Env):
+    """One simulation chasing recorded motions, written as such environments usually are: mj_step on one MjData."""
+
+    def __init__(self, robot: RobotSpec, motions: ListOf[Sequence], config: ModelConfig, seed: int = 0) -> None:
+        n = len(robot.operated)
+        self.observation_space, self.action_space = _spaces(config, n)
+        self.robot, self.motions, self.config = robot, motions, config
+        locked = idle_limbs(motions, robot)
+        self.model = build_model(robot, locked=locked, bare=True)
+        self.data = mujoco.MjData(self.model)
+        free = [j for j in robot.joint_names if j not in locked]
+        self.free, self.op = robot.index(free), np.array([free.index(j) for j in robot.operated])
+        self.low, self.high = robot.qpos_range[self.free].T
+        self.history = History(config, 1, n)
+        self.rng = np.random.default_rng(seed)
+        self.steps = round(10 / robot.dt)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        self.motion = self.motions[int(self.rng.integers(len(self.motions)))]
+        self.row = self.first = int(self.rng.integers(len(self.motion) - 1))
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:] = self.motion.qpos[self.row, self.free]
+        self.data.qvel[:] = self.motion.qvel[self.row, self.free]
+        before, op = frames_before(np.array([self.row]), self.history.depth), self.robot.operated_index
+        self.history.reset(
+            slice(None), *(x[before][..., op] for x in (self.motion.qpos, self.motion.qvel, self.motion.ctrl))
+        )
+        return self._observe(), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        op, data = self.op, self.data
+        target = self.motion.ctrl[self.row, self.free].astype(float)
+        target[op] += action
+        np.clip(target, self.low, self.high, out=target)
+        self.history.push(data.qpos[None, op], data.qvel[None, op], target[None, op])
+        data.ctrl[:] = target
+        mujoco.mj_step(self.model, data, self.robot.decimation)
+        self.row += 1
+        error = data.qpos[op] - self.motion.qpos[self.row, self.robot.operated_index]
+        reward = -32.83 * float((error**2).mean())
+        over = self.row >= len(self.motion) - 1 or self.row - self.first >= self.steps
+        return self._observe(), reward, False, over, {}
+
+    def _observe(self) -> Array:
+        op = self.op
+        o = self.history.observe(self.data.qpos[None, op], self.data.qvel[None, op], np.zeros(1, np.float32))
+        return np.concatenate([o[0], self.motion.ctrl[self.row, self.robot.operated_index]], dtype=np.float32)

@@ -1,0 +1,34 @@
+"""Work for cells of a comparison in tests: a spawned process imports it by name."""
+
+from __future__ import annotations
+
+import os
+import time
+
+from gaponet.errors import ModelError
+from gaponet.train.compare import Cell, Tell
+
+
+def note_threads(cell: Cell, tell: Tell) -> None:
+    """Leave a file that says how many threads this process was given; seed 1 fails, seed 2 is a bug, seed 3 dies."""
+    if cell.seed == 1:
+        raise ModelError("no such thing")
+    if cell.seed == 2:
+        raise ZeroDivisionError("a bug")
+    if cell.seed == 3:
+        os._exit(9)
+    tell(0.5, "half")
+    cell.folder.mkdir(parents=True)
+    (cell.folder / "threads").write_text(os.environ["OMP_NUM_THREADS"])
+
+
+def wait_for_the_end(cell: Cell, tell: Tell) -> None:
+    """Work until interrupted, then keep what was reached."""
+    cell.folder.mkdir(parents=True)
+    try:
+        while True:
+            tell(0.1, "busy")
+            time.sleep(0.01)
+    except KeyboardInterrupt:
+        (cell.folder / "kept").touch()
+        raise
