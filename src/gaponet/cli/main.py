@@ -25,6 +25,7 @@ COMMANDS = {
     "report": "gaponet.cli.train:report",
     "budget": "gaponet.cli.budget:budget",
     "runs": "gaponet.cli.runs:runs",
+    "view": "gaponet.cli.view:view",
     "demo": "gaponet.cli.demo:demo",
     "bench": "gaponet.cli.bench:bench",
 }
