@@ -96,12 +96,10 @@ class Camera:
     def _lens(self) -> mujoco.MjvCamera:
         """Orthographic, so that every copy is seen from the same side."""
         scene, layout = self.scene, self.layout
-        left, right, bottom, top = scene.box
-        across, up = scene.view.axes
         lens = mujoco.MjvCamera()
         lens.orthographic = 1
         lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
-        lens.lookat[:] = across * (left + right) / 2 + up * (bottom + top) / 2
+        lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
         scene.model.vis.global_.fovy = layout.robots / layout.scale  # m, of an orthographic picture
         scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20

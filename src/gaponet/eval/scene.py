@@ -67,7 +67,7 @@ class Scene:
         self.shown, self.view = shown, view
         self.ghosts = ghost and any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
         self.box, self.floor = self._fit(rows)
-        self.spacing = 1.06 * (self.box[1] - self.box[0])
+        self.spacing = 1.1 * (self.box[1] - self.box[0])
         k = len(shown.motions)
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
         self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
@@ -92,6 +92,13 @@ class Scene:
     def row(self, time: float) -> int:
         """The newest row at a time of the recording, s."""
         return int(np.clip(time / self.shown.real.dt + 1e-6, 0, len(self.shown.real) - 1))
+
+    @property
+    def middle(self) -> Array:
+        """Centre of the row of robots, (3), m."""
+        left, right, bottom, top = self.box
+        across, up = self.view.axes
+        return across * (left + right) / 2 + up * (bottom + top) / 2
 
     def _haunted(self) -> list:
         return [m for m in self.shown.motions if m.method != "recorded"]
@@ -202,9 +209,15 @@ def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: 
 def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
     """White ground, one light that casts shadows and one that fills them."""
     world = scene.worldbody
-    world.add_geom(
+    ground = world.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(FLOOR, FLOOR, FLOOR, 1),
         contype=0, conaffinity=0,
+    )  # fmt: skip
+    if hasattr(ground, "castshadow"):  # from MuJoCo 4 on: no shadow onto itself
+        ground.castshadow = False
+    scene.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[FLOOR] * 3, rgb2=[FLOOR] * 3, width=8, height=48,
     )  # fmt: skip
     sun, fill = np.array([-0.25, 0.15, -1.0]), np.array([-0.6, -0.5, -0.4])
     for direction, bright, shadow in ((sun, 0.5, True), (fill, 0.3, False)):
