@@ -47,7 +47,7 @@ def view(
     Args:
         dataset: Dataset folder.
         model: Run folders of gaponet train; each gives a copy of the robot in the simulator that it aligns.
-        motion: Which motion; default: the first that the model was not trained on, or the first.
+        motion: Which motion; default: one that the model was not trained on, where there is one.
         unit: Which unit's recording, where there are several.
         payload_mass: Which payload's recording, kg.
         show: Copies from left to right; aligned stands for every --model.
@@ -95,7 +95,8 @@ def view(
     if shown.seen:
         out.say("[yellow]a model was trained or chosen on this recording: it is not held-out[/]")
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, slice(first, last + 1))
+    rows = slice(first, last + 1)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, flat=render is not None)
     if render is not None:
         pictures = _film(scene, clip, render, width, magnify, course)
         size = render.stat().st_size

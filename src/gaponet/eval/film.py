@@ -65,7 +65,7 @@ def require_kind(path: Path) -> None:
 
 
 def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None] = lambda i, n: None) -> int:
-    """Render to a file whose ending says the kind; a PNG shows the moment when the first simulated copy is furthest off.
+    """Render to a file whose ending says the kind; a PNG shows the moment when the first simulated copy is worst.
 
     Returns:
         Number of pictures.

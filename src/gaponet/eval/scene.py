@@ -13,15 +13,16 @@ import mujoco
 import numpy as np
 
 from gaponet.errors import UsageError
-from gaponet.eval.side_by_side import SideBySide
+from gaponet.eval.side_by_side import Motion, SideBySide
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
 
 Array = np.ndarray
 
 PAYLOAD = (0.93, 0.60, 0.10, 1.0)
-GHOST = (0.07, 0.07, 0.07, 0.28)  # the recording inside each other copy
-THIN = 0.95  # of a ghost's limbs: where the copy is right, it covers the ghost
+GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
+THIN = 0.9  # of a ghost's limbs: where the copy is right, it covers the ghost
+BEHIND = 0.12  # of the robot's height: how far behind its copy a ghost stands on a flat picture
 FLOOR = 0.96  # grey of the ground
 SAMPLES = 60  # frames looked at when the camera is set
 
@@ -55,7 +56,14 @@ class Scene:
         base: Of each copy, (k, 3), m.
     """
 
-    def __init__(self, shown: SideBySide, view: View = View(), ghost: bool = True, rows: slice = slice(None)) -> None:  # noqa: B008
+    def __init__(
+        self,
+        shown: SideBySide,
+        view: View = View(),
+        ghost: bool = True,
+        rows: slice = slice(None),
+        flat: bool = False,
+    ) -> None:
         """Build and fit.
 
         Args:
@@ -63,6 +71,8 @@ class Scene:
             view: The camera's direction decides the direction of the row.
             ghost: Draw the recording, translucent, into each other copy.
             rows: Frames that have to fit.
+            flat: For an orthographic picture, on which a ghost can stand behind its copy and still be in place: what is
+                seen of it is what differs.
         """
         self.shown, self.view = shown, view
         self.ghosts = ghost and any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
@@ -71,11 +81,13 @@ class Scene:
         k = len(shown.motions)
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
         self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
-        self.model = self._compose(self.base)
+        across, up = view.axes
+        behind = BEHIND * (self.box[3] - self.box[2]) * np.cross(up, across) if flat else np.zeros(3)
+        self.model = self._compose(self.base, behind)
         self.data = mujoco.MjData(self.model)
         self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
         if self.ghosts:
-            last = [i for i, m in enumerate(shown.motions) if m.method == "recorded"][0]
+            last = next(i for i, m in enumerate(shown.motions) if m.method == "recorded")
             self.address += [(last, self._address(f"{m.method}-ghost")) for m in self._haunted()]
 
     def pose(self, time: float) -> None:
@@ -100,7 +112,7 @@ class Scene:
         across, up = self.view.axes
         return across * (left + right) / 2 + up * (bottom + top) / 2
 
-    def _haunted(self) -> list:
+    def _haunted(self) -> list[Motion]:
         return [m for m in self.shown.motions if m.method != "recorded"]
 
     def _address(self, prefix: str) -> Array:
@@ -130,17 +142,17 @@ class Scene:
                 low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
         return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), float(low[2])
 
-    def _compose(self, base: Array) -> mujoco.MjModel:
+    def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
         scene, meta = mujoco.MjSpec(), self.shown.real.meta
         scene.compiler.degree = False
         _light(scene, self.floor, self.extent)
         for motion, place in zip(self.shown.motions, base, strict=True):
-            coats = {motion.method: motion.colour}
+            coats = {motion.method: (motion.colour, place)}
             if self.ghosts and motion.method != "recorded":
-                coats[f"{motion.method}-ghost"] = ""
-            for prefix, colour in coats.items():
+                coats[f"{motion.method}-ghost"] = ("", place + behind)
+            for prefix, (colour, pos) in coats.items():
                 spec = dressed(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
-                scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=place))
+                scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
         return scene.compile()
 
 
@@ -164,6 +176,7 @@ def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: st
     if not colour:
         for geom in spec.geoms:
             geom.size = THIN * np.array(geom.size)
+            _cast_no_shadow(geom)
     return spec
 
 
@@ -206,6 +219,11 @@ def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: 
     body.add_geom(type=kind, fromto=ends, size=(radius, 0, 0), mass=0, contype=0, conaffinity=0, rgba=rgba)
 
 
+def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:
+    if hasattr(geom, "castshadow"):  # from MuJoCo 4 on
+        geom.castshadow = False
+
+
 def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
     """White ground, one light that casts shadows and one that fills them."""
     world = scene.worldbody
@@ -213,8 +231,7 @@ def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(FLOOR, FLOOR, FLOOR, 1),
         contype=0, conaffinity=0,
     )  # fmt: skip
-    if hasattr(ground, "castshadow"):  # from MuJoCo 4 on: no shadow onto itself
-        ground.castshadow = False
+    _cast_no_shadow(ground)  # onto itself
     scene.add_texture(
         name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
         rgb1=[FLOOR] * 3, rgb2=[FLOOR] * 3, width=8, height=48,

@@ -14,7 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.colours import COLOURS, NAMES
-from gaponet.eval.evaluate import choose, corrected_robot, read_split
+from gaponet.eval.evaluate import corrected_robot, read_split
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import Corrector, replay
@@ -100,16 +100,14 @@ class SideBySide:
 def pick(
     dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
 ) -> Entry:
-    """The first sequence that fits; where nothing is asked for, one that the first run has not seen."""
-    if motion or not runs:
-        entries = dataset.select((motion,) if motion else ())
-    else:
-        entries = choose(runs[0], dataset, ())[0]
+    """The first sequence that fits; among those the first run has not seen, where one of them fits."""
+    entries = dataset.select((motion,) if motion else ())
+    known = {h for part in ("train", "val") for h in read_split(runs[0])[part].values()} if runs else set()
+    entries = sorted(entries, key=lambda e: e.hash in known)
     asked = [
-        e
-        for e in (entries if motion or not (unit or payload_mass is not None) else [*entries, *dataset.entries])
+        e for e in entries
         if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
-    ]
+    ]  # fmt: skip
     if not asked:
         there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
         raise DatasetError(

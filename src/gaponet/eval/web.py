@@ -46,7 +46,7 @@ class WebScene:
         head += f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
         gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
         self.playing = gui.add_checkbox("play", True)
-        self.time = gui.add_slider("time, s", clip.start, clip.stop, scene.shown.real.dt, clip.start)
+        self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, scene.shown.real.dt, clip.start)
         self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))
         self.table = gui.add_markdown("")
         self.update()
@@ -80,8 +80,8 @@ class WebScene:
             name = "/" + model.body(body).name.replace("/", "_")
             frames[body] = self.server.scene.add_frame(name, show_axes=False)
             for g in geoms:
-                vertices, faces = surface(model, g)
-                colour = tuple(int(255 * c) for c in model.geom_rgba[g, :3])
+                vertices, faces = surface(model, int(g))
+                colour = (255 * model.geom_rgba[g, :3]).astype(int)
                 self.server.scene.add_mesh_simple(
                     f"{name}/{g}", vertices, faces, color=colour, opacity=float(model.geom_rgba[g, 3]),
                     position=model.geom_pos[g], wxyz=model.geom_quat[g],
