@@ -32,6 +32,7 @@ def view(
     speed: float = 1.0,
     magnify: float = 1.0,
     ghost: bool = True,
+    closeup: bool = False,
     fps: float = 20.0,
     width: int = 960,
     course: bool = True,
@@ -59,6 +60,7 @@ def view(
         speed: Below 1 is slow motion.
         magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
         ghost: Draw the recording, translucent, into each other copy.
+        closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
         fps: Of a film.
         width: Of a picture, pixels; the height follows from the robots.
         course: Draw the error against time below a picture.
@@ -96,7 +98,7 @@ def view(
         out.say("[yellow]a model was trained or chosen on this recording: it is not held-out[/]")
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
     rows = slice(first, last + 1)
-    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, flat=render is not None)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
     if render is not None:
         pictures = _film(scene, clip, render, width, magnify, course)
         size = render.stat().st_size

@@ -13,7 +13,7 @@ from gaponet.errors import UsageError
 from gaponet.eval.picture import Camera
 from gaponet.eval.side_by_side import SideBySide
 
-COLOURS = 96  # of a GIF, shared by all frames
+COLOURS = 200  # of a GIF, shared by all frames
 KINDS = (".gif", ".mp4", ".png")
 
 
@@ -51,7 +51,8 @@ class Clip:
 
     def times(self, period: float) -> np.ndarray:
         """Times of the recording to show, s, one picture every `period` s."""
-        return np.arange(self.start, self.stop, period * self.speed)
+        count = max(round(self.duration / (period * self.speed)), 1)
+        return self.start + np.arange(count) * period * self.speed
 
 
 def require_kind(path: Path) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
-DOT = "  ·  "
+DOT = "  ·  "  # Pillow's own font has this, but no ×
 TALLEST = 0.8  # of the width
 
 
@@ -126,8 +126,8 @@ class Camera:
         meta = shown.real.meta
         facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
         facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
-        clock = [f"speed {self.speed:g}×"] if self.speed != 1 else []
-        clock += [f"differences drawn {self.magnify:g}×"] if self.magnify != 1 else []
+        clock = [f"speed {self.speed:g}x"] if self.speed != 1 else []
+        clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
         left, right = DOT.join(facts), DOT.join([*clock, f"{time:6.2f} s"])
         mark = "VIRTUAL ROBOT   " if meta.virtual else ""
         while font.getlength(mark + left + right) > self.layout.width - 4 * pad and font.size > 8:

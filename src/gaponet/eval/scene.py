@@ -63,6 +63,7 @@ class Scene:
         ghost: bool = True,
         rows: slice = slice(None),
         flat: bool = False,
+        closeup: bool = False,
     ) -> None:
         """Build and fit.
 
@@ -73,10 +74,11 @@ class Scene:
             rows: Frames that have to fit.
             flat: For an orthographic picture, on which a ghost can stand behind its copy and still be in place: what is
                 seen of it is what differs.
+            closeup: Limbs without an operated joint need not fit.
         """
         self.shown, self.view = shown, view
         self.ghosts = ghost and any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
-        self.box, self.floor = self._fit(rows)
+        self.box, self.floor = self._fit(rows, closeup)
         self.spacing = 1.1 * (self.box[1] - self.box[0])
         k = len(shown.motions)
         self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
@@ -119,7 +121,7 @@ class Scene:
         names = self.shown.robot.joint_names
         return np.array([self.model.joint(f"{prefix}/{name}").qposadr[0] for name in names])
 
-    def _fit(self, rows: slice) -> tuple[tuple[float, float, float, float], float]:
+    def _fit(self, rows: slice, closeup: bool) -> tuple[tuple[float, float, float, float], float]:
         """Extent of one robot on the picture over all motions, and its lowest point."""
         robot, meta = self.shown.robot, self.shown.real.meta
         model = dressed(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
@@ -127,6 +129,9 @@ class Scene:
         seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
         if not len(seen):
             raise UsageError(f"{robot.mjcf}: has no visible geom; add one to each body to look at it")
+        if closeup:
+            near = _operated_bodies(model, robot)
+            seen = np.array([g for g in seen if model.geom_bodyid[g] in near])
         middle, half = model.geom_aabb[seen, None, :3], model.geom_aabb[seen, None, 3:]
         corners = middle + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T  # (k, 8, 3)
         address = [model.joint(name).qposadr[0] for name in robot.joint_names]
@@ -217,6 +222,19 @@ def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) 
 
 def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: float, rgba: tuple[float, ...]) -> None:
     body.add_geom(type=kind, fromto=ends, size=(radius, 0, 0), mass=0, contype=0, conaffinity=0, rgba=rgba)
+
+
+def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
+    """Bodies that carry operated joints, that these move, and that carry those."""
+    moving = {int(model.jnt_bodyid[model.joint(name).id]) for name in robot.operated}
+    found: set[int] = set()
+    for body in range(1, model.nbody):
+        chain = [body]
+        while chain[-1]:
+            chain.append(int(model.body_parentid[chain[-1]]))
+        if moving.intersection(chain):
+            found.update(chain)
+    return found
 
 
 def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:
