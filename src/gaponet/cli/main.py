@@ -27,6 +27,7 @@ COMMANDS = {
     "compare": "gaponet.cli.compare:compare",
     "budget": "gaponet.cli.budget:budget",
     "runs": "gaponet.cli.runs:runs",
+    "view": "gaponet.cli.view:view",
     "demo": "gaponet.cli.demo:demo",
     "bench": "gaponet.cli.bench:bench",
 }
