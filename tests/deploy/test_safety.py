@@ -81,7 +81,7 @@ def test_a_correction_is_bounded_in_size_and_rate(limits):
     delta = first
     for _ in range(20):
         delta = limit_delta(np.array([1.0, np.nan]), delta, DT, limits)
-    np.testing.assert_allclose(delta, [0.3, -0.04])
+    np.testing.assert_allclose(delta, [0.5, -0.04])
 
 
 def test_damping_never_asks_for_more_than_the_effort_limit():

@@ -36,8 +36,8 @@ Policy = Callable[[int, State], Array | None]  # period since the start of the r
 class Compensator(Protocol):
     """Changes a target so that the robot ends up where the target says (deploy.compensator). All joints, (n)."""
 
-    def reset(self, target: Array, qpos: Array, qvel: Array) -> None:
-        """Before the first period of blend_in."""
+    def reset(self, target: Array, payload_mass: float | None = None) -> None:
+        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take a while."""
 
     def step(self, target: Array, qpos: Array, qvel: Array) -> Array:
         """What to command so that the robot gets to `target`, (n) rad."""
@@ -98,6 +98,16 @@ def play(motion: Motion, dt: float) -> Policy:
     return lambda k, state: rows[k] if k < len(rows) else None
 
 
+def require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
+    """Refuse a motion that moves joints which the driver does not command."""
+    left = [name for name in motion.moved(robot) if name not in driver.commanded]
+    if left:
+        raise UsageError(
+            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
+            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
+        )
+
+
 class Controller:
     """One run on one robot."""
 
@@ -110,6 +120,7 @@ class Controller:
         compensator: Compensator | None = None,
         clock: Clock | None = None,
         guard: bool = True,
+        payload_mass: float | None = None,
         on_event: Callable[[Event], None] = lambda event: None,
         **meta: Any,
     ) -> None:
@@ -122,8 +133,9 @@ class Controller:
             compensator: Between targets and commands.
             clock: Default the machine's monotonic clock.
             guard: Start the process that damps the robot if this one dies, where the driver has one.
+            payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
             on_event: Told every change of phase.
-            meta: Kept with the recording (unit, payload_mass, model…).
+            meta: Kept with the recording (unit, model…).
         """
         self.driver, self.robot, self.compensator = driver, robot, compensator
         self.config, self.safety = config or ControlConfig(), safety or SafetyConfig()
@@ -135,9 +147,10 @@ class Controller:
         self.phase = Phase.IDLE
         self.recording = Recording(
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
-            meta=meta | {"kp": robot.kp[self.joints].tolist(), "kd": robot.kd[self.joints].tolist()},
+            meta=meta | {"payload_mass": payload_mass, "kp": robot.kp[self.joints].tolist(), "kd": robot.kd[self.joints].tolist()},
         )  # fmt: skip
         self._use_guard, self._on_event, self._guard = guard, on_event, None
+        self._payload_mass, self._prepared = payload_mass, compensator is None
         self._ctrl: Array | None = None  # commanded joints
         self._delta = np.zeros(len(self.joints))
         self._since = self._fresh = 0
@@ -240,6 +253,11 @@ class Controller:
                 fault = self._unfresh or Fault("stale", "no fresh state")
                 self._enter(Phase.DAMP, k, now, fault.kind, f"never ready: {fault.text}")
             return
+        if not self._prepared:  # takes longer than a period; then wait for fresh states again
+            assert self.compensator
+            self.compensator.reset(state.qpos, self._payload_mass)
+            self._prepared, self._fresh = True, 0
+            return
         first = policy(0, state)
         if first is None or not np.isfinite(first[self.joints]).all():
             self._enter(Phase.DAMP, k, now, "target", "the motion has no first target, or it is not a number")
@@ -248,8 +266,6 @@ class Controller:
         self._ctrl = self._found.copy()
         distance = np.abs(first[self.joints] - self._found).max()
         self._blend_time = float(move_time(distance, self.config.blend_speed, self.config.blend))
-        if self.compensator:
-            self.compensator.reset(self._full(self._ctrl, state), state.qpos, state.qvel)
         self._enter(Phase.BLEND_IN, k, now, "", f"to the first target in {self._blend_time:.1f} s")
 
     def _send(self, k: int, now: float, state: State, policy: Policy) -> Array | None:

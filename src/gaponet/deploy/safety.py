@@ -40,7 +40,7 @@ class SafetyConfig:
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
     """Of a joint's effort limit that a command may ask for."""
-    delta: float = 0.3
+    delta: float = 0.5
     """Largest correction of a model, rad."""
     delta_rate: float = 2.0
     """Fastest change of a model's correction, rad/s."""
