@@ -169,7 +169,7 @@ class VirtualH12:
         if fault == "nan":
             qpos[joint] = np.nan
         if fault == "jump":
-            qpos[joint] += 0.8
+            qpos[joint] += 1.5
         if fault == "hot":
             temperature[joint] = 120.0
         self._frozen = qpos, qvel, tau, temperature
