@@ -25,7 +25,8 @@ class RobotProcess:
 
     def ask(self, line: str) -> Any:
         """Answer to a line."""
-        assert self.process.stdin and self.process.stdout
+        assert self.process.stdin
+        assert self.process.stdout
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())

@@ -94,9 +94,7 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
     assert sequence.meta.notes["rows"] == "as recorded"
     assert sequence.dt == 0.02
     recording.save(tmp_path / "logs", "sway")
-    report = import_logs(
-        tmp_path / "logs", arm, "virtual-1", 0.0, tmp_path / "set", position_unit="rad", time_unit="s"
-    )
+    report = import_logs(tmp_path / "logs", arm, "virtual-1", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
     stored = report.dataset.read(report.entries[0])
     np.testing.assert_allclose(stored.ctrl, sequence.ctrl, atol=1e-6)
     np.testing.assert_allclose(stored.qpos, sequence.qpos, atol=1e-6)
@@ -229,7 +227,7 @@ def test_a_compensator_acts_within_its_bounds(arm):
             self.resets = getattr(self, "resets", 0) + 1
 
         def step(self, target, qpos, qvel):
-            return target + [5.0, -0.01]
+            return target + np.array([5.0, -0.01])
 
     greedy = Greedy()
     recording = run(arm, Tampered(arm, SimulatedClock()), compensator=greedy, payload_mass=0.7)

@@ -1,4 +1,4 @@
-"""Faults on real DDS: robot and controller in processes of their own, on loopback. What arrives at the robot is judged."""
+"""Faults on real DDS: robot and controller in two processes, on loopback. What arrives at the robot is judged."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
-from deploy.robot_process import RobotProcess  # noqa: E402
+from deploy.robot_process import RobotProcess
 
-from gaponet.deploy.controller import ControlConfig, Controller  # noqa: E402
-from gaponet.deploy.driver import DriverError  # noqa: E402
-from gaponet.deploy.drivers.unitree import UnitreeDriver  # noqa: E402
-from gaponet.deploy.recording import Recording  # noqa: E402
-from gaponet.deploy.safety import Limits, SafetyConfig  # noqa: E402
-from gaponet.errors import UsageError  # noqa: E402
-from gaponet.robot import RobotSpec, load_robot  # noqa: E402
+from gaponet.deploy.controller import ControlConfig, Controller
+from gaponet.deploy.driver import DriverError
+from gaponet.deploy.drivers.unitree import UnitreeDriver
+from gaponet.deploy.recording import Recording
+from gaponet.deploy.safety import Limits, SafetyConfig
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec, load_robot
 
 DOMAIN = 20 + os.getpid() % 150
 SLOW = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=0.3)  # machines that run tests are busy
@@ -59,7 +59,7 @@ def run(at_fault, robot: RobotSpec = ROBOT, domain: int = DOMAIN) -> Recording:
 def judge(recording: Recording, heard: dict[str, list]) -> None:
     """What the robot heard: never outside the limits, and once damped, damped for good."""
     arms = ROBOT.index(recording.commanded)
-    ctrl, kp, kd, qvel = (np.array(heard[n])[:, arms] for n in ("ctrl", "kp", "kd", "qvel"))
+    ctrl, kp, _kd, _qvel = (np.array(heard[n])[:, arms] for n in ("ctrl", "kp", "kd", "qvel"))
     limits = Limits.of(ROBOT, recording.commanded, SafetyConfig())
     stiff = (kp > 0).all(axis=1)
     assert (stiff | (kp == 0).all(axis=1)).all()

@@ -90,7 +90,7 @@ def test_damping_never_asks_for_more_than_the_effort_limit():
 
 
 def test_a_share_above_the_effort_limit_is_refused():
-    with pytest.raises(UsageError, match="torque_share is 1.5; give at most 1"):
+    with pytest.raises(UsageError, match=r"torque_share is 1\.5; give at most 1"):
         SafetyConfig(torque_share=1.5)
 
 

@@ -18,11 +18,12 @@ from gaponet.errors import UsageError
 def record(
     motion: str,
     out: Path,
-    unit_id: str,
     payload_mass: float,
+    unit_id: str = "",
     driver: Literal["virtual", "unitree", "so101"] = "virtual",
     robot: str | None = None,
     payload_side: str = "both",
+    max_payload: float | None = None,
     repetitions: int = 1,
     reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),  # noqa: B008
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
@@ -35,11 +36,13 @@ def record(
     Args:
         motion: A motion's name or file; several, separated by commas, are played one after the other.
         out: Dataset folder; made, or appended to. Every run's full recording goes to OUT/recordings.
-        unit_id: Which of its kind was recorded.
+        unit_id: Which of its kind was recorded; the virtual driver knows it and sets it.
         payload_mass: kg in each hand named by payload_side; 0 when empty.
         driver: virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial).
         robot: Name or folder; default h1_2, or so101 with that driver.
         payload_side: both, or one hand.
+        max_payload: kg that the motion must be possible with; default 3 for named motions, so that all payloads play
+            the same one, and payload_mass for files.
         repetitions: Of each motion.
         reach: How to reach the robot.
         control: Timing.
@@ -51,10 +54,12 @@ def record(
     from gaponet.data.sequence import SequenceMeta, to_sequence
     from gaponet.data.store import Dataset
 
+    if driver != "virtual" and not unit_id:
+        raise UsageError("say which unit is recorded: --unit-id NAME")
     screen = Out(json)
-    if driver == "virtual" and reach.unit in unit_id.removeprefix("virtual-"):
-        unit_id = unit_id if unit_id.startswith("virtual-") else f"virtual-{unit_id}"
-    asked = Request("", driver, robot, None, payload_mass, payload_side, reach, control, safety, yes)
+    if driver == "virtual":
+        unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
+    asked = Request("", driver, robot, None, payload_mass, payload_side, max_payload, reach, control, safety, yes)
     written, errors = [], []
     for name in [m.strip() for m in motion.split(",") for _ in range(repetitions)]:
         recording, played, spec = perform(screen, replace(asked, motion=name))

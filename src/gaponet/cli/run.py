@@ -56,6 +56,7 @@ class Request:
     model: Path | None = None
     payload_mass: float | None = None
     payload_side: str = "both"
+    max_payload: float | None = None
     reach: Reach = field(default_factory=Reach)
     control: ControlConfig = field(default_factory=ControlConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
@@ -69,8 +70,9 @@ def run(
     model: Path | None = None,
     payload_mass: float | None = None,
     payload_side: str = "both",
+    max_payload: float | None = None,
     out: Path | None = None,
-    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),  # noqa: B008
+    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
     safety: SafetyConfig = SafetyConfig(),  # noqa: B008
     yes: tyro.conf.FlagCreatePairsOff[bool] = False,
@@ -85,6 +87,8 @@ def run(
         model: Run or artifact folder: compensate with it, so that the robot gets to where the motion says.
         payload_mass: kg in each hand; with a model, None estimates it.
         payload_side: both, or one hand.
+        max_payload: kg that the motion must be possible with; default 3 for named motions, so that all payloads play
+            the same one, and payload_mass for files.
         out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npz.
         reach: How to reach the robot.
         control: Timing.
@@ -93,7 +97,9 @@ def run(
         json: One JSON object on stdout.
     """
     screen = Out(json)
-    session = Request(motion, driver, robot, model, payload_mass, payload_side, reach, control, safety, yes)
+    session = Request(
+        motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes
+    )
     recording, played, _ = perform(screen, session)
     if out:
         screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
@@ -111,7 +117,7 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     spec = load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
     fast = asked.reach.fast and asked.driver == "virtual"
     clock = SimulatedClock() if fast else MonotonicClock()
-    motion = find_motion(asked.motion, spec, asked.payload_mass)
+    motion = find_motion(asked, spec)
     driver, facts = make_driver(asked, spec, clock, motion)
     require_commanded(motion, spec, driver)
     compensator = _compensator(asked, spec)
@@ -127,14 +133,19 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     return recording, motion, spec
 
 
-def find_motion(name: str, robot: RobotSpec, payload_mass: float | None) -> Motion:
+def find_motion(asked: Request, robot: RobotSpec) -> Motion:
     """A motion file, fitted to the robot's limits, or a motion of the library."""
     from gaponet.motion.feasible import MAX_PAYLOAD
     from gaponet.motion.files import SUFFIXES, read_motion
     from gaponet.motion.library import Library
 
-    library = Library(robot, max_payload=max(payload_mass or 0.0, MAX_PAYLOAD) if robot.payload_mounts else 0.0)
-    if not name.endswith(SUFFIXES):
+    name, payload = asked.motion, asked.payload_mass or 0.0
+    is_file = name.endswith(SUFFIXES)
+    heaviest = max(payload, 0.0 if is_file else MAX_PAYLOAD) if asked.max_payload is None else asked.max_payload
+    if heaviest < payload:
+        raise UsageError(f"--max-payload {heaviest:g} is less than --payload-mass {payload:g}")
+    library = Library(robot, max_payload=heaviest)
+    if not is_file:
         return library.make(name)
     motion = read_motion(name, robot)
     library.add(motion)
@@ -167,8 +178,9 @@ def tracking(recording: Recording) -> dict[str, Any]:
     if len(rows) < 2:
         return {}
     at = [recording.joint_names.index(name) for name in recording.commanded]
-    error = np.abs(np.array([b.state.qpos[at] - a.target[at] for a, b in zip(rows, rows[1:], strict=False)]))  # type: ignore[index]
-    moved = np.ptp([r.target[at] for r in rows], axis=0) > 1e-6  # type: ignore[index]
+    target, qpos = np.array([r.target for r in rows])[:, at], np.array([r.state.qpos for r in rows])[:, at]
+    error = np.abs(qpos[1:] - target[:-1])
+    moved = np.ptp(target, axis=0) > 1e-6
     joints = {n: float(e) for n, e, m in zip(recording.commanded, error.mean(axis=0), moved, strict=True) if m}
     return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
 
@@ -188,8 +200,8 @@ def _compensator(asked: Request, robot: RobotSpec) -> Any:
 
 def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
     screen.say(
-        f"[bold]{driver.address}[/] will move {len(driver.commanded)} joints for {motion.duration:.1f} s ({motion.name}). "
-        "Is the space around it free, and a hand on its own emergency stop? Enter to start, Ctrl-C to leave."
+        f"[bold]{driver.address}[/] will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
+        f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? Enter to start, Ctrl-C to leave."
     )
     if not sys.stdin.isatty():
         raise UsageError("no terminal to ask on; say --yes if the space around the robot is free")
@@ -203,10 +215,12 @@ def _tell(screen: Out, event: Event) -> None:
 
 def _report(screen: Out, recording: Recording) -> None:
     facts = recording.summary()
+    three = lambda what: ", ".join(f"{facts[what][q]:.2f}" for q in ("p50", "p99", "max"))  # noqa: E731
+    error = tracking(recording).get("tracking_error_rad", {}).get("mean")
     label = "VIRTUAL " if recording.virtual else ""
     screen.table(f"{label}{recording.robot} at {facts['rate_hz']:g} Hz", ["what", "value"], [
         ["periods, of which never started", f"{facts['periods']}, {recording.missed}"],
-        ["late, ms: p50, p99, max", ", ".join(f"{facts['late_ms'][q]:.2f}" for q in ("p50", "p99", "max"))],
-        ["age of state, ms: p50, p99, max", ", ".join(f"{facts['state_age_ms'][q]:.2f}" for q in ("p50", "p99", "max"))],
-        ["tracking error, mrad", f"{1e3 * (tracking(recording).get('tracking_error_rad', {}).get('mean') or np.nan):.2f}"],
+        ["late, ms: p50, p99, max", three("late_ms")],
+        ["age of state, ms: p50, p99, max", three("state_age_ms")],
+        ["tracking error, mrad", "–" if error is None else f"{1e3 * error:.2f}"],
     ])  # fmt: skip

@@ -74,7 +74,9 @@ def virtual(
         finally:
             if heard:
                 served.heard.save(heard)
-        out.say(f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods")
+        out.say(
+            f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods"
+        )
         return
     from gaponet.deploy.drivers.so101_virtual import VirtualSO101
 

@@ -26,7 +26,7 @@ class MonotonicClock:
         return time.monotonic()
 
     def wait_until(self, deadline: float) -> float:
-        """Sleep to shortly before the deadline, then spin. A signal handler may run meanwhile and does not shorten it."""
+        """Sleep to shortly before the deadline, then spin. Signal handlers run meanwhile and do not shorten it."""
         left = deadline - time.monotonic() - SPIN
         if left > 0:
             time.sleep(left)

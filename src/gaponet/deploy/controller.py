@@ -3,8 +3,8 @@
     idle ─ fresh state ─→ blend_in ─ at the first target ─→ run ─ end ─→ blend_out ─ back ─→ damp ─ time ─→ stopped
       └──────────────────────┴── any fault, key, signal or call ──┴────────┴──→ damp
 
-Only blend_in, run and blend_out send position commands. Damp is entered at once and for good: what caused it is latched,
-and a controller that has stopped cannot be started again. docs/deploy-safety.md says what this guarantees.
+Only blend_in, run and blend_out send position commands. Damp is entered at once and for good: what caused it is
+latched, and a controller that has stopped cannot be started again. docs/deploy-safety.md says what this guarantees.
 """
 
 from __future__ import annotations
@@ -147,7 +147,8 @@ class Controller:
         self.phase = Phase.IDLE
         self.recording = Recording(
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
-            meta=meta | {"payload_mass": payload_mass, "kp": robot.kp[self.joints].tolist(), "kd": robot.kd[self.joints].tolist()},
+            meta=meta | {"payload_mass": payload_mass}
+            | {name: getattr(robot, name)[self.joints].tolist() for name in ("kp", "kd")},
         )  # fmt: skip
         self._use_guard, self._on_event, self._guard = guard, on_event, None
         self._payload_mass, self._prepared = payload_mass, compensator is None

@@ -108,7 +108,7 @@ class Recording:
         }
 
     def save(self, folder: Path, name: str) -> Path:
-        """NAME.parquet for gaponet import (if the motion was reached), NAME.json, and NAME.cycles.npz with everything."""
+        """NAME.parquet for gaponet import (if the motion was reached), NAME.json, and all periods in NAME.cycles.npz."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -116,16 +116,15 @@ class Recording:
         (folder / f"{name}.json").write_text(json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n", "utf-8")
         full = lambda x: np.full(len(self.joint_names), np.nan) if x is None else x  # noqa: E731
         states = {n: np.array([getattr(r.state, n) for r in self.rows]) for n in ("qpos", "qvel", "tau", "temperature")}
-        np.savez_compressed(
-            folder / f"{name}.cycles.npz",
-            joint_names=np.array(self.joint_names),
-            time=np.array([r.time for r in self.rows]),
-            state_time=np.array([r.state.time for r in self.rows]),
-            phase=np.array([r.phase for r in self.rows]),
-            target=np.array([full(r.target) for r in self.rows]),
-            ctrl=np.array([full(r.ctrl) for r in self.rows]),
-            **states,
-        )
+        everything = states | {
+            "joint_names": np.array(self.joint_names),
+            "time": np.array([r.time for r in self.rows]),
+            "state_time": np.array([r.state.time for r in self.rows]),
+            "phase": np.array([r.phase for r in self.rows]),
+            "target": np.array([full(r.target) for r in self.rows]),
+            "ctrl": np.array([full(r.ctrl) for r in self.rows]),
+        }
+        np.savez_compressed(folder / f"{name}.cycles.npz", **everything)  # type: ignore[arg-type]
         path = folder / f"{name}.parquet"
         if sum(r.phase == "run" for r in self.rows) >= 2:
             log = self.log(str(path))

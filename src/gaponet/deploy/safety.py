@@ -7,10 +7,10 @@ A position command leaves only if it is within
 3. the torque that it asks for: |kp (u − q) − kd q̇| ≤ share · effort limit,
 
 all three, for every joint. Each is an interval; the command is moved into their intersection. Range and rate always
-intersect, because the previous command was within the range. The torque interval follows the measured joint and may leave
-the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then there is no
-position command that is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields to
-another. The size and rate of a model's correction are bounded before that, on the request; the three limits above
+intersect, because the previous command was within the range. The torque interval follows the measured joint and may
+leave the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then there is no
+position command that is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields
+to another. The size and rate of a model's correction are bounded before that, on the request; the three limits above
 come last and may cut a correction further.
 """
 
@@ -276,5 +276,7 @@ class Watch:
         self._refused = [*(r for r in self._refused if now - r[0] <= 1.0), (now, state.refused)]
         count = state.refused - self._refused[0][1]
         if count > self.config.refused:
-            return Fault("checksum", f"{count} messages with a wrong checksum within a second; check cable and firmware")
+            return Fault(
+                "checksum", f"{count} messages with a wrong checksum within a second; check cable and firmware"
+            )
         return None

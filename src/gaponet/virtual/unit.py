@@ -131,9 +131,9 @@ class VirtualRobot:
         self._reported = np.zeros((2, *target.shape), bool)
 
     def set_gains(self, kp: Array, kd: Array) -> None:
-        """Gains (n) or (N, n) told to the drives instead of the robot's, N·m/rad and N·m·s/rad; they deliver their share.
+        """Gains told to the drives instead of the robot's, (n) or (N, n); they deliver their share of them.
 
-        Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles with the gains it finds.
+        Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles by those it finds.
         """
         p, at = self.physics, self.active
         self._kp = np.broadcast_to(np.asarray(kp, float)[..., at] * p.kp_scale, self._kp.shape)

@@ -61,7 +61,11 @@ def test_the_wire_layout_is_that_of_cyclonedds():
     def build(cls, fields):
         values = []
         for _, kind, count in fields:
-            one = (lambda k=kind: next(counter) % 100) if isinstance(kind, str) else (lambda k=kind: build(inner[id(k)], k))
+            one = (
+                (lambda k=kind: next(counter) % 100)
+                if isinstance(kind, str)
+                else (lambda k=kind: build(inner[id(k)], k))
+            )
             values.append(one() if count == 1 else [one() for _ in range(count)])
         return cls(*values)
 

@@ -1,3 +1,4 @@
+# mypy: disable-error-code="type-arg, valid-type, method-assign, unused-ignore, attr-defined, assignment"
 """hg topics over cyclonedds: types for the bus, raw bytes for us. Imported when a bus is opened.
 
 The classes below are what other participants see of our types. They carry a message as bytes: `serialize` and
@@ -118,8 +119,8 @@ def raw(kind: type[IdlStruct]) -> type[IdlStruct]:
         sample.data = data[len(HEADER) :] if data[:2] == HEADER[:2] else b""
         return sample
 
-    kind.serialize = serialize  # type: ignore[method-assign, assignment]
-    kind.deserialize = classmethod(deserialize)  # type: ignore[method-assign, assignment]
+    kind.serialize = serialize
+    kind.deserialize = classmethod(deserialize)
     return kind
 
 
@@ -139,7 +140,9 @@ class Bus:
             "<AllowMulticast>true</AllowMulticast></General></Domain></CycloneDDS>"
         )
         try:
-            self._domain = _DOMAINS[domain] if domain in _DOMAINS else _DOMAINS.setdefault(domain, Domain(domain, config))
+            self._domain = (
+                _DOMAINS[domain] if domain in _DOMAINS else _DOMAINS.setdefault(domain, Domain(domain, config))
+            )
             self._participant = DomainParticipant(domain)
         except DDSException as error:
             raise DriverError(f"DDS on {interface} does not start: {error}; is the interface up?") from None
@@ -176,7 +179,7 @@ _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
 def send(writer: DataWriter, kind: type[IdlStruct], data: Array) -> None:
     """Publish one message."""
     sample = kind.__new__(kind)
-    sample.data = data.tobytes()  # type: ignore[attr-defined]
+    sample.data = data.tobytes()
     try:
         writer.write(sample)
     except DDSException as error:

@@ -1,8 +1,8 @@
 """Feetech's servo bus (STS series, protocol 0): packets over any byte stream, and the registers of an STS3215.
 
-A packet is FF FF id length instruction parameters… checksum; a reply has a status byte in place of the instruction. Numbers are
-little-endian; velocity and load are sign and magnitude. From Feetech's public memory table (STS3215) and protocol manual.
-Tested against a bus that answers by the same document; not against servos.
+A packet is FF FF id length instruction parameters… checksum; a reply has a status byte in place of the instruction.
+Numbers are little-endian; velocity and load are sign and magnitude. From Feetech's public memory table (STS3215) and
+protocol manual. Tested against a bus that answers by the same document; not against servos.
 """
 
 from __future__ import annotations

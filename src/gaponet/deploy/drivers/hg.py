@@ -3,9 +3,9 @@
 LowState and LowCmd have a fixed size, so one structured dtype reads or writes a whole message at once: 5 µs instead of
 2 ms that field by field takes, of the 2 ms that a 500 Hz state leaves.
 
-The figures are those of Unitree's public IDL (unitree_sdk2, unitree_hg): fields and types, little-endian CDR without padding
-at the end of a struct on the wire; the checksum is CRC-32/MPEG-2 over the 32-bit words of the C struct, which does pad. Tested
-against the serialiser of cyclonedds and against a CRC written bit by bit; not against a robot.
+The figures are those of Unitree's public IDL (unitree_sdk2, unitree_hg): fields and types, little-endian CDR
+without padding at the end of a struct on the wire; the checksum is CRC-32/MPEG-2 over the 32-bit words of the C struct,
+which does pad. Tested against the serialiser of cyclonedds and a CRC written bit by bit; not against a robot.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple
     Args:
         fields: A struct.
         start: Offset at which it begins.
-        padded: As a C compiler lays it out (structs begin and end at multiples of 4), else as CDR does (only scalars do).
+        padded: As C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
         prefix: Path of the struct.
     """
     out: list[tuple[str, str, int, int]] = []

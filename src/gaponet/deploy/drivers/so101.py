@@ -1,15 +1,16 @@
 """SO101Driver: an SO-101 arm, six Feetech STS3215 servos on a serial bus.
 
-Units: 4096 encoder steps a turn; velocity in steps/s; current in 6.5 mA. tau is current times a constant, signed by the load: the
-constant makes the stall current the effort limit; it was not calibrated. Zero of a joint is the middle of its calibrated range
-(LeRobot's convention), or step 2048 without a calibration; it is not exactly the MJCF's zero, gaponet import fits the rest.
+Units: 4096 encoder steps a turn; velocity in steps/s; current in 6.5 mA. tau is current times a constant, signed by the
+load: the constant makes the stall current the effort limit; it was not calibrated. Zero of a joint is the middle of its
+calibrated range (LeRobot's convention), or step 2048 without a calibration; it is not exactly the MJCF's zero.
 
-The servos cannot damp: `damp` switches their torque off and the gears brake. They keep their last target when commands cease.
-Not checked on a real arm: everything was tested against a bus that answers by Feetech's document.
+The servos cannot damp: `damp` switches their torque off and the gears brake. They keep their last target when commands
+cease. Not checked on a real arm: everything was tested against a bus that answers by Feetech's document.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from pathlib import Path
@@ -40,7 +41,9 @@ class SO101Driver:
     virtual = False
     noisy = False  # a resting encoder reads the same for ever
 
-    def __init__(self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None, timeout: float = 0.01) -> None:
+    def __init__(
+        self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None, timeout: float = 0.01
+    ) -> None:
         """
         Args:
             robot: so101.
@@ -76,8 +79,8 @@ class SO101Driver:
             model, mode = self._bus.read(servo, reg.MODEL), self._bus.read(servo, reg.MODE)
             if model != reg.STS3215 or mode != 0:
                 raise DriverError(
-                    f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the driver needs an STS3215 "
-                    f"({reg.STS3215}) in position mode (0)"
+                    f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the driver needs an "
+                    f"STS3215 ({reg.STS3215}) in position mode (0)"
                 )
         self._state: State | None = None
         deadline = time.monotonic() + 1.0
@@ -139,10 +142,8 @@ class SO101Driver:
         """Torque off, port closed."""
         if self._serial is None:
             return
-        try:
+        with contextlib.suppress(DriverError):
             self.damp()
-        except DriverError:
-            pass
         self._serial.close()
         self._serial = None
 

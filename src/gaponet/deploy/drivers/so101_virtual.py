@@ -1,4 +1,4 @@
-"""A VIRTUAL SO-101 on a pseudo-terminal: six servos that answer like STS3215, hidden physics in real time behind them."""
+"""A VIRTUAL SO-101 on a pseudo-terminal: servos that answer like STS3215, hidden physics in real time behind them."""
 
 from __future__ import annotations
 
@@ -133,7 +133,10 @@ class VirtualSO101:
             for register, value in (
                 (reg.PRESENT_POSITION, np.clip(round(qpos[i] / STEP) + STEPS // 2, 0, STEPS - 1)),
                 (reg.PRESENT_VELOCITY, round(qvel[i] / STEP)),
-                (reg.PRESENT_LOAD, np.clip(round(1000 * tau[i] / self.robot.effort_limit[self._order[i]]), -1000, 1000)),
+                (
+                    reg.PRESENT_LOAD,
+                    np.clip(round(1000 * tau[i] / self.robot.effort_limit[self._order[i]]), -1000, 1000),
+                ),
                 (reg.PRESENT_CURRENT, round(current[i])),
                 (reg.PRESENT_TEMPERATURE, round(temperature[i])),
             ):

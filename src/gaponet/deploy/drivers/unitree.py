@@ -1,14 +1,17 @@
-"""UnitreeDriver: the H1-2 over DDS: rt/lowstate in, rt/arm_sdk (shared with the robot's own controller) or rt/lowcmd out.
+"""UnitreeDriver: the H1-2 over DDS. State from rt/lowstate; commands to rt/arm_sdk, shared with the robot, or rt/lowcmd.
 
-Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers, topics, the
-weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for pitch/roll
-ankles. Tested against a virtual robot on real DDS only. Not checked, for want of a robot: that `tick` counts
-milliseconds (measured when connecting; arrival times are used where it does not), how the robot behaves when commands cease, and
-the sign and scale of tau_est.
+Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers,
+topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for
+pitch/roll ankles. Tested against a virtual robot on real DDS only. Not checked, for want of a robot: that `tick` counts
+milliseconds (measured when connecting; arrival times are used where it does not), how the robot behaves when commands
+cease, and the sign and scale of tau_est. The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one
+roll, pitch, yaw (17 to 19 and 24 to 26): ours follows the latter, as the MJCF does; check it with one small wrist
+motion first.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
 from typing import TYPE_CHECKING, Literal
 
@@ -96,8 +99,8 @@ class UnitreeDriver:
         others = self._bus.publishers(topic) if self.sole else 0
         if others:
             raise DriverError(
-                f"{others} other participant(s) publish {topic} on {self.interface}; stop them first (on the robot: leave "
-                "debug programs, and for lowcmd release the motion mode)"
+                f"{others} other participant(s) publish {topic} on {self.interface}; stop them first (on the "
+                "robot: leave debug programs, and for lowcmd release the motion mode)"
             )
         seen = self._listen()
         self._clock = TickClock(*seen)
@@ -106,7 +109,9 @@ class UnitreeDriver:
         while self._state is None:
             self._drain()
             if time.monotonic() > deadline:
-                raise DriverError(f"rt/lowstate on {self.interface} has {self._refused} messages, all with a wrong checksum")
+                raise DriverError(
+                    f"rt/lowstate on {self.interface} has {self._refused} messages, all with a wrong checksum"
+                )
             time.sleep(0.001)
         hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
 
@@ -123,8 +128,8 @@ class UnitreeDriver:
                     ticks.append(int(hg.LowState.view(data, "tick")[0]))
             if now - start > CONNECT and not arrivals:
                 raise DriverError(
-                    f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within {CONNECT:g} s. "
-                    "Is the robot on, the cable in, the interface right? A virtual one: gaponet virtual serve"
+                    f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
+                    f"{CONNECT:g} s. Is the robot on, the cable in, the interface right? A virtual one: gaponet virtual serve"
                 )
             time.sleep(0.001)
         return arrivals, ticks
@@ -186,10 +191,8 @@ class UnitreeDriver:
         """Leave the bus; on rt/arm_sdk the last word is weight 0: the arms are the robot's own again."""
         if self._bus is None:
             return
-        try:
+        with contextlib.suppress(DriverError):
             self.damp(0.0)
-        except DriverError:
-            pass
         self._bus = self._reader = self._writer = None  # type: ignore[assignment]
 
     def guard(self) -> dict[str, object] | None:
@@ -203,8 +206,8 @@ class UnitreeDriver:
 class TickClock:
     """Maps the robot's tick to this machine's monotonic clock, so that late messages are seen to be old.
 
-    The offset is the smallest (arrival − tick) seen, that is, the fastest way a message ever took; it may grow slowly, in
-    case the robot's clock is slower than ours.
+    The offset is the smallest (arrival − tick) seen, that is, the fastest way a message ever took; it may grow slowly,
+    in case the robot's clock is slower than ours.
     """
 
     def __init__(self, arrivals: list[float], ticks: list[int]) -> None:

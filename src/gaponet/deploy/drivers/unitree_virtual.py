@@ -1,7 +1,7 @@
 """A VIRTUAL H1-2 behind the real DDS topics: hidden physics in real time, LowState out, arm_sdk and lowcmd in.
 
-It holds its home posture until somebody speaks, hands its arms over by the weight of rt/arm_sdk, obeys the gains that it
-is sent, ignores messages with a wrong checksum, and keeps the last command when commands cease: the worst a robot
+It holds its home posture until somebody speaks, hands its arms over by the weight of rt/arm_sdk, obeys the gains that
+it is sent, ignores messages with a wrong checksum, and keeps the last command when commands cease: the worst a robot
 can do. It can also be told to fail, for rehearsing what a controller does then.
 """
 
@@ -30,7 +30,7 @@ ARMS = 12  # motors from here on belong to rt/arm_sdk
 
 @dataclass
 class Heard:
-    """What arrived: time (s), topic, targets, gains, weight, and where the joints truly were, all (n) in motor order."""
+    """What arrived: time (s), topic, targets, gains, weight, and where the joints were; (n) in motor order."""
 
     time: list[float] = field(default_factory=list)
     topic: list[str] = field(default_factory=list)
@@ -44,7 +44,7 @@ class Heard:
 
     def save(self, path: Path) -> None:
         """As npz."""
-        np.savez_compressed(path, **{name: np.array(values) for name, values in vars(self).items()})
+        np.savez_compressed(path, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
 
 
 class VirtualH12:
