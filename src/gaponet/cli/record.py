@@ -25,6 +25,7 @@ def record(
     payload_side: str = "both",
     max_payload: float | None = None,
     repetitions: int = 1,
+    seed: int = 0,
     reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),  # noqa: B008
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
     safety: SafetyConfig = SafetyConfig(),  # noqa: B008
@@ -44,6 +45,7 @@ def record(
         max_payload: kg that the motion must be possible with; default 3 for named motions, so that all payloads play
             the same one, and payload_mass for files.
         repetitions: Of each motion.
+        seed: virtual: of the first recording's noise; later ones count on.
         reach: How to reach the robot.
         control: Timing.
         safety: Limits and watchdogs.
@@ -61,9 +63,9 @@ def record(
         unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
     asked = Request("", driver, robot, None, payload_mass, payload_side, max_payload, reach, control, safety, yes)
     written, errors = [], []
-    for name in [m.strip() for m in motion.split(",") for _ in range(repetitions)]:
-        recording, played, spec = perform(screen, replace(asked, motion=name))
-        known = Dataset.peek(out, spec) or Dataset.create(out, spec)
+    for count, name in enumerate([m.strip() for m in motion.split(",") for _ in range(repetitions)], seed):
+        recording, played, spec = perform(screen, replace(asked, motion=name, seed=count))
+        known = Dataset.create(out, spec)
         same = [
             e for e in known.entries
             if (e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.meta.payload_side)

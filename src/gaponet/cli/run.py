@@ -61,6 +61,7 @@ class Request:
     control: ControlConfig = field(default_factory=ControlConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     yes: bool = False
+    seed: int = 0  # of a virtual robot's noise
 
 
 def run(
@@ -169,7 +170,7 @@ def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) ->
     side = asked.payload_side
     physics = load_fleet(reach.fleet, robot).unit(name)
     payload = (asked.payload_mass or 0.0, side)
-    return VirtualDriver(robot, physics, clock, payload, name), {"unit_id": name, "fleet": reach.fleet}
+    return VirtualDriver(robot, physics, clock, payload, name, seed=asked.seed), {"unit_id": name, "fleet": reach.fleet}
 
 
 def tracking(recording: Recording) -> dict[str, Any]:
@@ -201,7 +202,8 @@ def _compensator(asked: Request, robot: RobotSpec) -> Any:
 def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
     screen.say(
         f"[bold]{driver.address}[/] will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
-        f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? Enter to start, Ctrl-C to leave."
+        f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? "
+        "Enter to start, Ctrl-C to leave."
     )
     if not sys.stdin.isatty():
         raise UsageError("no terminal to ask on; say --yes if the space around the robot is free")

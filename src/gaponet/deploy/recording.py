@@ -108,7 +108,7 @@ class Recording:
         }
 
     def save(self, folder: Path, name: str) -> Path:
-        """NAME.parquet for gaponet import (if the motion was reached), NAME.json, and all periods in NAME.cycles.npz."""
+        """NAME.parquet for gaponet import (if the run was reached), NAME.json, and all periods in NAME.cycles.npz."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 

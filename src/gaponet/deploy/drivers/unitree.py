@@ -1,4 +1,4 @@
-"""UnitreeDriver: the H1-2 over DDS. State from rt/lowstate; commands to rt/arm_sdk, shared with the robot, or rt/lowcmd.
+"""UnitreeDriver: the H1-2 over DDS. State from rt/lowstate, commands to rt/arm_sdk or rt/lowcmd.
 
 Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers,
 topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for
@@ -129,7 +129,8 @@ class UnitreeDriver:
             if now - start > CONNECT and not arrivals:
                 raise DriverError(
                     f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
-                    f"{CONNECT:g} s. Is the robot on, the cable in, the interface right? A virtual one: gaponet virtual serve"
+                    f"{CONNECT:g} s. Is the robot on, the cable in, the interface right? A virtual "
+                    "one: gaponet virtual serve"
                 )
             time.sleep(0.001)
         return arrivals, ticks
