@@ -1,1 +1,1 @@
-"""Using a trained model: aligned simulator, compensator, the loop on a robot."""
+"""What a user does with a model on a robot: aligned simulator, compensator, controller, drivers."""

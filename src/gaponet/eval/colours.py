@@ -1,6 +1,8 @@
 """One name and one colour per method, in every figure and every scene."""
 
 NAMES = {
+    "target": "target",
+    "recorded": "recorded",
     "nominal": "nominal simulator",
     "delay_offset": "delay + offset",
     "identified": "identified simulator",
