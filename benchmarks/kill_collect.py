@@ -31,9 +31,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument(
-        "--recipe", default="small", help="one of a dozen parts, or it is done too early"
-    )
+    parser.add_argument("--recipe", default="small", help="one of a dozen parts, or it is done too early")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=False)

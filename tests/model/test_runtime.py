@@ -127,7 +127,7 @@ def test_every_kind_of_network_ships(robot, tmp_path, how):
     assert export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), x) <= 1e-5
     model = GapModel.load(tmp_path)
     if net.config.asks_simulator or net.config.keeps_observation or net.config.delta_hold > 1:
-        with pytest.raises(ModelError, match="only sim.replay runs it"):
+        with pytest.raises(ModelError, match=r"only sim\.replay runs it"):
             model.loop()
     else:
         assert model.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
