@@ -24,7 +24,8 @@ from gaponet.data.store import Dataset
 
 def collect(recipe: str, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "gaponet.cli.main", "collect", "--recipe", recipe, "--out", str(out), "--json"]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with out.with_name("collect.log").open("a") as log:
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
 
 
 def main() -> int:
@@ -44,13 +45,16 @@ def main() -> int:
         child = collect(args.recipe, args.out / "killed")
         before = count(journal)
         time.sleep(rng.uniform(0.0, 1.5 * duration / args.kills))
-        if child.poll() is not None:  # it was done before its moment came: the killing is over
-            break
         if rng.random() < 0.5:  # half of the kills fall while sequences are being written
-            until = time.monotonic() + duration
-            while count(journal) == before and child.poll() is None and time.monotonic() < until:
+            until, enough = time.monotonic() + duration, before + rng.integers(1, 40)
+            while count(journal) < enough and child.poll() is None and time.monotonic() < until:
                 time.sleep(0.001)
             time.sleep(rng.uniform(0.0, 0.03))
+        if child.poll() is not None:  # it was done before its moment came, or it failed
+            if child.returncode:
+                print(f"collect ended with {child.returncode}; see {args.out / 'collect.log'}", file=sys.stderr)
+                return 1
+            break
         os.kill(child.pid, signal.SIGKILL)
         child.wait()
         kills.append(count(journal))
