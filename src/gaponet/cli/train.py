@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -29,6 +29,7 @@ def train(
     resume: tyro.conf.FlagCreatePairsOff[bool] = False,
     robot: str | None = None,
     holdout_units: tuple[str, ...] = (),
+    log: tuple[Literal["tensorboard", "wandb"], ...] = (),
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -43,6 +44,7 @@ def train(
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
         robot: Robot name or folder, if not the package's robot of the dataset.
+        log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.
         config: Everything else.
         json: One JSON object on stdout.
@@ -50,7 +52,7 @@ def train(
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     config = replace(config, model=replace(config.model, kind=model))
-    trained = run_training(data, spec, out, config, budget, resume, holdout_units)
+    trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
@@ -65,7 +67,14 @@ def train(
 
 
 def run_training(
-    data: Dataset, spec: RobotSpec, out: Path, config: TrainConfig, budget: str, resume: bool, holdout: tuple[str, ...]
+    data: Dataset,
+    spec: RobotSpec,
+    out: Path,
+    config: TrainConfig,
+    budget: str,
+    resume: bool,
+    holdout: tuple[str, ...],
+    log: tuple[str, ...] = (),
 ) -> GapModel:
     """Train with a progress bar: reward, held-out MPJAE, throughput."""
     from gaponet.train.budget import Budget
@@ -79,7 +88,7 @@ def run_training(
             best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
             update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
 
-        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show)
+        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show, log)
         return trainer.run()
 
 

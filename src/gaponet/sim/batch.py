@@ -79,6 +79,19 @@ class BatchSim:
         for n in np.unique(self._nstep[moving]):
             self.batch.step(moving[self._nstep[moving] == n], nstep=int(n))
 
+    def state(self) -> dict[str, Array]:
+        """Copies of all that the next step follows from."""
+        return {name: x.copy() for name, x in self._state().items()}
+
+    def set_state(self, state: dict[str, Array]) -> None:
+        """Undo `state`; entries of other names are not looked at."""
+        for name, x in self._state().items():
+            x[:] = state[name]
+
+    def _state(self) -> dict[str, Array]:
+        late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
+        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late
+
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""
         return self.batch.get_data(env)

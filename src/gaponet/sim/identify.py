@@ -14,12 +14,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mujoco
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import least_squares
+from scipy.optimize import lsq_linear
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
@@ -38,7 +37,8 @@ MAX_DELAY = 0.15  # s
 MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
 MAX_MASS = 20.0  # kg
 MASS_STEP = 0.1  # kg
-TOGETHER = 0.05  # of the prior, where all joints leave their values by the same share: a cold day, a slow bus
+TOGETHER = 0.05  # of the prior, where all joints leave their values by the same share: a cold day, a slow bus …
+COMMON = ("damping", "frictionloss", "armature", "delay")  # … which does not turn zeros, nor soften gains
 SETTLE = 0.1  # s: velocities at a window's start are measured ones
 
 # Parameter → (lower, upper, finite-difference step), as a multiple of the scale in `_scales`.
@@ -96,7 +96,7 @@ def identify(
         fields: Which parameters; the others stay the robot's.
         corrector: Corrects the targets on the way, as in replay.
         prior: Price of leaving the robot's own values, rad per scale: for logs too short to determine everything. All
-            joints together leave them for a twentieth of it, zero offsets apart.
+            joints together leave them for a twentieth of it, gains and zero offsets apart.
         evaluations: At most so many.
         unknown_payload: Do not believe the recordings' payload mass; fit one for all of them.
     """
@@ -104,23 +104,11 @@ def identify(
     if not parts:
         raise UsageError("no recording is longer than a second; identification needs longer ones")
     problem = _Problem(parts, robot, nthread, fields, corrector, prior, unknown_payload)
-    count = 0
-
-    def residual(x: Array) -> Array:
-        nonlocal count
-        count += 1
-        e = problem.evaluate(x)
-        progress(count, evaluations, problem.rms(e))
-        return e
-
-    low, high = problem.bounds()
-    fit = least_squares(
-        residual, problem.start(), problem.jacobian, bounds=(low, high), loss="soft_l1", f_scale=SOFT,
-        max_nfev=evaluations, xtol=1e-4, ftol=1e-4 if not prior else 1e-3, x_scale="jac",
-    )  # fmt: skip
-    before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.fun)
+    fit = descend(problem, evaluations, 1e-3 if prior else 1e-4, progress)
+    before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.errors)
     mass = {"payload_mass": float(fit.x[-1]), "payload_std": problem.jackknife(fit)} if unknown_payload else {}
-    return Identified(problem.robot_of(fit.x), before, after, problem.doubts(fit.x, fit.jac, after), count, **mass)
+    doubts = problem.doubts(fit.x, fit.jac, after)
+    return Identified(problem.robot_of(fit.x), before, after, doubts, fit.evaluations, **mass)
 
 
 def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
@@ -131,6 +119,58 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
         parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
     parts = [p for p in parts if p.duration > 1.0]
     return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters (P,), errors (m,) and Jacobian (m, P) at the end, and how many evaluations it took."""
+
+    x: Array
+    errors: Array
+    jac: Array
+    evaluations: int
+
+
+def descend(problem: _Problem, evaluations: int, tolerance: float, progress: Callable[[int, int, float], None]) -> Fit:
+    """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
+
+    Many parameters end at a bound (no delay, no friction), where scipy's trust regions creep: two to four times the
+    evaluations. Errors beyond SOFT count linearly, by weights (soft_l1).
+
+    Args:
+        problem: Its start, bounds, errors and Jacobian.
+        evaluations: At most.
+        tolerance: Ends when the cost falls by a smaller share.
+        progress: Called with evaluations done, at most, and the present RMS error in rad.
+    """
+    x, (low, high) = problem.start(), problem.bounds()
+    errors = problem.errors(x[None])[0]
+    jac = problem.jacobian(x, errors)
+    damping, count, fresh = 1e-2, 1, True
+    progress(count, evaluations, problem.rms(errors))
+    while count < evaluations:
+        if not fresh:
+            jac, fresh = problem.jacobian(x, errors), True
+        weight = 1 / np.sqrt(1 + (errors / SOFT) ** 2)
+        normal, slope = jac.T @ (weight[:, None] * jac), jac.T @ (weight * errors)
+        normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12
+        root = np.linalg.cholesky(normal).T
+        step = lsq_linear(root, -np.linalg.solve(root.T, slope), (low - x - 1e-12, high - x + 1e-12)).x
+        trial = np.clip(x + step, low, high)
+        tried = problem.errors(trial[None])[0]
+        count += 1
+        gained = 1 - _soft(tried) / _soft(errors)
+        damping = max(damping / 10, 1e-3) if gained > 0 else damping * 30
+        if gained > 0:
+            x, errors, fresh = trial, tried, False
+        progress(count, evaluations, problem.rms(errors))
+        if 0 <= gained < tolerance or damping > 1e3:
+            break
+    return Fit(x, errors, jac, count)
+
+
+def _soft(errors: Array) -> float:
+    return float((np.sqrt(1 + (errors / SOFT) ** 2) - 1).sum())
 
 
 class _Problem:
@@ -165,7 +205,6 @@ class _Problem:
             np.broadcast_to(i, self.counted.shape)[self.counted]
             for i in (np.arange(self.n), np.arange(len(parts))[:, None])
         )
-        self.last: tuple[Array, Array] | None = None  # parameters and errors evaluated last
         model = build_model(robot)
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         gain = robot.kp[self.op]
@@ -184,11 +223,12 @@ class _Problem:
         }  # fmt: skip
 
     def start(self) -> Array:
-        """The given robot, a little inside the bounds; one period late, since a delay of zero hides its gradient.
+        """The given robot, a little inside the bounds; a little late, since a delay of zero hides its gradient.
 
         An unknown payload starts at the mass of MASSES that fits best.
         """
-        x = self._inside(self.first | {"delay": np.maximum(self.first["delay"], 0.02)})
+        late = 0.005 if self.prior else 0.02  # s; with a prior the given robot is thought to be near
+        x = self._inside(self.first | {"delay": np.maximum(self.first["delay"], late)})
         if not self.unknown_payload:
             return x
         xs = np.repeat(x[None], len(MASSES), axis=0)
@@ -226,11 +266,6 @@ class _Problem:
             {j: {f: float(f"{values[f][i]:.6g}") for f in self.limits} for i, j in enumerate(self.robot.operated)}
         )
 
-    def evaluate(self, x: Array) -> Array:
-        """Errors of one parameter vector, kept for the Jacobian there."""
-        self.last = x.copy(), self.errors(x[None])[0]
-        return self.last[1]
-
     def rms(self, errors: Array) -> float:
         """Of the simulated errors, rad."""
         return float(np.sqrt((errors[: self.rows] ** 2).mean()))
@@ -265,9 +300,9 @@ class _Problem:
         return [replace(s, meta=replace(s.meta, payload_mass=float(x[-1]))) for s in self.parts]
 
     def _prices(self) -> Array:
-        """Prior residual by parameter, (P, P), payload apart; what all joints do together costs TOGETHER of it."""
+        """Prior residual by parameter, payload apart, (P, P); what all joints do together is cheaper."""
         common = np.full((self.n, self.n), (1 - TOGETHER) / self.n)
-        blocks = [np.eye(self.n) - (common if f != "offset" else 0.0) for f in self.limits]
+        blocks = [np.eye(self.n) - (common if f in COMMON else 0.0) for f in self.limits]
         return self.prior * np.asarray(block_diag(*blocks))
 
     def _corrected(self, t: int, target: Array, sim: BatchSim) -> Array:
@@ -289,9 +324,11 @@ class _Problem:
             sim.batch.expand(f"dof_{name}")[:, dof] = values[name]
         sim.batch.expand("actuator_delay")[:, act] = values["delay"]
 
-    def jacobian(self, x: Array) -> Array:
-        """Forward differences towards the inside of the bounds, one simulation for all joints' same field, (m, P)."""
-        base = self.last[1] if self.last is not None and np.array_equal(self.last[0], x) else self.evaluate(x)
+    def jacobian(self, x: Array, base: Array) -> Array:
+        """Forward differences towards the inside of the bounds, one simulation for all joints' same field, (m, P).
+
+        base: The errors at x.
+        """
         fields = len(self.limits)
         steps = np.r_[np.repeat([b[2] for b in self.limits.values()], self.n), [MASS_STEP] * self.unknown_payload]
         steps = np.where(x + steps > self.bounds()[1], -steps, steps)
@@ -311,12 +348,12 @@ class _Problem:
             jac[self.rows :, : len(self.names)] = self._prices()
         return jac
 
-    def jackknife(self, fit: Any) -> float:
+    def jackknife(self, fit: Fit) -> float:
         """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
 
         The model's own errors last as long as a motion, so that rows of a window say little about each other.
         """
-        jac, error = fit.jac, fit.fun
+        jac, error = fit.jac, fit.errors
         weight = 1 / np.sqrt(1 + (error / SOFT) ** 2)
         moved = []
         for window in range(len(self.parts)):

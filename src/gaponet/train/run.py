@@ -3,7 +3,9 @@
 RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
 RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
 RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
-RUN/robot/             the simulator corrected
+RUN/robot/             the simulator corrected              RUN/tensorboard/     the same curve, with --log tensorboard
+
+A run that was stopped and resumed equals one that was not, bit for bit, as long as its budget counts steps.
 """
 
 from __future__ import annotations
@@ -36,10 +38,12 @@ from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
+from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state
 from gaponet.train.config import TrainConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
+from gaponet.train.loggers import Loggers
 from gaponet.train.ppo import make_runner, update
 from gaponet.train.sensor_fit import Report, points_of, report_of
 from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
@@ -81,8 +85,9 @@ class Trainer:
         resume: bool = False,
         holdout_units: tuple[str, ...] = (),
         show: Callable[[Status], None] = lambda status: None,
+        log: tuple[str, ...] = (),
     ) -> None:
-        """Split the dataset and refuse what cannot work, before any time is spent."""
+        """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
         dataset.require_robot(robot)
         if (out / "config.json").exists() and not resume:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
@@ -104,16 +109,19 @@ class Trainer:
         torch.set_num_threads(config.torch_threads)
         self.net = build_network(config.model, self.n)
         self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
-        self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, better or not
+        self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, with gain 1
         self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
         self.reward = self.val = self.nominal = float("nan")
         self.sensor_r2: Report | None = None
-        self.runner_state: dict[str, Any] | None = None
+        self.runner_state: State | None = None
+        self.env_state: State | None = None  # of PPO's environments
+        self.warm_state: State | None = None
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
         if resume:
             self._load()
         self._write_config(holdout_units)
+        self.loggers = Loggers(log, out, asdict(config))
 
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
@@ -143,13 +151,19 @@ class Trainer:
         limit = 0.99 * self.config.model.delta_max
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed)
-        warm.done = self.rounds_done
+        rounds: list[State] = []
         self.stage = "warm start"
+        if self.warm_state is not None and self._spent() < 1:
+            rounds = self.warm_state["rounds"]
+            restore_warm(warm, self.warm_state)
+            torch.set_rng_state(self.rng)
         while warm.done < config.rounds and self._spent() < 1:
+            before = round_state(warm)
             warm.round(self._tick)
             if self.sensor_r2 is not None:
                 self.sensor_r2 = warm.refresh_sensors(self.sensor_r2, self.config.threads)
-            self.rounds_done = warm.done
+            rounds.append(before)
+            self.rounds_done, self.warm_state = warm.done, warm_state(warm, rounds)
             self.steps += config.num_envs * config.steps
             self._consider()
 
@@ -164,7 +178,11 @@ class Trainer:
         if self.runner_state is not None:
             runner.alg.load(self.runner_state, None, True)
         else:
-            runner.alg.actor.mlp.load_state_dict(self.best_state)
+            runner.alg.actor.mlp.load_state_dict(self.trained_state)
+        if self.env_state is not None:
+            restore_env(env, self.env_state)
+            torch.set_rng_state(self.rng)
+        self.warm_state = None
         self.net = runner.alg.actor.mlp
         env.inputs.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         if self.net.predictor is not None:
@@ -179,21 +197,22 @@ class Trainer:
             self.reward = env.mean_reward()
             self._tick()
             if self.updates % self.config.validate_every == 0:
-                self.runner_state = runner.alg.save()
+                self.runner_state, self.env_state = runner.alg.save(), env_state(env)
                 self._consider()
-        self.runner_state = runner.alg.save()
+        self.runner_state, self.env_state = runner.alg.save(), env_state(env)
         self._consider()
 
     def _shrink(self) -> None:
-        """Less of the best correction where validation motions say so, even where all of it does harm."""
+        """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
         if not np.isfinite(self.trained):
             return
         self.stage = "gain"
         self._tick()
-        self.net = build_network(self.config.model, self.n)
-        self.net.load_state_dict(self.trained_state)
-        if choose_gain(self.net, lambda: self.validate(self.net), self.trained) < 1.0:
-            self._consider()
+        with torch.random.fork_rng():
+            net = build_network(self.config.model, self.n)
+        net.load_state_dict(self.trained_state)
+        if choose_gain(net, lambda: self.validate(net), self.trained) < 1.0:
+            self._consider(net)
 
     def finish(self) -> GapModel:
         """Export the best model and write its card."""
@@ -203,6 +222,7 @@ class Trainer:
         net.load_state_dict(self.best_state)
         net.eval()
         env = self._env(max(64, len(self._conditions())), 10, seed=0)
+        self.loggers.close()
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
         return GapModel.load(self.out)
 
@@ -228,19 +248,21 @@ class Trainer:
     def _corrector(self, net: DeltaNet) -> DeltaCorrector:
         return DeltaCorrector(torch_infer(net), self.config.model, self.robot, points_of(net))
 
-    def _consider(self) -> None:
-        """Validate the present network, keep it if it is the best, write progress and checkpoint."""
-        self.val = self.validate(self.net)
+    def _consider(self, shrunk: DeltaNet | None = None) -> None:
+        """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
+        net = shrunk or self.net
+        self.val = self.validate(net)
         if self.val < self.best:
-            self.best, self.best_state = self.val, copy.deepcopy(self.net.state_dict())
+            self.best, self.best_state = self.val, copy.deepcopy(net.state_dict())
         if self.stage in ("warm start", "ppo") and self.val < self.trained:
-            self.trained, self.trained_state = self.val, copy.deepcopy(self.net.state_dict())
+            self.trained, self.trained_state = self.val, copy.deepcopy(net.state_dict())
         line = {
             "stage": self.stage, "steps": self.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
             "val_mpjae": self.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
         with (self.out / "progress.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({k: v if v == v else None for k, v in line.items()}) + "\n")
+        self.loggers.write(line)
         self._save()
         self._tick()
 
@@ -264,7 +286,8 @@ class Trainer:
             "net": self.net.state_dict(), "best_state": self.best_state, "best": self.best, "val": self.val,
             "trained_state": self.trained_state, "trained": self.trained,
             "steps": self.steps, "seconds": self.seconds(), "rounds_done": self.rounds_done, "updates": self.updates,
-            "sensor_r2": self.sensor_r2, "runner": self.runner_state, "rng": torch.get_rng_state(),
+            "sensor_r2": self.sensor_r2,
+            "runner": self.runner_state, "env": self.env_state, "warm": self.warm_state, "rng": torch.get_rng_state(),
         }  # fmt: skip
         temporary = self.out / ".checkpoint.pt.tmp"
         torch.save(state, temporary)
@@ -274,6 +297,8 @@ class Trainer:
         try:
             state = torch.load(self.out / "checkpoint.pt", weights_only=True)
             self.net.load_state_dict(state["net"])
+            self.trained_state, self.trained = state["trained_state"], state["trained"]
+            self.env_state, self.warm_state, self.rng = state["env"], state["warm"], state["rng"]
         except (RuntimeError, KeyError, EOFError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
@@ -283,7 +308,7 @@ class Trainer:
         self.rounds_done, self.updates = state["rounds_done"], state["updates"]
         self.sensor_r2 = report_of(state["sensor_r2"])
         self.runner_state = state["runner"]
-        torch.set_rng_state(state["rng"])
+        torch.set_rng_state(self.rng)
 
     def _write_config(self, holdout_units: tuple[str, ...]) -> None:
         self.out.mkdir(parents=True, exist_ok=True)
