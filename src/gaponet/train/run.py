@@ -303,7 +303,6 @@ class Trainer:
             reason = str(error).splitlines()[0]
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
         self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
-        self.trained_state, self.trained = state["trained_state"], state["trained"]
         self.steps, self.earlier = state["steps"], state["seconds"]
         self.rounds_done, self.updates = state["rounds_done"], state["updates"]
         self.sensor_r2 = report_of(state["sensor_r2"])
