@@ -242,3 +242,16 @@ def test_a_log_of_a_run_that_never_began_says_why(arm):
     recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))
     with pytest.raises(LogError, match="0 periods of phase 'run'"):
         recording.log()
+
+
+def test_damping_takes_the_stiffness_away_and_brakes(arm):
+    driver = Tampered(arm, SimulatedClock())
+    driver.connect()
+    held = driver.read().qpos
+    driver.clock.wait_until(0.5)
+    assert np.abs(driver.read().qpos - held).max() < 0.02
+    driver.damp()
+    driver.clock.wait_until(0.9)
+    sinking = driver.read()
+    assert np.abs(sinking.qpos - held).max() > 0.05
+    assert (np.abs(sinking.qvel) < 5).all()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
@@ -62,7 +62,8 @@ def record(
     if driver == "virtual":
         unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
     asked = Request("", driver, robot, None, payload_mass, payload_side, max_payload, reach, control, safety, yes)
-    written, errors = [], []
+    written: list[str] = []
+    errors: list[dict[str, Any]] = []
     for count, name in enumerate([m.strip() for m in motion.split(",") for _ in range(repetitions)], seed):
         recording, played, spec = perform(screen, replace(asked, motion=name, seed=count))
         known = Dataset.create(out, spec)

@@ -150,7 +150,8 @@ class Controller:
             meta=meta | {"payload_mass": payload_mass}
             | {name: getattr(robot, name)[self.joints].tolist() for name in ("kp", "kd")},
         )  # fmt: skip
-        self._use_guard, self._on_event, self._guard = guard, on_event, None
+        self._use_guard, self._on_event = guard, on_event
+        self._guard: Guard | None = None
         self._payload_mass, self._prepared = payload_mass, compensator is None
         self._ctrl: Array | None = None  # commanded joints
         self._delta = np.zeros(len(self.joints))
