@@ -5,7 +5,7 @@ import dataclasses
 import mujoco
 import numpy as np
 import pytest
-from arm import commands, record, write_arm
+from arm import XML, commands, record, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.errors import UsageError
@@ -127,6 +127,13 @@ def test_a_closeup_may_cut_limbs_without_operated_joints():
     whole, near = Scene(standing), Scene(standing, closeup=True)
     assert whole.box[2] < 0.1 < 0.6 < near.box[2]  # feet, pelvis
     assert whole.box[3] == near.box[3]
+    assert whole.floor == near.floor < 0.05
+
+
+def test_a_ground_in_the_robots_own_file_is_not_drawn_four_times(tmp_path):
+    own = XML.replace("<worldbody>", '<worldbody><geom name="ground" type="plane" size="1 1 1"/>')
+    scene = Scene(shown(write_arm(tmp_path, xml=own)))
+    assert (scene.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).sum() == 1
 
 
 def test_a_picture_is_not_blank_and_shows_every_colour(camera):

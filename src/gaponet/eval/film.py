@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,8 @@ def require_kind(path: Path) -> None:
         raise UsageError(f"--render {path}: name a file that ends in {', '.join(KINDS)}")
     if not path.parent.is_dir():
         raise UsageError(f"--render {path}: there is no folder {path.parent}; make it first")
+    if importlib.util.find_spec("PIL") is None:
+        raise UsageError("--render needs Pillow; run: pip install 'gaponet[view]'")
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
 
@@ -105,7 +108,7 @@ def _write_gif(pictures: list[Any], path: Path, milliseconds: int) -> None:
     sheet = Image.new("RGB", (some[0].width, some[0].height * len(some)))
     for i, picture in enumerate(some):
         sheet.paste(picture, (0, i * picture.height))
-    palette = sheet.quantize(COLOURS, Image.Quantize.MEDIANCUT)
+    palette = sheet.quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
     frames = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     frames[0].save(path, save_all=True, append_images=frames[1:], duration=milliseconds, loop=0, optimize=True)
 

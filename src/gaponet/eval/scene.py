@@ -1,7 +1,7 @@
 """Several copies of a robot side by side in one MuJoCo scene, one colour per method, made to be looked at.
 
 Nothing is stepped here: joint angles are given, positions follow from them. The robots of the package have no meshes;
-what is added to their lines is what is known of them: housings about the joints, and the shells of collision.toml.
+what is added to their lines is what is known of them: housings about the joints, and the shells of look.toml or collision.toml.
 """
 
 from __future__ import annotations
@@ -129,23 +129,23 @@ class Scene:
         seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
         if not len(seen):
             raise UsageError(f"{robot.mjcf}: has no visible geom; add one to each body to look at it")
-        if closeup:
-            near = _operated_bodies(model, robot)
-            seen = np.array([g for g in seen if model.geom_bodyid[g] in near])
+        near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
+        fits = np.array([model.geom_bodyid[g] in near for g in seen])
         middle, half = model.geom_aabb[seen, None, :3], model.geom_aabb[seen, None, 3:]
         corners = middle + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T  # (k, 8, 3)
         address = [model.joint(name).qposadr[0] for name in robot.joint_names]
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        axes = np.stack([*self.view.axes, [0.0, 0.0, 1.0]])
+        low, high, floor = np.full(2, np.inf), np.full(2, -np.inf), np.inf
+        axes = np.stack(self.view.axes)
         for motion in self.shown.motions:
             part = motion.qpos[rows]
             for q in part[np.unique(np.linspace(0, len(part) - 1, SAMPLES).astype(int))]:
                 data.qpos[address] = q
                 mujoco.mj_kinematics(model, data)
                 points = data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
-                places = points.reshape(-1, 3) @ axes.T
+                floor = min(floor, float(points[..., 2].min()))
+                places = points[fits].reshape(-1, 3) @ axes.T
                 low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
-        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), float(low[2])
+        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
 
     def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
         scene, meta = mujoco.MjSpec(), self.shown.real.meta
@@ -167,6 +167,8 @@ def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: st
     spec.option = mujoco.MjSpec().option  # nothing is stepped; all copies must agree
     for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys):
         spec.delete(part)
+    for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+        spec.delete(geom)  # the scene has a ground of its own
     payload = {f"payload_{m.side}" for m in robot.payload_mounts}
     rgba = rgb(colour) if colour else GHOST
     dark = (*(0.55 * np.array(rgba[:3])), rgba[3])
