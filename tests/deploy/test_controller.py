@@ -137,7 +137,8 @@ def test_no_command_sent_around_a_fault_is_outside_the_limits(arm, kind, at):
     assert len([c for _, c in driver.sent if c is not None]) == len(rows)
 
 
-def test_a_robot_that_is_never_well_is_never_commanded(arm):
+def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
+    monkeypatch.setattr("gaponet.deploy.controller.PATIENCE", 0.3)
     driver = Tampered(arm, SimulatedClock(), at=0.0, kind="hot")
     recording = run(arm, driver)
     assert phases(recording) == ["idle", "damp", "stopped"]
@@ -238,7 +239,8 @@ def test_a_compensator_acts_within_its_bounds(arm):
     np.testing.assert_allclose(delta[:, 1], -0.01, atol=1e-12)
 
 
-def test_a_log_of_a_run_that_never_began_says_why(arm):
+def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
+    monkeypatch.setattr("gaponet.deploy.controller.PATIENCE", 0.3)
     recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))
     with pytest.raises(LogError, match="0 periods of phase 'run'"):
         recording.log()
