@@ -24,6 +24,8 @@ from gaponet.deploy.safety import Limits, SafetyConfig
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec, load_robot
 
+pytestmark = pytest.mark.faults
+
 DOMAIN = 20 + os.getpid() % 150
 SLOW = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=0.3)  # machines that run tests are busy
 ROBOT = load_robot("h1_2")
