@@ -1,4 +1,4 @@
-# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types. make faults: real DDS.
+# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
