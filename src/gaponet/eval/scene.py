@@ -1,7 +1,8 @@
 """Several copies of a robot side by side in one MuJoCo scene, one colour per method, made to be looked at.
 
 Nothing is stepped here: joint angles are given, positions follow from them. The robots of the package have no meshes;
-what is added to their lines is known of them: housings about the joints, and the shells of look.toml or collision.toml.
+what is added to their lines is what is known of them: housings about the joints, and the shells of look.toml or
+collision.toml.
 """
 
 from __future__ import annotations
