@@ -5,8 +5,8 @@ runs of several seconds from recorded states; all finite differences of a Jacobi
 
 A servo's parameters act on its own joint first: what they do to the others is weaker by the ratio of the inertias. So
 one simulation moves the same parameter of all joints, and each joint's error is put down to its own parameter: six
-simulations for a Jacobian, however many joints. The cost is the true one, so that what is left out slows the descent a
-little and moves no minimum.
+simulations for a Jacobian, however many joints. That comes near the minimum, and a few steps with what joints of a limb
+do to each other end there; joints of different limbs are moved together to the end.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import lsq_linear
+from scipy.sparse.csgraph import connected_components
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
@@ -31,7 +32,7 @@ Array = np.ndarray
 
 WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
 WINDOWS = 40
-EVALUATIONS = 20
+EVALUATIONS, POLISH = 20, 4  # with joints on their own, and with all of a limb
 SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
 MAX_DELAY = 0.15  # s
 MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
@@ -104,7 +105,9 @@ def identify(
     if not parts:
         raise UsageError("no recording is longer than a second; identification needs longer ones")
     problem = _Problem(parts, robot, nthread, fields, corrector, prior, unknown_payload)
-    fit = descend(problem, evaluations, 1e-3 if prior else 1e-4, progress)
+    fit = descend(problem, problem.start(), evaluations, 1e-3, progress)
+    if not prior:
+        fit = descend(problem, fit.x, POLISH, 1e-4, progress, alone=False)
     before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.errors)
     mass = {"payload_mass": float(fit.x[-1]), "payload_std": problem.jackknife(fit)} if unknown_payload else {}
     doubts = problem.doubts(fit.x, fit.jac, after)
@@ -131,26 +134,35 @@ class Fit:
     evaluations: int
 
 
-def descend(problem: _Problem, evaluations: int, tolerance: float, progress: Callable[[int, int, float], None]) -> Fit:
+def descend(
+    problem: _Problem,
+    x: Array,
+    evaluations: int,
+    tolerance: float,
+    progress: Callable[[int, int, float], None],
+    alone: bool = True,
+) -> Fit:
     """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
 
     Many parameters end at a bound (no delay, no friction), where scipy's trust regions creep: two to four times the
     evaluations. Errors beyond SOFT count linearly, by weights (soft_l1).
 
     Args:
-        problem: Its start, bounds, errors and Jacobian.
+        problem: Its bounds, errors and Jacobian.
+        x: Start, (P,).
         evaluations: At most.
         tolerance: Ends when the cost falls by a smaller share.
         progress: Called with evaluations done, at most, and the present RMS error in rad.
+        alone: As if joints did nothing to each other.
     """
-    x, (low, high) = problem.start(), problem.bounds()
+    low, high = problem.bounds()
     errors = problem.errors(x[None])[0]
-    jac = problem.jacobian(x, errors)
+    jac = problem.jacobian(x, errors, alone)
     damping, count, fresh = 1e-2, 1, True
     progress(count, evaluations, problem.rms(errors))
     while count < evaluations:
         if not fresh:
-            jac, fresh = problem.jacobian(x, errors), True
+            jac, fresh = problem.jacobian(x, errors, alone), True
         weight = 1 / np.sqrt(1 + (errors / SOFT) ** 2)
         normal, slope = jac.T @ (weight[:, None] * jac), jac.T @ (weight * errors)
         normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12
@@ -164,7 +176,7 @@ def descend(problem: _Problem, evaluations: int, tolerance: float, progress: Cal
         if gained > 0:
             x, errors, fresh = trial, tried, False
         progress(count, evaluations, problem.rms(errors))
-        if 0 <= gained < tolerance or damping > 1e3:
+        if 0 <= gained < tolerance or damping > 10:
             break
     return Fit(x, errors, jac, count)
 
@@ -207,6 +219,7 @@ class _Problem:
         )
         model = build_model(robot)
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
+        self.limb = _limbs(model, dof)
         gain = robot.kp[self.op]
         natural = gain * 0.05  # N·m·s/rad: a time constant of 50 ms
         self.scale = {
@@ -324,24 +337,31 @@ class _Problem:
             sim.batch.expand(f"dof_{name}")[:, dof] = values[name]
         sim.batch.expand("actuator_delay")[:, act] = values["delay"]
 
-    def jacobian(self, x: Array, base: Array) -> Array:
-        """Forward differences towards the inside of the bounds, one simulation for all joints' same field, (m, P).
+    def jacobian(self, x: Array, base: Array, alone: bool) -> Array:
+        """Forward differences towards the inside of the bounds, (m, P).
 
-        base: The errors at x.
+        Args:
+            x: Parameters, (P,).
+            base: The errors there.
+            alone: One simulation moves a field of all joints, and each joint answers for itself; else one joint of
+                every limb, and the limb answers.
         """
-        fields = len(self.limits)
         steps = np.r_[np.repeat([b[2] for b in self.limits.values()], self.n), [MASS_STEP] * self.unknown_payload]
         steps = np.where(x + steps > self.bounds()[1], -steps, steps)
-        moved = np.zeros((fields + self.unknown_payload, self.size))
-        for field in range(fields):
-            moved[field, field * self.n : (field + 1) * self.n] = 1.0
+        # Which joint's parameter moves in the limb of joint i, (simulations of a field, n); −1: none.
+        movers = np.arange(self.n)[None] if alone else _one_per_limb(self.limb)
+        columns = [np.where(m < 0, -1, m + self.n * f) for f in range(len(self.limits)) for m in movers]
+        moved = np.zeros((len(columns) + self.unknown_payload, self.size))
+        for row, column in zip(moved, columns, strict=False):
+            row[column[column >= 0]] = 1.0
         if self.unknown_payload:
             moved[-1, -1] = 1.0
         change = (self.errors(x + moved * steps) - base)[:, : self.rows]
         jac = np.zeros((len(base), self.size))
-        for field in range(fields):
-            column = field * self.n + self.joint
-            jac[np.arange(self.rows), column] = change[field] / steps[column]
+        for answer, column in zip(change, columns, strict=False):
+            to = column[self.joint]
+            rows = np.flatnonzero(to >= 0)
+            jac[rows, to[rows]] = answer[rows] / steps[to[rows]]
         if self.unknown_payload:  # a payload loads every joint
             jac[: self.rows, -1] = change[-1] / steps[-1]
         if self.prior:
@@ -383,6 +403,22 @@ class _Problem:
                     f"{joint}: {field} {value * scale:.4g} ± {error * scale:.2g} is not determined by these logs"
                 )
         return tuple(found)
+
+
+def _limbs(model: mujoco.MjModel, dof: Array) -> Array:
+    """Number of the limb of each of these degrees of freedom, (n,): those on one chain, with none between limbs."""
+    linked = np.zeros((len(dof), len(dof)))
+    for i, d in enumerate(dof):
+        while d >= 0:
+            linked[i, dof == d] = 1.0
+            d = model.dof_parentid[d]
+    return connected_components(linked, directed=False)[1]
+
+
+def _one_per_limb(limb: Array) -> Array:
+    """Row k: for every joint, the k-th joint of its limb, −1 where that has fewer, (largest limb, n)."""
+    members = [np.flatnonzero(limb == name) for name in limb]
+    return np.array([[m[k] if k < len(m) else -1 for m in members] for k in range(max(map(len, members)))])
 
 
 def _held(x: Array, rows: int) -> Array:
