@@ -7,9 +7,7 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.errors import UsageError
-from gaponet.robot import load_robot
-from gaponet.sim.identify import BOUNDS, _limbs, _one_per_limb, _Problem, cut, identify
-from gaponet.sim.model import build_model
+from gaponet.sim.identify import cut, identify
 
 
 @pytest.fixture(scope="module")
@@ -50,34 +48,3 @@ def test_windows_cover_all_recordings(tmp_path):
     assert {p.meta.motion for p in parts} == {s.meta.motion for s in sequences}
     with pytest.raises(UsageError, match="longer"):
         identify([s.rows(slice(0, 20)) for s in sequences], robot)
-
-
-@pytest.fixture(scope="module")
-def problem(tmp_path_factory):
-    robot = write_arm(tmp_path_factory.mktemp("arm"))
-    return _Problem(cut(recordings(robot, 2, rows=60, kp=0.6), 2), robot, 0, tuple(BOUNDS), None, 0.0, False)
-
-
-def test_the_jacobian_of_a_limb_is_that_of_one_parameter_after_the_other(problem):
-    x = problem.start()
-    base, steps = problem.errors(x[None])[0], np.repeat([b[2] for b in BOUNDS.values()], 2)
-    slow = (problem.errors(x + np.diag(steps)) - base).T / steps
-    np.testing.assert_array_equal(problem.jacobian(x, base, alone=False), slow)
-
-
-def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(problem):
-    x = problem.start()
-    base = problem.errors(x[None])[0]
-    alone, company = (problem.jacobian(x, base, alone) for alone in (True, False))
-    own = problem.joint[:, None] == np.tile([0, 1], len(BOUNDS))
-    assert not alone[~own].any()
-    gain = own & (np.arange(len(x)) < 2)
-    assert np.abs(alone - company)[gain].mean() < 0.2 * np.abs(company[gain]).mean()
-
-
-def test_two_arms_are_two_limbs():
-    robot = load_robot("h1_2")
-    model = build_model(robot)
-    limb = _limbs(model, np.array([model.joint(j).dofadr[0] for j in robot.operated]))
-    assert limb.tolist() == [0] * 5 + [1] * 5
-    assert _one_per_limb(np.array([0, 0, 1])).tolist() == [[0, 0, 2], [1, 1, -1]]
