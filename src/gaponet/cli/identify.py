@@ -49,7 +49,7 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.errors import UsageError
     from gaponet.robot_folder import save_robot
-    from gaponet.sim.identify import BOUNDS
+    from gaponet.sim.free_runs import BOUNDS
     from gaponet.sim.identify import identify as fit
     from gaponet.sim.replay import replay
 
