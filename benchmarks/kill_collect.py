@@ -1,6 +1,6 @@
 """Proof that collecting survives being killed: ten kill -9 at random moments, then the datasets are compared.
 
-    python benchmarks/kill_collect.py OUT [--kills 10] [--recipe demo] [--seed 0]
+    python benchmarks/kill_collect.py OUT [--kills 10] [--recipe small] [--seed 0]
 
 Collects the recipe once undisturbed into OUT/whole, then into OUT/killed with a kill -9 of the collecting process after
 a random time, again and again, and finishes it. Prints one JSON object; exits with 1 if anything differs.
@@ -24,14 +24,15 @@ from gaponet.data.store import Dataset
 
 def collect(recipe: str, out: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "gaponet.cli.main", "collect", "--recipe", recipe, "--out", str(out), "--json"]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with out.with_name("collect.log").open("a") as log:
+        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=log)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--kills", type=int, default=10)
-    parser.add_argument("--recipe", default="demo")
+    parser.add_argument("--recipe", default="small", help="one of a dozen parts, or it is done too early")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=False)
@@ -43,14 +44,17 @@ def main() -> int:
     while len(kills) < args.kills:
         child = collect(args.recipe, args.out / "killed")
         before = count(journal)
-        time.sleep(rng.uniform(0.0, 0.7 * duration))
-        if child.poll() is not None:  # it was done before its moment came: the killing is over
-            break
+        time.sleep(rng.uniform(0.0, 1.5 * duration / args.kills))
         if rng.random() < 0.5:  # half of the kills fall while sequences are being written
-            until = time.monotonic() + duration
-            while count(journal) == before and child.poll() is None and time.monotonic() < until:
+            until, enough = time.monotonic() + duration, before + rng.integers(1, 40)
+            while count(journal) < enough and child.poll() is None and time.monotonic() < until:
                 time.sleep(0.001)
             time.sleep(rng.uniform(0.0, 0.03))
+        if child.poll() is not None:  # it was done before its moment came, or it failed
+            if child.returncode:
+                print(f"collect ended with {child.returncode}; see {args.out / 'collect.log'}", file=sys.stderr)
+                return 1
+            break
         os.kill(child.pid, signal.SIGKILL)
         child.wait()
         kills.append(count(journal))
@@ -65,7 +69,8 @@ def main() -> int:
         "stray_files": len(files) - len(killed),
     }
     print(json.dumps(result))
-    return 0 if result["same_order_and_hashes"] and not result["stray_files"] else 1
+    sound = len(kills) == args.kills and result["same_order_and_hashes"] and not result["stray_files"]
+    return 0 if sound else 1
 
 
 def count(journal: Path) -> int:

@@ -88,10 +88,22 @@ def table(results: list[dict[str, Any]]) -> str:
     ]
     for name in results[0]["methods"]:
         mean, std = spread(results, name, "mpjae")
-        text = f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std else f"{mean * 1e3:.2f}"
+        text = f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std > 1e-9 else f"{mean * 1e3:.2f}"
         large, q_dis = spread(results, name, "large_0.05")[0] * 100, spread(results, name, "q_dis")[0]
         rows.append(f"| {TITLES[name]} | {text} | {mean / nominal:.2f} | {q_dis:.2f} | {large:.1f} % |")
     return "\n".join(rows)
+
+
+def horizons(results: list[dict[str, Any]]) -> str:
+    """Markdown: MPJAE in mrad by time since the common start."""
+    methods = list(results[0]["methods"])
+    times = list(results[0]["methods"]["nominal"]["by_horizon"])
+    lines = ["| after | " + " | ".join(TITLES[m] for m in methods) + " |", "| --- |" + " ---: |" * len(methods)]
+    for time in times:
+        found = [spread(results, m, "by_horizon", time, "mpjae") for m in methods]
+        cells = [f"{a * 1e3:.2f} ± {b * 1e3:.2f}" if b > 1e-9 else f"{a * 1e3:.2f}" for a, b in found]
+        lines.append(f"| {time + ' s' if time != 'whole' else 'whole motion'} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def draw(results: list[dict[str, Any]], run: Path) -> None:
@@ -160,7 +172,8 @@ def main() -> None:
         f"{args.seeds}; training budgets in control steps: {steps}; {date.today()}.\nSimulator "
         f"{first['simulator_hash']}. Regenerate: `python benchmarks/real_so101.py LOGS WORK"
         f"{' --nominal-only' if args.nominal_only else ''}`.\n\n"
-        f"{table(results)}\n\nHeld-out motions: {', '.join(first['motions'])}.\n\n![](real_so101.svg)\n"
+        f"{table(results)}\n\nMPJAE in mrad by time since the start (of the last half of that time):\n\n"
+        f"{horizons(results)}\n\nHeld-out motions: {', '.join(first['motions'])}.\n\n![](real_so101.svg)\n"
     )
     (DOCS / "real_so101.md").write_text(text, encoding="utf-8")
     (DOCS / "real_so101.json").write_text(

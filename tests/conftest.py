@@ -1,9 +1,14 @@
 """Fixtures shared by all tests."""
 
 import os
+import sys
 from pathlib import Path
 
 import pytest
+
+if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # before mujoco is imported; tests that render skip where it fails
+
 from arm import write_arm
 
 from gaponet.data.importer import import_logs

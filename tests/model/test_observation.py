@@ -4,13 +4,26 @@ import numpy as np
 import pytest
 
 from gaponet.model.config import ModelConfig
+from gaponet.model.inputs import Inputs
 from gaponet.model.observation import History, frames_before
+from gaponet.robot import load_robot
 
 
 @pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
 def test_dimensions_are_the_papers(history, dim):
     assert ModelConfig(history=history, payload_input=False).observation_dim(10) == dim
     assert ModelConfig(history=4, payload_input=True).observation_dim(10) == 141
+
+
+@pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
+def test_so_they_are_of_the_h1_2(history, dim):
+    n = len(load_robot("h1_2").operated)
+    for payload in (0, 1):
+        config = ModelConfig(history=history, payload_input=bool(payload))
+        empty = History(config, 1, n)
+        state = np.zeros((1, n))
+        assert empty.observe(state, state, np.zeros(1)).shape == (1, dim + payload)
+        assert Inputs(config, 1, np.arange(n)).layout.dim == dim + payload + n
 
 
 def test_layout_is_state_then_frames_newest_first_then_payload():

@@ -5,6 +5,7 @@ import pytest
 import torch
 from arm import recordings, write_arm
 
+from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.sim.replay import replay
 from gaponet.train.config import RewardConfig
@@ -81,3 +82,36 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     after = env.get_observations()
     assert torch.equal(before["actor"], after["actor"])
     assert not torch.equal(before["critic"], after["critic"])
+
+
+def hold_env(robot, hold, rows=60):
+    sequences = recordings(robot, 2, rows=rows, kp=0.6)
+    return DeltaEnv(sequences, robot, ModelConfig(delta_hold=hold), 8, 1000, RewardConfig(), seed=0, nthread=1)
+
+
+def test_a_held_correction_earns_the_mean_reward_of_its_periods(robot):
+    held, single = hold_env(robot, 3), hold_env(robot, 1)
+    single.rng = np.random.default_rng(5)
+    single.reset()
+    for name in ("row", "first", "last", "group"):
+        getattr(held, name)[:] = getattr(single, name)
+    held.sim.reset(slice(None), single.sim.qpos, single.sim.qvel)
+    held.previous[:] = single.previous[:] = 0.0
+    action = torch.full((8, 2), 0.02)
+    alive = single.row + 3 <= single.last
+    rewards = [single.step(action)[1] for _ in range(3)]
+    _, reward, _, _ = held.step(action)
+    assert alive.sum() >= 4
+    torch.testing.assert_close(reward[alive], torch.stack(rewards).mean(0)[alive])
+
+
+def test_a_decision_never_runs_past_the_end_of_a_motion(robot):
+    env = hold_env(robot, 4, rows=10)
+    for _ in range(12):
+        assert (env.row + 4 <= env.last).all()
+        env.step(torch.zeros(8, 2))
+
+
+def test_a_motion_shorter_than_a_decision_is_refused(robot):
+    with pytest.raises(UsageError, match=r"motion motion0 has 4 rows, .* lower --model\.delta-hold"):
+        hold_env(robot, 4, rows=4)

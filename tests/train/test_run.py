@@ -5,14 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import recordings, write_arm
+from arm import commands, record, recordings, write_arm
 
 import gaponet.sim.batch
 from gaponet.data.pair import require_disjoint
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
-from gaponet.eval.evaluate import evaluate
+from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
+from gaponet.eval.figures import COLOURS, NAMES
 from gaponet.model.config import ModelConfig
 from gaponet.train.budget import Budget
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
@@ -52,6 +53,50 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
     assert result["unseen"]
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
     assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+@pytest.mark.parametrize("kind", ["mlp", "transformer", "fno", "inverse"])
+def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
+    data, run, _ = trained
+    config = replace(
+        SMALL,
+        model=replace(
+            SMALL.model,
+            kind=kind,
+            mlp_hidden=(64,),
+            fno_width=16,
+            fno_layers=1,
+            transformer_width=16,
+            transformer_layers=1,
+        ),
+    )
+    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
+    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    if kind == "inverse":  # one regression, no roll-outs of its own, no PPO
+        assert [line["stage"] for line in lines][:2] == ["start", "warm start"]
+        assert {line["steps"] for line in lines} == {0, 16 * 60}
+    else:
+        assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+        assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    result = evaluate([run, tmp_path / "run"], data, robot).result
+    assert [m for m in result["methods"] if m in LEARNED] == [kind, "gaponet"]
+    assert set(ORDER) | {"target", "recorded"} == set(NAMES) == set(COLOURS)
+
+
+@pytest.mark.parametrize(
+    "change", [{"sensors": "oracle"}, {"sensors": "learned"}, {"delta_hold": 2, "sensor_hold": 3}],
+    ids=["oracle", "learned", "held"],
+)  # fmt: skip
+def test_switches_of_the_operator_train_and_are_evaluated_as_they_ship(change, trained, robot, tmp_path):
+    config = replace(SMALL, model=replace(SMALL.model, **change), validate_every=1)
+    budget = Budget(steps=3 * 16 * 60 + 3 * 16 * 16)
+    model = Trainer(trained[0], robot, tmp_path / "run", config, budget).run()
+    assert model.card["simulator_only"] == ("sensors" in change)
+    assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    methods = evaluate([tmp_path / "run"], trained[0], robot).result["methods"]
+    assert methods["gaponet"]["mpjae"] < methods["nominal"]["mpjae"]
+    if change.get("sensors") != "oracle":
+        assert model.card["sensor_r2"]["mean"] > 0.3
 
 
 def test_the_card_says_what_the_model_is(trained):
@@ -133,6 +178,18 @@ def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
         split_entries(data, ("c",))
 
 
+def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for seed in range(4):
+        for payload in (0.0, 0.2):
+            data.append(record(robot, commands(40, seed), f"motion{seed}", payload))
+    parts = split_entries(data, holdout_payloads=(0.2,))
+    assert {e.meta.payload_mass for e in parts["train"] + parts["val"]} == {0.0}
+    assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
+    with pytest.raises(UsageError, match=r"no recording with 3 kg .* it holds 0, 0.2 kg"):
+        split_entries(data, holdout_payloads=(3.0,))
+
+
 @pytest.mark.parametrize(
     ("text", "seconds", "steps"), [("90s", 90, None), ("10m", 600, None), ("2e6", None, 2_000_000)]
 )
@@ -155,3 +212,14 @@ def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(tr
     assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
     assert result["methods"]["identified"]["mpjae"] < 0.6 * result["methods"]["nominal"]["mpjae"]
     assert result["methods"]["gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]
+
+
+def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
+    def error(trainer, net):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+        fitted = net is not None and bool(net.trunk[-1].weight.any())
+        return 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
+
+    monkeypatch.setattr(Trainer, "validate", error)
+    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    assert model.card["gain"] == 0.5
+    assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)

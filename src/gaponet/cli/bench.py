@@ -1,8 +1,9 @@
-"""gaponet bench sim, gaponet bench train: how fast, beside a bare Batch loop and stable-baselines3."""
+"""gaponet bench: speed of simulation (sim), of training (train), and of a trained model (latency, aligned)."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Literal
 
 import tyro
@@ -12,29 +13,40 @@ from gaponet.robot import load_robot
 
 
 def bench(
-    what: tyro.conf.Positional[Literal["sim", "train"]],
+    what: tyro.conf.Positional[Literal["sim", "train", "latency", "aligned"]],
+    run: tyro.conf.Positional[Path] = Path("."),
     robot: str = "so101",
     model: Literal["gaponet", "mlp"] = "gaponet",
     num_envs: int | None = None,
     rounds: int | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Measure control steps per second; the ratio is what counts, machines differ.
+    """Measure speed; of control steps per second the ratio is what counts, machines differ.
 
     Args:
         what: sim: replay and environment. train: inference, collection, update, PPO as a whole, and stable-baselines3
-            where it is installed (pip install 'gaponet[bench]').
+            where it is installed (pip install 'gaponet[bench]'). latency: one correction of a trained model, on each
+            runtime. aligned: the aligned simulator against the nominal one.
+        run: Of gaponet train, for latency and aligned.
         robot: Robot name or folder.
         model: Network that is trained.
         num_envs: Simulations side by side; default 512, 1024 with train.
         rounds: Interleaved turns of each; the fastest counts; default 15, 3 with train.
         json: One JSON object on stdout.
     """
+    from gaponet.cli.aligned import aligned
+    from gaponet.cli.latency import latency
+
+    out = Out(json)
+    if what == "latency":
+        return latency(run, out)
+    if what == "aligned":
+        return aligned(run, out, num_envs or 512, rounds or 15)
     from gaponet.model.config import ModelConfig
     from gaponet.train.bench import bench_sim, bench_train
     from gaponet.train.config import TrainConfig
 
-    out, spec = Out(json), load_robot(robot)
+    spec = load_robot(robot)
     columns = ["", "control steps/s", "of bare"]
     if what == "sim":
         speeds = bench_sim(spec, num_envs or 512, rounds=rounds or 15)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -20,10 +21,11 @@ def calibrate(
     unit: str = "",
     motions: str = "",
     seconds: float = 30.0,
+    payload_mass: Literal["recorded", "unknown"] = "recorded",
     robot: str | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Fit what is particular to one unit (gain, friction, zero offset, delay of each joint) from a short log of it.
+    """Fit what is particular to one unit (gain, damping, friction, zero offset, delay of each joint) from a short log.
 
     The trained model stays as it is. gaponet eval then shows the unit without and with its calibration.
 
@@ -34,6 +36,7 @@ def calibrate(
         motions: Only these, separated by commas; default: those that the run was trained on, so that its test motions
             stay unseen, or all, where the unit played none of them.
         seconds: How much of the recordings to use, in windows of 8 s.
+        payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same.
         robot: Robot name or folder, if not the package's robot of the dataset.
         json: One JSON object on stdout.
     """
@@ -56,13 +59,15 @@ def calibrate(
         entries = [e for e in entries if e.meta.motion in trained] or entries
     with bar("calibrating") as update:
         found = calibration.calibrate(
-            model, simulator, data.sequences(entries), seconds,
+            model, simulator, data.sequences(entries), seconds, payload_mass == "unknown",
             lambda done, total, rms: update(done, total, f"window RMS {mrad(rms)} mrad"),
         )  # fmt: skip
     path = calibration.save(found, run)
     out.table(f"Unit {found.unit_id}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
         [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
     ])  # fmt: skip
+    if found.payload_mass is not None:
+        out.say(f"payload {found.payload_mass:.2f} ± {found.payload_std:.2f} kg in each hand that carries")
     out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; {path}")
     out.say(f"next: gaponet eval {run} {dataset}")
     out.result(asdict(found))

@@ -29,6 +29,7 @@ def identify(
     out: Path,
     windows: int = 40,
     robot: str | None = None,
+    units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -41,10 +42,12 @@ def identify(
         out: Robot folder to write.
         windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
         robot: Robot name or folder to start from, if not the package's robot of the dataset.
+        units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in gaponet train.
         json: One JSON object on stdout.
     """
     from gaponet.data.split import split_entries
+    from gaponet.errors import UsageError
     from gaponet.robot_folder import save_robot
     from gaponet.sim.identify import BOUNDS
     from gaponet.sim.identify import identify as fit
@@ -53,7 +56,11 @@ def identify(
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     data.require_robot(spec)
-    parts = split_entries(data, holdout_units)
+    others = {e.meta.unit_id for e in data.entries} - set(units) if units else set()
+    strangers = set(units) - {e.meta.unit_id for e in data.entries}
+    if strangers:
+        raise UsageError(f"--units {min(strangers)}: not in {dataset}")
+    parts = split_entries(data, tuple(sorted(others | set(holdout_units))))
     with bar("identifying") as update:
         found = fit(
             data.sequences(parts["train"]), spec, windows,

@@ -12,6 +12,7 @@ from gaponet.cli.gap import mrad, show_methods
 from gaponet.cli.inputs import names, open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
+from gaponet.model.config import Kind
 from gaponet.robot import RobotSpec
 from gaponet.train.config import TrainConfig
 
@@ -23,11 +24,12 @@ if TYPE_CHECKING:
 def train(
     dataset: tyro.conf.Positional[Path],
     out: Path,
-    model: Literal["gaponet", "mlp"] = "gaponet",
+    model: Kind = "gaponet",
     budget: str = "10m",
     resume: tyro.conf.FlagCreatePairsOff[bool] = False,
     robot: str | None = None,
     holdout_units: tuple[str, ...] = (),
+    log: tuple[Literal["tensorboard", "wandb"], ...] = (),
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -38,10 +40,11 @@ def train(
     Args:
         dataset: Dataset folder.
         out: Run folder.
-        model: gaponet, or the mlp baseline.
+        model: gaponet, or a baseline: mlp, transformer, fno, inverse.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
         robot: Robot name or folder, if not the package's robot of the dataset.
+        log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.
         config: Everything else.
         json: One JSON object on stdout.
@@ -49,7 +52,7 @@ def train(
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     config = replace(config, model=replace(config.model, kind=model))
-    trained = run_training(data, spec, out, config, budget, resume, holdout_units)
+    trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
@@ -64,7 +67,14 @@ def train(
 
 
 def run_training(
-    data: Dataset, spec: RobotSpec, out: Path, config: TrainConfig, budget: str, resume: bool, holdout: tuple[str, ...]
+    data: Dataset,
+    spec: RobotSpec,
+    out: Path,
+    config: TrainConfig,
+    budget: str,
+    resume: bool,
+    holdout: tuple[str, ...],
+    log: tuple[str, ...] = (),
 ) -> GapModel:
     """Train with a progress bar: reward, held-out MPJAE, throughput."""
     from gaponet.train.budget import Budget
@@ -78,7 +88,7 @@ def run_training(
             best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
             update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
 
-        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show)
+        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show, log)
         return trainer.run()
 
 

@@ -31,23 +31,32 @@ BY: dict[str, Callable[[Entry], str]] = {
 TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
 
 
-def split_entries(dataset: Dataset, holdout_units: tuple[str, ...] = ()) -> Parts:
-    """Entries per part: the fixed split by motion; units held out appear in the test part only, with its motions."""
+def split_entries(
+    dataset: Dataset, holdout_units: tuple[str, ...] = (), holdout_payloads: tuple[float, ...] = ()
+) -> Parts:
+    """Entries per part: the fixed split by motion; what is held out appears in the test part only, with its motions."""
     units = {e.meta.unit_id for e in dataset.entries}
+    payloads = {e.meta.payload_mass for e in dataset.entries}
     strangers = [u for u in holdout_units if u not in units]
     if strangers:
         raise UsageError(f"unit '{strangers[0]}' is not in {dataset.path}; it holds {', '.join(sorted(units))}")
+    unknown = [p for p in holdout_payloads if p not in payloads]
+    if unknown:
+        known = ", ".join(f"{p:g}" for p in sorted(payloads))
+        raise UsageError(f"no recording with {unknown[0]:g} kg in {dataset.path}; it holds {known} kg")
+    away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
     split = split_by_motion([e.meta.motion for e in dataset.entries])
     parts = {
         part: [
             e for e in dataset.entries
-            if e.meta.motion in getattr(split, part) and (part == "test" or e.meta.unit_id not in holdout_units)
+            if e.meta.motion in getattr(split, part) and (part == "test" or not away(e.meta))
         ]
         for part in ("train", "val", "test")
     }  # fmt: skip
     for part, entries in parts.items():
         if not entries:
-            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {', '.join(holdout_units)}")
+            held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)])
+            raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {held}")
     return parts
 
 

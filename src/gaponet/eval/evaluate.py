@@ -1,4 +1,4 @@
-"""Nominal, delay + offset, MLP and GAPONet side by side: free runs with the shipped artifact (ONNX, not torch)."""
+"""Nominal, delay + offset and learned models side by side: free runs with the shipped artifact (ONNX, not torch)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
-ORDER = ("nominal", "delay_offset", "identified", "mlp", "gaponet", "calibrated")  # of tables and figures
+LEARNED = ("inverse", "mlp", "transformer", "fno", "gaponet")  # kinds of model
+ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The figures of a report: one function each, matplotlib in, Figure out; one colour per method everywhere."""
+"""The figures of a report: one function each, matplotlib in, Figure out."""
 
 from __future__ import annotations
 
@@ -8,25 +8,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-Array = np.ndarray
+from gaponet.eval.colours import COLOURS, NAMES
 
-NAMES = {
-    "nominal": "nominal simulator",
-    "delay_offset": "delay + offset",
-    "identified": "identified simulator",
-    "mlp": "MLP",
-    "gaponet": "GAPONet",
-    "calibrated": "calibrated to the unit",
-}
-COLOURS = {
-    "recorded": "#111111",
-    "nominal": "#8c8c8c",
-    "delay_offset": "#d99000",
-    "identified": "#2a9d6f",
-    "mlp": "#3b7dd8",
-    "gaponet": "#c8102e",
-    "calibrated": "#6a1b9a",
-}
+Array = np.ndarray
 
 STYLE = {
     "font.size": 9,

@@ -254,13 +254,23 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
         ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],
-        ["sensor predictor R²", "–" if r2 is None else f"{r2:.3f} on held-out states"],
+        ["sensors", "the simulator's own answers: a bound, not for a robot" if card.get("simulator_only") else
+         shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
+        ["sensor predictor R²", _r2(r2)],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
         ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['init_std']:g} rad"],
         ["seed", str(card["seed"])],
         ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
     ]  # fmt: skip
     return _facts_table(rows)
+
+
+def _r2(found: dict[str, Any] | float | None) -> str:
+    """Held-out R² of the sensor predictor; older cards hold the mean alone."""
+    if not isinstance(found, dict):
+        return "–" if found is None else f"{found:.3f} on held-out states"
+    joints = ", ".join(f"{j} {v:.2f}" for j, v in found["by_joint"].items())
+    return f"{found['mean']:.3f} on held-out states ({joints})"
 
 
 def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> str:

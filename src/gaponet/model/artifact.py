@@ -1,18 +1,24 @@
-"""GapModel: what ships. A folder with model.onnx (normalisers inside) and card.json; needs onnxruntime, not torch."""
+"""GapModel: what ships. A folder with model.onnx (normalisers inside), weights.npz (the same for numpy) and card.json.
+
+Needs onnxruntime, or numpy alone; never torch.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gaponet.errors import ModelError
+from gaponet.model import fused
+from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
 from gaponet.model.config import ModelConfig
-from gaponet.model.corrector import DeltaCorrector, Infer
+from gaponet.model.corrector import DeltaCorrector
+from gaponet.model.runtime import DeltaLoop
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray
@@ -37,8 +43,12 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         "joint_names": list(robot.operated),
         "kp": [float(robot.kp[i]) for i in robot.operated_index],
         "kd": [float(robot.kd[i]) for i in robot.operated_index],
+        "qpos_range": [
+            [float(x) if np.isfinite(x) else None for x in robot.qpos_range[i]] for i in robot.operated_index
+        ],
         "simulator_hash": model_hash(robot),
         "model": asdict(config),
+        "simulator_only": config.asks_simulator,  # a bound to compare with, not for a robot
     } | facts
 
 
@@ -49,44 +59,34 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
-def infer_session(path: Path) -> Infer:
-    """An ONNX file as a function of numpy arrays, on one thread."""
-    try:
-        import onnxruntime as ort
-        from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
-    except ImportError:
-        raise ModelError("onnxruntime is not installed; run: pip install 'gaponet[deploy]'") from None
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    try:
-        session = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.Fail, ort_errors.NoSuchFile) as error:
-        raise ModelError(
-            f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
-        ) from None
-    return lambda x: session.run(None, {"x": x})[0]
-
-
 @dataclass(frozen=True)
 class GapModel:
-    """A delta-action model and its card. `corrector` puts it into a stepping simulator."""
+    """A delta-action model and its card.
+
+    `delta` serves a loop of one's own, deploy.AlignedSim a simulator, `corrector` sim.replay.
+    """
 
     path: Path
     card: dict[str, Any]
     config: ModelConfig
-    infer: Infer
+    infer: Network
+    _loops: list[DeltaLoop] = field(default_factory=list, repr=False, compare=False)  # at most one: that of `delta`
 
     @classmethod
-    def load(cls, path: str | Path) -> GapModel:
+    def load(cls, path: str | Path, backend: Backend = "onnxruntime", threads: int = 1) -> GapModel:
         """Read an artifact, or the artifact of a run folder.
+
+        Args:
+            path: Folder.
+            backend: onnxruntime, or numpy, which needs nothing else.
+            threads: Of onnxruntime; 0 for all cores, which pays for hundreds of robots at once.
 
         Raises:
             ModelError: Missing or damaged file, or one written by a newer version.
         """
         folder = Path(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
-        for name in (CARD, WEIGHTS):
+        for name in (CARD, *([WEIGHTS] if backend == "onnxruntime" else [])):
             if not (folder / name).is_file():
                 raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
         try:
@@ -98,7 +98,40 @@ class GapModel:
             raise ModelError(f"{folder / CARD}: damaged ({error}); restore it or train again") from None
         if version > FORMAT or not set(shape) <= known:
             raise ModelError(f"{folder / CARD}: written by a newer gaponet; upgrade to read it")
-        return cls(folder, card, ModelConfig(**shape), infer_session(folder / WEIGHTS))
+        numpy = backend == "numpy"
+        network = NumpyNetwork(folder / fused.FILE) if numpy else OnnxNetwork(folder / WEIGHTS, threads)
+        return cls(folder, card, ModelConfig(**shape), network)
+
+    @property
+    def qpos_range(self) -> Array:
+        """Limits of the operated joints, (n, 2) rad; ±inf where there is none (or the card is an old one)."""
+        limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
+        return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
+
+    def loop(self, num_envs: int = 1) -> DeltaLoop:
+        """A history of its own for num_envs robots."""
+        return DeltaLoop(self.infer, self.config, self.qpos_range, num_envs)
+
+    def delta(self, qpos: Array, qvel: Array, ctrl: Array, payload_mass: Array | float) -> Array:
+        """Δa for the coming control period, rad, to be added to ctrl; ask exactly once per period.
+
+        The model remembers its last frames; reset() where another motion begins.
+
+        Args:
+            qpos, qvel: State now of the operated joints (card: joint_names), (n,) or (num_envs, n); rad, rad/s.
+            ctrl: Target of the coming period, the same shape, rad.
+            payload_mass: kg, one number or (num_envs,).
+        """
+        if not self._loops:
+            self._loops.append(self.loop(len(ctrl) if np.ndim(ctrl) == 2 else 1))
+        return self._loops[0].delta(qpos, qvel, ctrl, payload_mass)
+
+    def reset(self, ids: Array | None = None) -> None:
+        """Forget the past, of robots `ids` only where given."""
+        if ids is None:
+            self._loops.clear()
+        elif self._loops:
+            self._loops[0].reset(ids)
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""
@@ -115,8 +148,13 @@ class GapModel:
                 f"{self.path}: trained in simulator {card['simulator_hash']}, but robot '{robot.name}' is now "
                 f"{model_hash(robot)} (MJCF, gains or limits changed); train again or use the old robot folder"
             )
-        rates = card.get("dt", [])
-        if dt is not None and rates and min(abs(dt / r - 1) for r in rates) > DT_TOLERANCE:
+        if dt is not None:
+            self.require_rate(dt)
+
+    def require_rate(self, dt: float) -> None:
+        """Refuse a control period, s, that the model was not trained on."""
+        rates = self.card.get("dt", [])
+        if rates and min(abs(dt / r - 1) for r in rates) > DT_TOLERANCE:
             seen = ", ".join(f"{1 / r:.1f}" for r in rates)
             raise ModelError(
                 f"{self.path}: trained at {seen} Hz, asked to run at {1 / dt:.1f} Hz; run the loop at a trained rate, "
@@ -126,7 +164,8 @@ class GapModel:
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
         """For sim.replay and the aligned simulator; refuses a robot the model was not trained on."""
         self.require(robot)
-        return DeltaCorrector(self.infer, self.config, robot)
+        points = OnnxNetwork(self.path / WEIGHTS, output="offsets") if self.config.learns_points else None
+        return DeltaCorrector(self.infer, self.config, robot, points)
 
     def weights_hash(self) -> str:
         """12 hex digits of model.onnx."""

@@ -1,7 +1,9 @@
 """What is particular to one unit, beside a model: a small file per unit in RUN/calibration/.
 
-No model can know a unit's zero offsets, friction level, gain and delay before it has seen the unit. They are fitted to
-half a minute of its log, as servo parameters of the simulator under the trained correction; the network stays as it is.
+No model can know a unit's gain, damping, friction, zero offsets and delay before it has seen the unit. They are fitted
+to half a minute of its log, as servo parameters of the simulator under the trained correction; the network stays as it
+is. So little log does not say much of one joint, and more of all of them: what joints do together is cheaper than what
+one does alone. If nobody weighed what the unit carried, its mass is fitted with them.
 """
 
 from __future__ import annotations
@@ -20,8 +22,9 @@ from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import WINDOW, identify
 
-FIELDS = ("kp", "frictionloss", "offset", "delay")
-PRIOR = 0.1  # rad per scale: outweighed by a few seconds of log that show something else
+FIELDS = ("kp", "damping", "frictionloss", "offset", "delay")
+PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together (docs/log.md, 2026-11-21)
+EVALUATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,11 @@ class Calibration:
     Attributes:
         unit_id: Whose.
         weights: Hash of the model.onnx that they were fitted under.
-        servos: Joint → kp N·m/rad, frictionloss N·m, offset rad, delay s.
+        servos: Joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
         logs: Content hashes of the recordings used.
         seconds: How much of them.
         before, after: RMS error of the windows fitted, rad.
+        payload_mass, payload_std: What the unit carried, kg, and its standard error, where nobody knew; else None.
     """
 
     unit_id: str
@@ -44,6 +48,8 @@ class Calibration:
     seconds: float
     before: float
     after: float
+    payload_mass: float | None = None
+    payload_std: float | None = None
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """The simulator of this unit."""
@@ -55,6 +61,7 @@ def calibrate(
     simulator: RobotSpec,
     sequences: ListOf[Sequence],
     seconds: float = 30.0,
+    unknown_payload: bool = False,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
 ) -> Calibration:
     """Fit a unit's parameters under a trained model.
@@ -64,25 +71,35 @@ def calibrate(
         simulator: The one that the model corrects.
         sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
         seconds: How much is used.
+        unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
         progress: Called with evaluations done, at most, RMS error in rad.
     """
     units = sorted({s.meta.unit_id for s in sequences})
     if len(units) != 1:
         raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    if unknown_payload and len(payloads) > 1:
+        raise UsageError(
+            f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
+            "one and the same: give recordings of one mass"
+        )
     found = identify(
         sequences, simulator, max(1, round(seconds / WINDOW)), progress=progress, fields=FIELDS,
-        corrector=model.corrector(simulator), prior=PRIOR,
+        corrector=model.corrector(simulator), prior=PRIOR, evaluations=EVALUATIONS, unknown_payload=unknown_payload,
     )  # fmt: skip
     servos = {
         j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
         for j in simulator.operated
     }
     logs = tuple(s.content_hash() for s in sequences)
-    return Calibration(units[0], model.weights_hash(), servos, logs, seconds, found.before, found.after)
+    return Calibration(
+        units[0], model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
+        found.payload_std,
+    )  # fmt: skip
 
 
 def save(calibration: Calibration, run: Path) -> Path:
-    """RUN/calibration/UNIT.json."""
+    """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
     path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', calibration.unit_id)}.json"
     path.parent.mkdir(exist_ok=True)
     write_text(path, json.dumps(asdict(calibration), indent=1) + "\n")

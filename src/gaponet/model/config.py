@@ -7,37 +7,61 @@ from typing import Literal
 
 from gaponet.errors import UsageError
 
+Kind = Literal["gaponet", "mlp", "transformer", "fno", "inverse"]
+
+POSITIVE = (
+    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max", "delta_hold", "sensor_hold",
+    "transformer_width", "transformer_layers", "transformer_heads", "fno_width", "fno_layers", "fno_modes",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class ModelConfig:
     """Shape of a delta-action model; every dimension is derived from it and the number of operated joints n."""
 
-    kind: Literal["gaponet", "mlp"] = "gaponet"
-    """gaponet: the operator. mlp: a plain network on [observation, action], the ASAP form."""
+    kind: Kind = "gaponet"
+    """gaponet: the operator. mlp: a plain network on [observation, action], the ASAP form. transformer: attention over
+    the past frames and the present. fno: Fourier neural operator over the same time axis. inverse: the mlp fitted once
+    to the inverse labels on the recorded motions, without roll-outs of its own and without PPO."""
     history: int = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
     stride: int = 1
     """Control periods between past frames."""
     payload_input: bool = True
     """Whether the payload mass is observed."""
+    payload_trunk: bool = True
+    """Whether the trunk is asked at the payload as well as at the action, where it is observed."""
+    payload_predictor: bool = True
+    """Whether the sensor predictor sees the payload, where it is observed."""
     payload_max: float = 3.0
     """Mass that counts as 1 at the input, kg."""
     delta_max: float = 0.3
     """Largest correction, rad."""
+    delta_hold: int = 1
+    """Control periods that a correction is held; the reward of a decision is the mean over them."""
     num_probes: int = 20
     """m, how many targets the simulator is asked about."""
     probe_small: float = 0.05
     """Probe that reads gains and friction, rad."""
     probe_large: float = 0.4
     """Probe that reads inertia, payload and saturation, rad."""
-    sensors: Literal["predicted", "off"] = "predicted"
-    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only."""
+    sensors: Literal["predicted", "oracle", "learned", "off"] = "predicted"
+    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only. oracle: the
+    simulator itself is asked at every state. learned: it is asked at targets that a network chooses. The last two need
+    the simulator's whole state and m more simulations: bounds to compare with, of no use on a robot."""
+    sensor_target: Literal["delta", "absolute"] = "delta"
+    """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
+    sensor_hold: int = 1
+    """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh. With
+    delta_hold they are refreshed at the next decision."""
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""
     coupling: Literal["joint", "full"] = "joint"
     """joint: branch and trunk are shared by the joints and take one joint at a time; postures never recorded do not
     lead them astray (docs/log.md). full: the paper's, every joint sees every joint. The mlp is always full."""
+    branch: Literal["unstacked", "stacked"] = "unstacked"
+    """unstacked: one branch net emits all p features. stacked: p nets of the same hidden layers emit one each."""
     num_basis: int = 16
     """p, basis functions per joint."""
     branch_hidden: tuple[int, ...] = (128, 128)
@@ -48,11 +72,32 @@ class ModelConfig:
     """Hidden layers of the sensor predictor."""
     mlp_hidden: tuple[int, ...] = (512, 256, 128)
     """Hidden layers of the MLP baseline (ASAP's size)."""
+    mlp_match: bool = False
+    """Widen or narrow mlp_hidden, in its proportions, until the MLP has as many parameters as the operator would."""
+    transformer_width: int = 64
+    """Numbers per token of the transformer."""
+    transformer_layers: int = 2
+    """Blocks of attention and MLP."""
+    transformer_heads: int = 4
+    """Attention heads; they share the width."""
+    fno_width: int = 32
+    """Channels of the Fourier neural operator."""
+    fno_layers: int = 3
+    """Spectral layers."""
+    fno_modes: int = 4
+    """Lowest frequencies kept, the mean included; at most history + 2 exist."""
 
     def __post_init__(self) -> None:
-        for field in ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max"):
+        for field in POSITIVE:
             if getattr(self, field) <= 0:
                 raise UsageError(f"{field} is {getattr(self, field)}; it must be positive")
+        if self.mlp_match and not self.mlp_hidden:
+            raise UsageError("mlp_match without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1")
+        if self.transformer_width % self.transformer_heads:
+            raise UsageError(
+                f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
+                "make it a multiple of transformer_heads"
+            )
 
     @property
     def joint_wise(self) -> bool:
@@ -66,3 +111,23 @@ class ModelConfig:
     def sensor_dim(self, n: int) -> int:
         """m probes, each answered by n positions and n velocities."""
         return self.num_probes * 2 * n
+
+    @property
+    def asks_simulator(self) -> bool:
+        """Whether the sensors are the simulator's own answers, a part of x."""
+        return self.kind == "gaponet" and self.sensors in ("oracle", "learned")
+
+    @property
+    def learns_points(self) -> bool:
+        """Whether a network chooses where the simulator is asked."""
+        return self.asks_simulator and self.sensors == "learned"
+
+    @property
+    def keeps_observation(self) -> bool:
+        """Whether x carries the observation of the last refresh, for what the sensors are predicted or chosen from."""
+        return self.kind == "gaponet" and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
+
+    def input_dim(self, n: int) -> int:
+        """Numbers in x = [o_t | a_t | o_refresh or S_t, where there is one]."""
+        more = self.observation_dim(n) * self.keeps_observation + self.sensor_dim(n) * self.asks_simulator
+        return self.observation_dim(n) + n + more

@@ -1,26 +1,27 @@
-"""A network in a running simulation: history, observation, inference, bounds."""
+"""A network in a running simulation: inputs, inference, bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 
 import numpy as np
 
 from gaponet.data.sequence import Sequence
+from gaponet.errors import ModelError
 from gaponet.model.config import ModelConfig
-from gaponet.model.observation import History
+from gaponet.model.inputs import Infer, Inputs
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray
-Infer = Callable[[Array], Array]  # [o_t | a_t] (B, dim) float32 → Δa (B, n) rad
+Condition = tuple[float, str, float]  # payload_mass kg, payload_side, dt s
 
 
 class DeltaCorrector:
     """Target → target + Δa for the operated joints, clipped to the joint range. Implements sim.replay.Corrector."""
 
-    def __init__(self, infer: Infer, config: ModelConfig, robot: RobotSpec) -> None:
-        self.infer, self.config = infer, config
+    def __init__(self, infer: Infer, config: ModelConfig, robot: RobotSpec, points: Infer | None = None) -> None:
+        """points: x → offsets of the probes, where config.sensors is learned."""
+        self.infer, self.config, self.robot, self.points = infer, config, robot, points
         self.op = robot.operated_index
         self.range = robot.qpos_range[self.op]
 
@@ -31,22 +32,51 @@ class DeltaCorrector:
             np.stack([s.qvel[0] for s in start]),
             np.stack([s.ctrl[0] for s in start]),
             np.array([s.meta.payload_mass for s in start], np.float32),
+            [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in start],
         )
 
-    def begin(self, qpos: Array, qvel: Array, ctrl: Array, payload_mass: Array) -> None:
-        """Start from a state, all joints: (k, n_all) each, payload (k,) kg."""
+    def begin(
+        self,
+        qpos: Array,
+        qvel: Array,
+        ctrl: Array,
+        payload_mass: Array,
+        simulated: list[Condition] | None = None,
+    ) -> None:
+        """Start from a state, all joints: (k, n_all) each, payload (k,) kg.
+
+        Args:
+            qpos, qvel, ctrl: State and command.
+            payload_mass: What the model is told.
+            simulated: Payload, side and period of each, where these are simulations whose whole state is given.
+
+        Raises:
+            ModelError: The model asks the simulator, and this is none.
+        """
         op, self.payload = self.op, np.asarray(payload_mass, np.float32)
-        self.history = History(self.config, len(qpos), len(op))
-        frame = [np.repeat(x[:, None, op], self.history.depth, axis=1) for x in (qpos, qvel, ctrl)]
-        self.history.reset(slice(None), *frame)
+        oracle = None
+        if self.config.asks_simulator:
+            if simulated is None:
+                raise ModelError(
+                    f"this model's sensors are the simulator's own answers (sensors = {self.config.sensors}): a "
+                    "bound to compare with, of no use outside a simulator; train with --model.sensors predicted"
+                )
+            from gaponet.model.sensor import ProbeOracle
+
+            oracle = ProbeOracle(self.robot, self.config, simulated)
+        self.inputs = Inputs(self.config, len(qpos), op, oracle, self.points)
+        frames = [np.repeat(x[:, None], self.inputs.history.depth, axis=1) for x in (qpos, qvel, ctrl)]
+        self.inputs.reset(slice(None), *frames)
+        self.periods = 0
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Corrected targets, (k, n_all) rad."""
         op = self.op
-        q, v, a = qpos[:, op], qvel[:, op], target[:, op]
-        x = np.concatenate([self.history.observe(q, v, self.payload), a], axis=1, dtype=np.float32)
-        delta = self.infer(x)
+        a = target[:, op]
+        if self.periods % self.config.delta_hold == 0:
+            self.delta = self.infer(self.inputs.x(qpos, qvel, a, self.payload))
+        self.periods += 1
         out = np.array(target, float)
-        out[:, op] = np.clip(a + delta, self.range[:, 0], self.range[:, 1])
-        self.history.push(q, v, out[:, op])
+        out[:, op] = np.clip(a + self.delta, self.range[:, 0], self.range[:, 1])
+        self.inputs.push(qpos, qvel, out)
         return out

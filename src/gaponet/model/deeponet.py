@@ -1,76 +1,19 @@
-"""Networks: sensor predictor, branch, trunk, their inner product; and the MLP baseline on the same features.
-
-All take x = [o_t | a_t] and return Δa_t; normalisers are buffers inside, so the exported file needs nothing beside it.
-"""
+"""Networks: sensor predictor, branch, trunk and their inner product; and the one place that builds any network."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
 
+from gaponet.model.baselines.fno import DeltaFNO
+from gaponet.model.baselines.mlp import DeltaMLP, matched_hidden
+from gaponet.model.baselines.transformer import DeltaTransformer
 from gaponet.model.config import ModelConfig
-
-
-def dense(inputs: int, hidden: Sequence[int], outputs: int, zero: bool = False) -> nn.Sequential:
-    """Linear layers with ELU between; with `zero` it starts by answering 0."""
-    layers: list[nn.Module] = []
-    for width in hidden:
-        layers += [nn.Linear(inputs, width), nn.ELU()]
-        inputs = width
-    head = nn.Linear(inputs, outputs)
-    if zero:
-        nn.init.zeros_(head.weight)
-        nn.init.zeros_(head.bias)
-    return nn.Sequential(*layers, head)
-
-
-class Standardise(nn.Module):
-    """(x − mean) / std with statistics of the training set; std has a floor so that a constant input stays harmless."""
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.zeros(dim))
-        self.register_buffer("std", torch.ones(dim))
-
-    def fit(self, x: Tensor, floor: float = 1e-4) -> None:
-        """Take mean and std from samples, (N, dim)."""
-        self.mean.copy_(x.mean(0))
-        self.std.copy_(x.std(0).clamp_min(floor))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) / self.std
-
-
-class Features(nn.Module):
-    """[o_t | a_t] with history and action expressed relative to the present position, then standardised.
-
-    A lag of 10 mrad is invisible in absolute joint angles that span a radian; relative to q_t it is the signal.
-    """
-
-    def __init__(self, config: ModelConfig, n: int) -> None:
-        super().__init__()
-        self.n, self.history = n, config.history
-        self.dim = config.observation_dim(n) + n
-        self.standardise = Standardise(self.dim)
-
-    def relative(self, x: Tensor) -> Tensor:
-        """(B, dim) → (B, dim): positions and targets of the past, and a_t, minus q_t."""
-        n = self.n
-        q, v, action = x[:, :n], x[:, n : 2 * n], x[:, -n:]
-        frames = x[:, 2 * n : 2 * n + 3 * n * self.history].reshape(-1, self.history, 3, n)
-        shift = torch.stack([q, torch.zeros_like(q), q], dim=1).unsqueeze(1)  # (B, 1, 3, n)
-        past = (frames - shift).flatten(1)
-        rest = x[:, 2 * n + 3 * n * self.history : -n]  # payload, if observed
-        return torch.cat([q, v, past, rest, action - q], dim=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
-        return self.standardise(self.relative(x)).clamp(-5.0, 5.0)
+from gaponet.model.layers import DeltaNet, Standardise, dense, size
+from gaponet.model.observation import Layout
+from gaponet.model.points import ProbePoints, Surrogate
 
 
 class SensorPredictor(nn.Module):
@@ -78,35 +21,31 @@ class SensorPredictor(nn.Module):
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
-        self.n = n
+        at = Layout(config, n)
+        self.seen = at.observation if config.payload_predictor else slice(0, at.past.stop)  # the payload comes last
         self.outputs = Standardise(config.sensor_dim(n))
-        self.net = dense(config.observation_dim(n), config.sensor_hidden, 2 * config.sensor_dim(n))
+        self.net = dense(self.seen.stop, config.sensor_hidden, 2 * config.sensor_dim(n))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Takes standardised features; the action, their last n columns, is not looked at."""
-        mean, log_var = self.net(features[:, : -self.n]).chunk(2, dim=1)
+        mean, log_var = self.net(features[:, self.seen]).chunk(2, dim=1)
         return mean, log_var.clamp(-10.0, 4.0)
 
 
-class Bounded(nn.Module):
-    """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
+class Stacked(nn.Module):
+    """p nets that emit one feature of every joint each, where one net would emit p (Lu et al. 2021)."""
 
-    The gain is 1 while training; train/gain.py lowers it where less of a correction does better.
-    """
-
-    gain: Tensor
-
-    def __init__(self, delta_max: float) -> None:
+    def __init__(self, nets: list[nn.Sequential]) -> None:
         super().__init__()
-        self.delta_max = delta_max
-        self.register_buffer("gain", torch.tensor(1.0))
+        self.nets = nn.ModuleList(nets)
 
-    def forward(self, y: Tensor) -> Tensor:
-        return self.delta_max * torch.tanh(self.gain * y / self.delta_max)
+    def forward(self, x: Tensor) -> Tensor:
+        """(…, inputs) → (…, outputs of one net, p)."""
+        return torch.stack([net(x) for net in self.nets], dim=-1)
 
 
-class OperatorNet(nn.Module):
-    """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), an unstacked DeepONet.
+class OperatorNet(DeltaNet):
+    """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), a DeepONet.
 
     Coupling "joint": one branch and one trunk, shared by all joints, take what belongs to a joint and its name.
     What other joints do reaches it through its sensors. Coupling "full": the paper's, every joint sees every joint.
@@ -115,87 +54,105 @@ class OperatorNet(nn.Module):
     which: Tensor
 
     def __init__(self, config: ModelConfig, n: int) -> None:
-        super().__init__()
-        self.config, self.n = config, n
-        self.features = Features(config, n)
-        self.predictor = SensorPredictor(config, n) if config.sensors == "predicted" else None
-        self.sees_observation = config.branch_history or self.predictor is None
+        super().__init__(config, n)
+        if config.sensors == "predicted":
+            self.predictor = SensorPredictor(config, n)
+        elif config.sensors == "learned":
+            self.predictor, self.points = Surrogate(config, n), ProbePoints(config, n)
+        elif config.sensors == "oracle":
+            self.answers = Standardise(config.sensor_dim(n))
+        self.sees_observation = config.branch_history or config.sensors == "off"
+        self.asks_payload = config.payload_input and config.payload_trunk
         self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)
         sensed, seen, asked = self.input_dims(config, n)
         outputs = config.num_basis * (1 if self.per_joint else n)
-        self.branch = dense(
-            sensed * (self.predictor is not None) + seen * self.sees_observation + n * self.per_joint,
-            config.branch_hidden,
-            outputs,
-        )
+        inputs = sensed * (config.sensors != "off") + seen * self.sees_observation + n * self.per_joint
+        if config.branch == "stacked":
+            nets = [dense(inputs, config.branch_hidden, outputs // config.num_basis) for _ in range(config.num_basis)]
+            self.branch: nn.Module = Stacked(nets)
+        else:
+            self.branch = dense(inputs, config.branch_hidden, outputs)
         self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
-        self.bounded = Bounded(config.delta_max)
-        # Supervised fitting samples the predictor, so that the branch does not trust a number that the predictor is
-        # unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when asked twice.
-        self.sample_sensors = False
+        # Supervised fitting samples the predictor (sample_sensors), so that the branch does not trust a number that the
+        # predictor is unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when
+        # asked twice.
 
     @staticmethod
     def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
         """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
-        payload = int(config.payload_input)
+        payload, asked = int(config.payload_input), int(config.payload_input and config.payload_trunk)
         if config.joint_wise:
-            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + payload
-        return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
+            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + asked
+        return config.sensor_dim(n), config.observation_dim(n), 2 * n + asked
+
+    def fit_inputs(self, x: Tensor) -> None:
+        """Statistics of the features, and of the answers where the simulator is asked at fixed targets."""
+        super().fit_inputs(x)
+        if self.config.sensors == "oracle":
+            self.answers.fit(x[:, self.features.layout.answers], floor=1e-6)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t], (B, observation_dim + n) → Δa, (B, n), rad."""
+        """x = [o_t | a_t | more], (B, input_dim) → Δa, (B, n), rad."""
         z = self.features(x)
-        sensors = self.sensors(z) if self.predictor is not None else None
+        sensors = self.sensors(x, z) if self.config.sensors != "off" else None
         see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
         shape = (-1, self.n, self.config.num_basis)
         branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
 
-    def sensors(self, z: Tensor) -> Tensor:
-        """Predicted sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities."""
-        assert self.predictor is not None
-        mean, log_var = self.predictor(z)
+    def sensors(self, x: Tensor, z: Tensor) -> Tensor:
+        """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
+        answers = x[:, self.features.layout.answers]
+        if self.config.sensors == "oracle":
+            return self.answers(answers).clamp(-5.0, 5.0)
+        refreshed = self.features.at_refresh(x) if self.config.keeps_observation else z
+        if self.config.sensors == "learned":
+            if not self.sample_sensors:
+                each = answers.reshape(-1, self.config.num_probes, 2 * self.n)
+                return self.predictor.outputs(each).clamp(-5.0, 5.0).flatten(1)
+            mean, log_var = (y.flatten(1) for y in self.predictor(refreshed, self.points(refreshed)))
+        else:
+            mean, log_var = self.predictor(refreshed)
         return mean + torch.randn_like(mean) * (0.5 * log_var).exp() if self.sample_sensors else mean
 
+    def offsets(self, x: Tensor) -> Tensor:
+        """Where learned points ask the simulator, relative to q_t, (B, m, n) rad."""
+        return self.points(self.features.at_refresh(x) if self.config.keeps_observation else self.features(x))
+
     def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
-        n = self.n
-        see = ([] if sensors is None else [sensors]) + ([z[:, :-n]] if self.sees_observation else [])
+        at = self.features.layout
+        see = ([] if sensors is None else [sensors]) + ([z[:, at.observation]] if self.sees_observation else [])
         # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
-        ask = [z[:, :n], z[:, -n:]] + ([z[:, -n - 1 : -n]] if self.config.payload_input else [])
+        ask = [z[:, at.q], z[:, at.action]] + ([z[:, at.payload]] if self.asks_payload else [])
         return torch.cat(see, dim=1), torch.cat(ask, dim=1)
 
     def _joint_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
-        n, past = self.n, self.n * (2 + 3 * self.config.history)
+        n, at = self.n, self.features.layout
         which = self.which.expand(z.shape[0], n, n)
-        payload = [z[:, past : past + 1].unsqueeze(1).expand(-1, n, 1)] if self.config.payload_input else []
+        payload = [z[:, at.payload].unsqueeze(1).expand(-1, n, 1)] if self.config.payload_input else []
         see = [which]
         if sensors is not None:
             see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
         if self.sees_observation:
-            see += [z[:, :past].reshape(-1, 2 + 3 * self.config.history, n).transpose(1, 2), *payload]
-        return torch.cat(see, dim=2), torch.cat([which, z[:, -n:].unsqueeze(2), *payload], dim=2)
+            see += [self.features.joint_wise(z), *payload]
+        ask = [which, z[:, at.action].unsqueeze(2), *(payload if self.asks_payload else [])]
+        return torch.cat(see, dim=2), torch.cat(ask, dim=2)
 
 
-class DeltaMLP(nn.Module):
-    """Baseline: a plain network on the same features, ASAP's form."""
-
-    predictor = None
-    sample_sensors = False
-
-    def __init__(self, config: ModelConfig, n: int) -> None:
-        super().__init__()
-        self.config, self.n = config, n
-        self.features = Features(config, n)
-        self.net = dense(self.features.dim, config.mlp_hidden, n, zero=True)
-        self.bounded = Bounded(config.delta_max)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t] → Δa, (B, n), rad."""
-        return self.bounded(self.net(self.features(x)))
-
-
-def build_network(config: ModelConfig, n: int) -> OperatorNet | DeltaMLP:
+def build_network(config: ModelConfig, n: int) -> DeltaNet:
     """The network a config describes, for n operated joints."""
-    return OperatorNet(config, n) if config.kind == "gaponet" else DeltaMLP(config, n)
+    if config.kind == "gaponet":
+        return OperatorNet(config, n)
+    if config.kind == "transformer":
+        return DeltaTransformer(config, n)
+    if config.kind == "fno":
+        return DeltaFNO(config, n)
+    return DeltaMLP(config, n, matched_hidden(config, n, operator_size(config, n)) if config.mlp_match else None)
+
+
+def operator_size(config: ModelConfig, n: int) -> int:
+    """Parameters that the operator with these fields has, sensor predictor included."""
+    with torch.device("meta"):  # shapes only
+        return size(OperatorNet(replace(config, kind="gaponet"), n))

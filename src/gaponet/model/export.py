@@ -9,16 +9,36 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
 
 from gaponet.errors import ModelError
-from gaponet.model.artifact import CARD, WEIGHTS, infer_session, write_card
-from gaponet.model.deeponet import DeltaMLP, OperatorNet
+from gaponet.model import fused
+from gaponet.model.artifact import CARD, WEIGHTS, write_card
+from gaponet.model.backends import OnnxNetwork
+from gaponet.model.deeponet import build_network
+from gaponet.model.fuse import FusedNet, fuse
+from gaponet.model.layers import DeltaNet
+
+Array = np.ndarray
 
 PARITY = 1e-5  # rad
 
 
-def export(net: OperatorNet | DeltaMLP, folder: Path, card: dict[str, Any], samples: np.ndarray) -> float:
-    """Write model.onnx and card.json.
+class Ships(nn.Module):
+    """x → (Δa,), and the probes' offsets of a network that chooses them."""
+
+    def __init__(self, net: DeltaNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        """x, (B, dim)."""
+        more = (self.net.offsets(x),) if self.net.config.learns_points else ()  # type: ignore[operator]
+        return (self.net(x), *more)
+
+
+def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
+    """Write model.onnx, weights.npz (for numpy; kinds with a fused form, model/fuse.py) and card.json.
 
     Args:
         net: Trained network, normalisers inside.
@@ -27,31 +47,80 @@ def export(net: OperatorNet | DeltaMLP, folder: Path, card: dict[str, Any], samp
         samples: Observations [o_t | a_t] to compare on, (k, dim) float32, of states really visited.
 
     Returns:
-        Largest |ONNX − torch| over the samples, rad.
+        Largest |ONNX or numpy − torch| over the samples, rad.
 
     Raises:
         ModelError: The difference is above 1e-5 rad; nothing is written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     frozen = copy.deepcopy(net).eval()
-    temporary = folder / f".{WEIGHTS}.tmp"
+    weights, names = fuse(frozen), ["delta", "offsets"][: 1 + net.config.learns_points]
+    temporary = {name: folder / f".{name}.tmp" for name in (WEIGHTS, fused.FILE)}
+    try:
+        write_onnx(Ships(frozen) if weights is None else FusedNet(weights), temporary[WEIGHTS], samples[:2], names)
+        with torch.inference_mode():
+            expected = [y.numpy() for y in Ships(frozen)(torch.from_numpy(samples))]
+        answers = [OnnxNetwork(temporary[WEIGHTS], output=name)(samples) for name in names]
+        difference = max(_require(folder, "ONNX", *pair) for pair in zip(answers, expected, strict=True))
+        if weights is not None:
+            answer = fused.FusedForward(weights, len(samples))(samples)
+            difference = max(difference, _require(folder, "numpy", answer, expected[0]))
+            with open(temporary[fused.FILE], "wb") as file:
+                np.savez(file, **weights)  # type: ignore[arg-type]
+            temporary[fused.FILE].replace(folder / fused.FILE)
+        else:
+            (folder / fused.FILE).unlink(missing_ok=True)
+        temporary[WEIGHTS].replace(folder / WEIGHTS)
+        write_card(folder / CARD, card | {"parity_rad": difference})
+    finally:
+        for path in temporary.values():
+            path.unlink(missing_ok=True)
+    return difference
+
+
+def write_onnx(net: nn.Module, path: Path, x: Array, names: list[str]) -> None:
+    """Input x (batch, dim), outputs by name: delta (batch, n), float32, and what else the network answers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Through torch.export (dynamo=True) it takes 5 to 11 s instead of 0.2 and writes the same function.
         torch.onnx.export(
-            frozen, (torch.from_numpy(samples[:2]),), temporary, input_names=["x"], output_names=["delta"],
-            dynamo=False, dynamic_axes={"x": {0: "batch"}, "delta": {0: "batch"}},
+            net, (torch.from_numpy(x),), path, input_names=["x"], output_names=names,
+            dynamo=False, dynamic_axes={name: {0: "batch"} for name in ("x", *names)},
         )  # fmt: skip
-    try:
-        answer = infer_session(temporary)(samples)
-        with torch.inference_mode():
-            difference = float(np.abs(frozen(torch.from_numpy(samples)).numpy() - answer).max())
-        if not difference <= PARITY:
-            raise ModelError(
-                f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written"
-            )
-        temporary.replace(folder / WEIGHTS)
-        write_card(folder / CARD, card | {"parity_rad": difference})
-    finally:
-        temporary.unlink(missing_ok=True)
+
+
+def _require(folder: Path, what: str, answer: Array, expected: Array) -> float:
+    difference = float(np.abs(expected - answer).max())
+    if not difference <= PARITY:
+        raise ModelError(f"{folder}: {what} and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written")
     return difference
+
+
+def trained_network(run: Path, config: Any, n: int) -> DeltaNet:
+    """The network that a run kept, from its checkpoint.
+
+    Args:
+        run: Folder of gaponet train.
+        config: Shape of the model.
+        n: Operated joints.
+    """
+    path = run / "checkpoint.pt"
+    if not path.is_file():
+        raise ModelError(f"{run}: no checkpoint.pt; give a run folder of gaponet train, not the artifact alone")
+    net = build_network(config, n)
+    try:
+        net.load_state_dict(torch.load(path, weights_only=True)["best_state"])
+    except (RuntimeError, KeyError, EOFError, ValueError) as error:
+        raise ModelError(f"{path}: does not fit this model or is damaged ({str(error).splitlines()[0]})") from None
+    return net.eval()
+
+
+def drawn_states(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
+    """Observations [o_t | a_t] spread as those trained on, (count, dim) float32, where no recording is at hand."""
+    features = net.features
+    generator = torch.Generator().manual_seed(seed)
+    z = torch.randn(count, features.dim, generator=generator)
+    relative = features.standardise.mean + features.standardise.std * z
+    # relative(x) is linear and the identity but for differences to q_t: its inverse is solved for, not written down.
+    x = torch.linalg.solve(features.relative(torch.eye(features.dim)).T.double(), relative.double().T).T
+    return x.float().contiguous().numpy()

@@ -2,15 +2,35 @@
 
 o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
+
+x = [ o_t | a_t | o_r | S_t ] is what a network is given: o_r, the observation of the last sensor refresh, where sensors
+are predicted and held; S_t, the simulator's answers to the probes, where it is asked. Most models have neither.
 """
 
 from __future__ import annotations
+
+from itertools import accumulate, pairwise
 
 import numpy as np
 
 from gaponet.model.config import ModelConfig
 
 Array = np.ndarray
+
+
+class Layout:
+    """Where in x things are, as slices of its columns; [o_t | a_t] of a network's features has the same places."""
+
+    def __init__(self, config: ModelConfig, n: int) -> None:
+        self.n, self.history = n, config.history
+        o = config.observation_dim(n)
+        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n,
+                 o * config.keeps_observation, config.sensor_dim(n) * config.asks_simulator)  # fmt: skip
+        self.q, self.v, self.past, self.payload, self.action, self.refresh, self.answers = (
+            slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0))
+        )
+        self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
+        self.dim = config.input_dim(n)
 
 
 class History:
@@ -37,20 +57,23 @@ class History:
 
     def push(self, qpos: Array, qvel: Array, u: Array) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
-        self.frames[:, 1:] = self.frames[:, :-1]
+        for k in range(self.depth - 1, 0, -1):  # one by one: as a whole it would go through a temporary copy
+            self.frames[:, k] = self.frames[:, k - 1]
         n = self.n
         self.frames[:, 0, :n] = qpos
         self.frames[:, 0, n : 2 * n] = qvel
         self.frames[:, 0, 2 * n :] = u
 
-    def observe(self, qpos: Array, qvel: Array, payload_mass: Array) -> Array:
+    def observe(self, qpos: Array, qvel: Array, payload_mass: Array | float, out: Array | None = None) -> Array:
         """The observation, (num_envs, dim), float32.
 
         Args:
             qpos, qvel: State now, (num_envs, n).
             payload_mass: (num_envs,) kg.
+            out: Where to write it, of the same shape; default a new array.
         """
-        n, out = self.n, np.empty((len(self.frames), self.dim), np.float32)
+        n = self.n
+        out = np.empty((len(self.frames), self.dim), np.float32) if out is None else out
         out[:, :n] = qpos
         out[:, n : 2 * n] = qvel
         past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]

@@ -29,7 +29,7 @@ def probe_offsets(config: ModelConfig, n: int) -> Array:
 
 
 class ProbeOracle:
-    """Forks the simulator m times per state. For labels, tests and the upper bound; never used on a robot."""
+    """Forks the simulator m times per state. For labels, tests and upper bounds; never used on a robot."""
 
     def __init__(
         self,
@@ -45,23 +45,32 @@ class ProbeOracle:
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
         self.sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
+        self.target = np.zeros((self.sim.num_envs, self.sim.n))
+        self.absolute = config.sensor_target == "absolute"
         self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
 
-    def __call__(self, qpos: Array, qvel: Array) -> Array:
-        """Sensor values in delta form.
+    def __call__(self, qpos: Array, qvel: Array, offsets: Array | None = None, ids: Array | None = None) -> Array:
+        """Sensor values.
 
         Args:
-            qpos, qvel: States of all the robot's joints, (k, n_all), one per slot.
+            qpos, qvel: States of all the robot's joints that are not locked, (k, n_free), one per slot.
+            offsets: Where to ask, relative to q, (k, m, n) rad; default the fixed probes.
+            ids: Only these slots, (k,) sorted; default all.
 
         Returns:
-            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints.
+            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] where sensor_target is absolute.
         """
         m, op = len(self.offsets), self.operated
+        slots = np.arange(len(self.dt)) if ids is None else ids
+        rows = (slots[:, None] * m + np.arange(m)).ravel()
         q, v = np.repeat(qpos, m, axis=0), np.repeat(qvel, m, axis=0)
         target = q.copy()
-        target[:, op] += np.tile(self.offsets, (len(qpos), 1))
-        self.sim.reset(slice(None), q, v, past=target[:, None])
-        self.sim.step(target)
-        moved = self.sim.qpos[:, op] - q[:, op]
-        sped = (self.sim.qvel[:, op] - v[:, op]) * np.repeat(self.dt, m)[:, None]
+        target[:, op] += np.tile(self.offsets, (len(qpos), 1)) if offsets is None else offsets.reshape(-1, len(op))
+        self.sim.reset(rows, q, v, past=target[:, None])
+        self.target[rows] = target
+        self.sim.step(self.target, None if ids is None else rows)
+        moved, sped = self.sim.qpos[rows][:, op], self.sim.qvel[rows][:, op]
+        if not self.absolute:
+            moved, sped = moved - q[:, op], sped - v[:, op]
+        sped = sped * np.repeat(self.dt[slots], m)[:, None]
         return np.concatenate([moved, sped], axis=1).reshape(len(qpos), m, 2 * len(op)).astype(np.float32)

@@ -32,7 +32,8 @@ class BatchSim:
         self.models = {c: build_model(robot, c[0], c[1], c[2], locked, bare=True) for c in dict.fromkeys(conditions)}
         first = self.models[conditions[0]]
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
-        expand_differences(self.batch, [self.models[c] for c in conditions])
+        # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
+        self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
         self.num_envs = len(conditions)
         self.n = len(self.joint_names)
         self.qpos: Array = self.batch.bind("qpos")
@@ -78,22 +79,42 @@ class BatchSim:
         for n in np.unique(self._nstep[moving]):
             self.batch.step(moving[self._nstep[moving] == n], nstep=int(n))
 
+    def state(self) -> dict[str, Array]:
+        """Copies of all that the next step follows from."""
+        return {name: x.copy() for name, x in self._state().items()}
+
+    def set_state(self, state: dict[str, Array]) -> None:
+        """Undo `state`; entries of other names are not looked at."""
+        for name, x in self._state().items():
+            x[:] = state[name]
+
+    def _state(self) -> dict[str, Array]:
+        late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
+        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late
+
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""
         return self.batch.get_data(env)
 
 
-def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> None:
-    """Give every model field that differs between simulations its value for each; models (nsim), many the same."""
+def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
+    """Give every model field that differs between simulations its value for each; models (nsim), many the same.
+
+    Returns:
+        Those fields, live.
+    """
     unique = list({id(m): m for m in models}.values())
+    fields: dict[str, Array] = {}
     if len(unique) == 1:
-        return
+        return fields
     place = {id(m): i for i, m in enumerate(unique)}
     rows = [place[id(m)] for m in models]
     for name in sorted(MODEL_FIELDS):
         values = [_field(m, name) for m in unique]
         if values[0] is not None and any(not np.array_equal(v, values[0]) for v in values[1:]):
-            batch.expand(name)[:] = np.stack(values)[rows]
+            fields[name] = batch.expand(name)
+            fields[name][:] = np.stack(values)[rows]
+    return fields
 
 
 def _field(model: mujoco.MjModel, name: str) -> Any:

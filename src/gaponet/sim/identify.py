@@ -2,6 +2,11 @@
 
 Per operated joint: gain, damping, dry friction, armature, zero offset, command delay. Nonlinear least squares on free
 runs of several seconds from recorded states; all finite differences of a Jacobian are stepped as one batch.
+
+A servo's parameters act on its own joint first: what they do to the others is weaker by the ratio of the inertias. So
+one simulation moves the same parameter of all joints, and each joint's error is put down to its own parameter: six
+simulations for a Jacobian, however many joints. The cost is the true one, so that what is left out slows the descent a
+little and moves no minimum.
 """
 
 from __future__ import annotations
@@ -10,8 +15,10 @@ from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.linalg import block_diag
+from scipy.optimize import lsq_linear
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
@@ -27,6 +34,11 @@ WINDOWS = 40
 EVALUATIONS = 20
 SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
 MAX_DELAY = 0.15  # s
+MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
+MAX_MASS = 20.0  # kg
+MASS_STEP = 0.1  # kg
+TOGETHER = 0.05  # of the prior, where all joints leave their values by the same share: a cold day, a slow bus …
+COMMON = ("damping", "frictionloss", "armature", "delay")  # … which does not turn zeros, nor soften gains
 SETTLE = 0.1  # s: velocities at a window's start are measured ones
 
 # Parameter → (lower, upper, finite-difference step), as a multiple of the scale in `_scales`.
@@ -49,6 +61,7 @@ class Identified:
         before, after: RMS error of the windows, rad.
         warnings: What the recordings do not determine, or what ended at a bound.
         evaluations: Of the whole set of windows, Jacobians not counted.
+        payload_mass, payload_std: kg in each hand that is said to carry, where it was asked for.
     """
 
     robot: RobotSpec
@@ -56,6 +69,8 @@ class Identified:
     after: float
     warnings: tuple[str, ...]
     evaluations: int
+    payload_mass: float | None = None
+    payload_std: float | None = None
 
 
 def identify(
@@ -67,6 +82,8 @@ def identify(
     fields: tuple[str, ...] = tuple(BOUNDS),
     corrector: Corrector | None = None,
     prior: float = 0.0,
+    evaluations: int = EVALUATIONS,
+    unknown_payload: bool = False,
 ) -> Identified:
     """Fit the parameters of all operated joints at once.
 
@@ -78,31 +95,20 @@ def identify(
         progress: Called with evaluations done, at most, and the present RMS error in rad.
         fields: Which parameters; the others stay the robot's.
         corrector: Corrects the targets on the way, as in replay.
-        prior: Price of leaving the robot's own values, rad per scale: for logs too short to determine everything.
+        prior: Price of leaving the robot's own values, rad per scale: for logs too short to determine everything. All
+            joints together leave them for a twentieth of it, gains and zero offsets apart.
+        evaluations: At most so many.
+        unknown_payload: Do not believe the recordings' payload mass; fit one for all of them.
     """
     parts = cut(sequences, windows)
     if not parts:
         raise UsageError("no recording is longer than a second; identification needs longer ones")
-    problem = _Problem(parts, robot, nthread, fields, corrector, prior)
-    start = problem.start()
-    count = 0
-
-    def residual(x: Array) -> Array:
-        nonlocal count
-        count += 1
-        e = problem.errors(x[None])[0]
-        progress(count, EVALUATIONS, float(np.sqrt((e[: problem.rows] ** 2).mean())))
-        return e
-
-    low, high = problem.bounds()
-    fit = least_squares(
-        residual, start, problem.jacobian, bounds=(low, high), loss="soft_l1", f_scale=SOFT, max_nfev=EVALUATIONS,
-        xtol=1e-4, ftol=1e-4, x_scale="jac",
-    )  # fmt: skip
-    before, after = (
-        float(np.sqrt((problem.errors(x[None])[0, : problem.rows] ** 2).mean())) for x in (problem.own(), fit.x)
-    )
-    return Identified(problem.robot_of(fit.x), before, after, problem.doubts(fit.x, fit.jac, after), count)
+    problem = _Problem(parts, robot, nthread, fields, corrector, prior, unknown_payload)
+    fit = descend(problem, evaluations, 1e-3 if prior else 1e-4, progress)
+    before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.errors)
+    mass = {"payload_mass": float(fit.x[-1]), "payload_std": problem.jackknife(fit)} if unknown_payload else {}
+    doubts = problem.doubts(fit.x, fit.jac, after)
+    return Identified(problem.robot_of(fit.x), before, after, doubts, fit.evaluations, **mass)
 
 
 def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
@@ -113,6 +119,58 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
         parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
     parts = [p for p in parts if p.duration > 1.0]
     return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters (P,), errors (m,) and Jacobian (m, P) at the end, and how many evaluations it took."""
+
+    x: Array
+    errors: Array
+    jac: Array
+    evaluations: int
+
+
+def descend(problem: _Problem, evaluations: int, tolerance: float, progress: Callable[[int, int, float], None]) -> Fit:
+    """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
+
+    Many parameters end at a bound (no delay, no friction), where scipy's trust regions creep: two to four times the
+    evaluations. Errors beyond SOFT count linearly, by weights (soft_l1).
+
+    Args:
+        problem: Its start, bounds, errors and Jacobian.
+        evaluations: At most.
+        tolerance: Ends when the cost falls by a smaller share.
+        progress: Called with evaluations done, at most, and the present RMS error in rad.
+    """
+    x, (low, high) = problem.start(), problem.bounds()
+    errors = problem.errors(x[None])[0]
+    jac = problem.jacobian(x, errors)
+    damping, count, fresh = 1e-2, 1, True
+    progress(count, evaluations, problem.rms(errors))
+    while count < evaluations:
+        if not fresh:
+            jac, fresh = problem.jacobian(x, errors), True
+        weight = 1 / np.sqrt(1 + (errors / SOFT) ** 2)
+        normal, slope = jac.T @ (weight[:, None] * jac), jac.T @ (weight * errors)
+        normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12
+        root = np.linalg.cholesky(normal).T
+        step = lsq_linear(root, -np.linalg.solve(root.T, slope), (low - x - 1e-12, high - x + 1e-12)).x
+        trial = np.clip(x + step, low, high)
+        tried = problem.errors(trial[None])[0]
+        count += 1
+        gained = 1 - _soft(tried) / _soft(errors)
+        damping = max(damping / 10, 1e-3) if gained > 0 else damping * 30
+        if gained > 0:
+            x, errors, fresh = trial, tried, False
+        progress(count, evaluations, problem.rms(errors))
+        if 0 <= gained < tolerance or damping > 1e3:
+            break
+    return Fit(x, errors, jac, count)
+
+
+def _soft(errors: Array) -> float:
+    return float((np.sqrt(1 + (errors / SOFT) ** 2) - 1).sum())
 
 
 class _Problem:
@@ -126,14 +184,15 @@ class _Problem:
         fields: tuple[str, ...],
         corrector: Corrector | None,
         prior: float,
+        unknown_payload: bool,
     ) -> None:
         self.parts, self.robot, self.nthread = parts, robot, nthread
         self.limits = {f: BOUNDS[f] for f in fields}
-        self.corrector, self.prior = corrector, prior
+        self.corrector, self.prior, self.unknown_payload = corrector, prior, unknown_payload
         self.locked = idle_limbs(parts, robot)
         self.op, self.n = robot.operated_index, len(robot.operated)
         self.names = [(field, joint) for field in fields for joint in robot.operated]
-        self.conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
+        self.size = len(self.names) + unknown_payload
         free = [j for j in robot.joint_names if j not in self.locked]
         self.free, self.free_op = robot.index(free), np.array([free.index(j) for j in robot.operated])
         rows = max(map(len, parts))
@@ -142,6 +201,10 @@ class _Problem:
         skip = np.array([[t >= SETTLE / s.dt and t < len(s) for s in parts] for t in range(rows)])
         self.counted = np.repeat(skip[1:, :, None], self.n, axis=2)
         self.rows = int(self.counted.sum())  # of the residual: simulated errors; those of the prior follow
+        self.joint, self.window = (
+            np.broadcast_to(i, self.counted.shape)[self.counted]
+            for i in (np.arange(self.n), np.arange(len(parts))[:, None])
+        )
         model = build_model(robot)
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         gain = robot.kp[self.op]
@@ -160,24 +223,37 @@ class _Problem:
         }  # fmt: skip
 
     def start(self) -> Array:
-        """The given robot, a little inside the bounds; one period late, since a delay of zero hides its gradient."""
-        return self._inside(self.first | {"delay": np.maximum(self.first["delay"], 0.02)})
+        """The given robot, a little inside the bounds; a little late, since a delay of zero hides its gradient.
+
+        An unknown payload starts at the mass of MASSES that fits best.
+        """
+        late = 0.005 if self.prior else 0.02  # s; with a prior the given robot is thought to be near
+        x = self._inside(self.first | {"delay": np.maximum(self.first["delay"], late)})
+        if not self.unknown_payload:
+            return x
+        xs = np.repeat(x[None], len(MASSES), axis=0)
+        xs[:, -1] = np.maximum(MASSES, 1e-3)
+        return xs[(self.errors(xs)[:, : self.rows] ** 2).sum(axis=1).argmin()]
 
     def own(self) -> Array:
-        """The given robot."""
+        """The given robot, and the mean of the payloads said to be carried."""
         return self._inside(self.first)
 
     def _inside(self, values: dict[str, Array]) -> Array:
         low, high = self.bounds()
-        return np.clip(np.concatenate([values[f] / self.scale[f] for f in self.limits]), low + 1e-3, high - 1e-3)
+        mass = [np.mean([s.meta.payload_mass for s in self.parts], keepdims=True)] * self.unknown_payload
+        return np.clip(
+            np.concatenate([*(values[f] / self.scale[f] for f in self.limits), *mass]), low + 1e-3, high - 1e-3
+        )
 
     def bounds(self) -> tuple[Array, Array]:
         """(P,) each."""
-        return tuple(np.repeat([b[k] for b in self.limits.values()], self.n) for k in (0, 1))  # type: ignore[return-value]
+        low, high = (np.repeat([b[k] for b in self.limits.values()], self.n) for k in (0, 1))
+        return (np.r_[low, 0.0], np.r_[high, MAX_MASS]) if self.unknown_payload else (low, high)
 
     def values(self, x: Array) -> dict[str, Array]:
         """(…, P) → field: (…, n) in SI; fields that are not fitted as they are."""
-        x = np.asarray(x)
+        x = np.asarray(x)[..., : len(self.names)]
         parts = np.split(x, len(self.limits), axis=-1)
         fitted = {f: part * self.scale[f] for f, part in zip(self.limits, parts, strict=True)}
         shape = (*x.shape[:-1], self.n)
@@ -190,26 +266,44 @@ class _Problem:
             {j: {f: float(f"{values[f][i]:.6g}") for f in self.limits} for i, j in enumerate(self.robot.operated)}
         )
 
+    def rms(self, errors: Array) -> float:
+        """Of the simulated errors, rad."""
+        return float(np.sqrt((errors[: self.rows] ** 2).mean()))
+
     def errors(self, xs: Array) -> Array:
         """Free-run errors q_sim − q_real of counted rows, then the prior's, (k, m), of parameter vectors (k, P)."""
         k, m = len(xs), len(self.parts)
         late = np.array(self.robot.delay)
         late[self.op] = MAX_DELAY
-        sim = BatchSim(replace(self.robot, delay=late), self.conditions * k, self.nthread, self.locked)
-        self._write(sim, xs, m)
+        parts = [s for x in xs for s in self._carrying(x)]
+        conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
+        sim = BatchSim(replace(self.robot, delay=late), conditions, self.nthread, self.locked)
+        self._write(sim, sim.models[conditions[0]], self.values(np.repeat(xs, m, axis=0)))
         tile = np.tile(self.ctrl, (1, k, 1))
-        q0, v0 = (
-            np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel")
-        )
+        q0, v0 = (np.stack([getattr(s, f)[0, self.free] for s in parts]) for f in ("qpos", "qvel"))
         sim.reset(slice(None), q0, v0, past=tile[0][:, None])
         out = np.empty((len(tile) - 1, k, m, self.n))
         if self.corrector is not None:
-            self.corrector.reset(self.parts * k)
+            self.corrector.reset(parts)
         for t in range(len(out)):
             sim.step(tile[t] if self.corrector is None else self._corrected(t, tile[t], sim))
             out[t] = sim.qpos[:, self.free_op].reshape(k, m, self.n) - self.real[t + 1]
         errors = out.transpose(1, 0, 2, 3)[:, self.counted]
-        return np.concatenate([errors, self.prior * (xs - self.own())], axis=1) if self.prior else errors
+        if not self.prior:
+            return errors
+        return np.concatenate([errors, (xs - self.own())[:, : len(self.names)] @ self._prices().T], axis=1)
+
+    def _carrying(self, x: Array) -> list[Sequence]:
+        """The windows, with the payload of a parameter vector where theirs is not believed."""
+        if not self.unknown_payload:
+            return self.parts
+        return [replace(s, meta=replace(s.meta, payload_mass=float(x[-1]))) for s in self.parts]
+
+    def _prices(self) -> Array:
+        """Prior residual by parameter, payload apart, (P, P); what all joints do together is cheaper."""
+        common = np.full((self.n, self.n), (1 - TOGETHER) / self.n)
+        blocks = [np.eye(self.n) - (common if f in COMMON else 0.0) for f in self.limits]
+        return self.prior * np.asarray(block_diag(*blocks))
 
     def _corrected(self, t: int, target: Array, sim: BatchSim) -> Array:
         assert self.corrector is not None
@@ -219,8 +313,7 @@ class _Problem:
             place[:, self.free] = now
         return self.corrector.correct(t, *full)[:, self.free]
 
-    def _write(self, sim: BatchSim, xs: Array, m: int) -> None:
-        model, values = sim.models[self.conditions[0]], self.values(np.repeat(xs, m, axis=0))
+    def _write(self, sim: BatchSim, model: mujoco.MjModel, values: dict[str, Array]) -> None:
         joints = [model.joint(j) for j in self.robot.operated]
         dof = np.array([j.dofadr[0] for j in joints])
         act = np.array([model.actuator(j).id for j in self.robot.operated])
@@ -231,19 +324,50 @@ class _Problem:
             sim.batch.expand(f"dof_{name}")[:, dof] = values[name]
         sim.batch.expand("actuator_delay")[:, act] = values["delay"]
 
-    def jacobian(self, x: Array) -> Array:
-        """Forward differences towards the inside of the bounds, (m, P)."""
-        steps = np.repeat([b[2] for b in self.limits.values()], self.n)
+    def jacobian(self, x: Array, base: Array) -> Array:
+        """Forward differences towards the inside of the bounds, one simulation for all joints' same field, (m, P).
+
+        base: The errors at x.
+        """
+        fields = len(self.limits)
+        steps = np.r_[np.repeat([b[2] for b in self.limits.values()], self.n), [MASS_STEP] * self.unknown_payload]
         steps = np.where(x + steps > self.bounds()[1], -steps, steps)
-        e = self.errors(np.concatenate([x[None], x + np.diag(steps)]))
-        return ((e[1:] - e[0]) / steps[:, None]).T
+        moved = np.zeros((fields + self.unknown_payload, self.size))
+        for field in range(fields):
+            moved[field, field * self.n : (field + 1) * self.n] = 1.0
+        if self.unknown_payload:
+            moved[-1, -1] = 1.0
+        change = (self.errors(x + moved * steps) - base)[:, : self.rows]
+        jac = np.zeros((len(base), self.size))
+        for field in range(fields):
+            column = field * self.n + self.joint
+            jac[np.arange(self.rows), column] = change[field] / steps[column]
+        if self.unknown_payload:  # a payload loads every joint
+            jac[: self.rows, -1] = change[-1] / steps[-1]
+        if self.prior:
+            jac[self.rows :, : len(self.names)] = self._prices()
+        return jac
+
+    def jackknife(self, fit: Fit) -> float:
+        """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
+
+        The model's own errors last as long as a motion, so that rows of a window say little about each other.
+        """
+        jac, error = fit.jac, fit.errors
+        weight = 1 / np.sqrt(1 + (error / SOFT) ** 2)
+        moved = []
+        for window in range(len(self.parts)):
+            keep = weight * np.r_[self.window != window, np.ones(len(error) - self.rows, bool)]
+            moved.append(np.linalg.lstsq(jac.T @ (keep[:, None] * jac), -jac.T @ (keep * error))[0][-1])
+        m = len(moved)
+        return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")
 
     def doubts(self, x: Array, jac: Array, rms: float) -> tuple[str, ...]:
         """Parameters at a bound, and those whose standard error exceeds half of what they may be."""
-        low, high = self.bounds()
+        x, low, high = (part[: len(self.names)] for part in (x, *self.bounds()))
         found = []
         # Errors of neighbouring rows are alike: about ten a second count as independent.
-        jac = jac[: self.rows]
+        jac = jac[: self.rows, : len(self.names)]
         rows_per_error = max(1.0, 0.1 / float(np.median([s.dt for s in self.parts])))
         covariance = np.linalg.pinv(jac.T @ jac) * rms**2 * rows_per_error
         scales = np.concatenate([self.scale[f] for f in self.limits])

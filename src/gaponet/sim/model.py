@@ -46,6 +46,31 @@ def build_model(
         RobotError: The MJCF does not compile, or lacks a joint or body that robot.toml names.
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
+    spec = build_spec(robot, payload_mass, payload_side, dt, locked, bare)
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise RobotError(f"{robot.mjcf}: does not compile: {' '.join(str(error).split())}") from None
+    if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
+        known = {j.name for j in spec.joints}
+        raise RobotError(
+            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
+            f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
+        )
+    if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
+        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
+    return model
+
+
+def build_spec(
+    robot: RobotSpec,
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    dt: float | None = None,
+    locked: tuple[str, ...] = (),
+    bare: bool = False,
+) -> mujoco.MjSpec:
+    """The same before compilation, for a scene that holds several robots (eval/scene.py)."""
     spec = _read(robot)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else _positive(dt)
@@ -60,19 +85,7 @@ def build_model(
         spec.compiler.discardvisual = True
         _remove_standing(spec, spec.worldbody, {mount.body for mount in robot.payload_mounts})
     _add_payload(spec, robot, payload_mass, payload_side)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise RobotError(f"{robot.mjcf}: does not compile: {' '.join(str(error).split())}") from None
-    if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
-        known = {j.name for j in spec.joints}
-        raise RobotError(
-            f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
-            f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
-        )
-    if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
-        raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
-    return model
+    return spec
 
 
 def qpos_address(model: mujoco.MjModel, robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:

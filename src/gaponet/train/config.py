@@ -41,6 +41,9 @@ class WarmStartConfig:
     """AdamW step size, decayed to a tenth over the rounds."""
     weight_decay: float = 0.01
     """AdamW weight decay."""
+    sensor_refresh: float | None = None
+    """Ask after each round how well the sensor predictor explains the states that the policy visits, and fit it again
+    when its R² has fallen by more than this since the fit; None never asks."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,7 @@ class PPOConfig:
     num_envs: int = 512
     """Simulations."""
     num_steps: int = 32
-    """Control periods between updates."""
+    """Decisions between updates; a decision is model.delta_hold control periods."""
     epochs: int = 2
     """Passes over each batch."""
     mini_batches: int = 4
@@ -90,6 +93,8 @@ class TrainConfig:
     """Seed of everything random."""
     episode_s: float = 10.0
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
+    holdout_payloads: tuple[float, ...] = ()
+    """Payloads never trained on, kg; their test motions stay in the test part."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
     threads: int = 0

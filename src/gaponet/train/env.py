@@ -12,7 +12,9 @@ from tensordict import TensorDict
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.model.observation import History, frames_before
+from gaponet.model.inputs import Inputs
+from gaponet.model.observation import frames_before
+from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.replay import idle_limbs
@@ -24,9 +26,12 @@ Array = np.ndarray
 class DeltaEnv(VecEnv):
     """num_envs simulations, each following one recording from a random frame on.
 
-    Observation groups: "actor" = [o_t | a_t]; "critic" = that and the recorded states at t and t+1, payload, rate
-    (training only: the recorded state never reaches the actor). An environment keeps its payload and rate for life, in
-    proportion to the frames recorded under them. A motion's end is a time-out, not a failure.
+    A step is a decision: its correction is held for config.delta_hold control periods; its reward is their mean.
+
+    Observation groups: "actor" = x = [o_t | a_t], and more for some models; "critic" = that and the recorded states at
+    t and t+1, payload, rate (training only: the recorded state never reaches the actor). An environment keeps its
+    payload and rate for life, in proportion to the frames recorded under them. A motion's end is a time-out, not a
+    failure.
     """
 
     def __init__(
@@ -40,7 +45,7 @@ class DeltaEnv(VecEnv):
         seed: int = 0,
         nthread: int = 0,
     ) -> None:
-        """Sequences shorter than two rows are refused; targets (inverse labels) are attached with set_targets."""
+        """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods."""
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
         self.robot, self.config, self.reward_config = robot, config, reward
@@ -51,10 +56,13 @@ class DeltaEnv(VecEnv):
         self.max_episode_length = episode_steps
         self.rng = np.random.default_rng(seed)
         self._load(sequences)
-        self.sim = BatchSim(robot, [self.conditions[g] for g in self.group], nthread, self.locked)
-        self.history = History(config, num_envs, self.num_actions)
+        conditions = [self.conditions[g] for g in self.group]
+        self.sim = BatchSim(robot, conditions, nthread, self.locked)
+        oracle = ProbeOracle(robot, config, conditions, nthread, self.locked) if config.asks_simulator else None
+        self.inputs = Inputs(config, num_envs, self.op, oracle)
         shortest = min(c[2] for c in self.conditions)
-        self.depth = max(self.history.depth, 1 + int(np.ceil(robot.delay.max() / shortest)))  # periods still under way
+        under_way = 1 + int(np.ceil(robot.delay.max() / shortest))  # periods whose command a late servo has not met yet
+        self.depth = max(self.inputs.history.depth, under_way)
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
@@ -77,6 +85,12 @@ class DeltaEnv(VecEnv):
         recorded = [x[:, self.op] for x in (self.qpos, self.qvel, self.ctrl)]
         self.track = np.ascontiguousarray(np.concatenate(recorded, axis=1), np.float32)  # take() copies anything else
         length = np.array([len(s) for s in sequences])
+        if length.min() <= self.config.delta_hold:
+            short = sequences[int(length.argmin())]
+            raise UsageError(
+                f"motion {short.meta.motion} has {len(short)} rows, and a correction is held for "
+                f"{self.config.delta_hold} of them: drop the motion, or lower --model.delta-hold"
+            )
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
         keys = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences]
@@ -100,22 +114,20 @@ class DeltaEnv(VecEnv):
             mine = ids[self.group[ids] == g]
             seq = self.rng.choice(self.members[g], size=len(mine), p=self.weights[g])
             self.first[mine], self.last[mine] = self.seq_first[seq], self.seq_last[seq]
-        self.row[ids] = self.rng.integers(self.first[ids], self.last[ids])
+        self.row[ids] = self.rng.integers(self.first[ids], self.last[ids] - self.config.delta_hold + 1)
         t = self.row[ids]
         before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.depth)
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
-        before = before[:, : self.history.depth]
-        op = self.op
-        self.history.reset(ids, self.qpos[before][..., op], self.qvel[before][..., op], self.ctrl[before][..., op])
+        before = before[:, : self.inputs.history.depth]
+        self.inputs.reset(ids, self.qpos[before], self.qvel[before], self.ctrl[before])
         self.previous[ids] = 0.0
         self.episode_length_buf[ids] = 0
         self.now[ids] = self.track[t]
 
     def get_observations(self) -> TensorDict:
         """Actor and critic observations of the present row."""
-        op, state = self.op, 2 * self.num_actions
-        o = self.history.observe(self.sim.qpos[:, op], self.sim.qvel[:, op], self.payload)
-        actor = np.concatenate([o, self.now[:, state:]], axis=1)
+        state = 2 * self.num_actions
+        actor = self.inputs.x(self.sim.qpos, self.sim.qvel, self.now[:, state:], self.payload)
         then = self.track.take(self.row + 1, axis=0)
         critic = np.concatenate([actor, self.now[:, :state], then[:, :state], self.condition_features], axis=1)
         return TensorDict(
@@ -123,24 +135,30 @@ class DeltaEnv(VecEnv):
         )
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """Hold clip(a + Δa) for one control period; compare with the recording one row on."""
+        """Hold the correction for delta_hold control periods; each is compared with the recording one row on."""
         delta = np.clip(actions.numpy(), -self.config.delta_max, self.config.delta_max)
-        self.advance(delta)
-        reward = self._reward(delta)
-        done = (self.row >= self.last) | (self.episode_length_buf.numpy() >= self.max_episode_length)
-        self.previous[:] = delta
+        reward = np.zeros(self.num_envs, np.float32)
+        for _ in range(self.config.delta_hold):
+            self.advance(delta)
+            reward += self._reward(delta) / self.config.delta_hold
+            self.previous[:] = delta
+        done = self.ended() | (self.episode_length_buf.numpy() >= self.max_episode_length)
         ids = np.flatnonzero(done)
         if ids.size:
             self.reset(ids)
         dones = torch.from_numpy(done)
         return self.get_observations(), torch.from_numpy(reward), dones, {"time_outs": dones}
 
+    def ended(self) -> Array:
+        """Whether the recording has too few rows left for one more decision, (num_envs,)."""
+        return self.row > self.last - self.config.delta_hold
+
     def advance(self, delta: Array) -> None:
         """One control period of all simulations, without reward or reset; delta (num_envs, n_operated)."""
         op, n = self.op, self.sim
         target = self.ctrl.take(self.row, axis=0).astype(float)
         target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])
-        self.history.push(n.qpos[:, op], n.qvel[:, op], target[:, op])
+        self.inputs.push(n.qpos, n.qvel, target)
         n.step(target)
         self.row += 1
         self.track.take(self.row, axis=0, out=self.now)

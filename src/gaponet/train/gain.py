@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gaponet.model.deeponet import DeltaMLP, OperatorNet
+from gaponet.model.layers import DeltaNet
 
 GAINS = (0.75, 0.5, 0.25)  # beside 1
 
 
-def choose_gain(net: OperatorNet | DeltaMLP, error: Callable[[], float], whole: float) -> float:
+def choose_gain(net: DeltaNet, error: Callable[[], float], whole: float) -> float:
     """Set the gain with the least error, and return it.
 
     Args:

@@ -75,7 +75,7 @@ def _runner_config(model: ModelConfig, ppo: PPOConfig) -> dict[str, Any]:
             "num_mini_batches": ppo.mini_batches,
             "learning_rate": ppo.learning_rate,
             "desired_kl": ppo.desired_kl,
-            "gamma": ppo.gamma,
+            "gamma": ppo.gamma**model.delta_hold,  # a step is a decision
             "lam": ppo.lam,
             "clip_param": ppo.clip,
             "entropy_coef": 0.0,

@@ -3,7 +3,9 @@
 RUN/config.json        everything needed to repeat it       RUN/progress.jsonl   training curve, one line per validation
 RUN/split.json         content hashes per part              RUN/checkpoint.pt    newest state, for --resume
 RUN/delay_offset.json  the cheap baseline, same data        RUN/model/           the artifact: model.onnx, card.json
-RUN/robot/             the simulator corrected
+RUN/robot/             the simulator corrected              RUN/tensorboard/     the same curve, with --log tensorboard
+
+A run that was stopped and resumed equals one that was not, bit for bit, as long as its budget counts steps.
 """
 
 from __future__ import annotations
@@ -31,16 +33,20 @@ from gaponet.model.baselines import delay_offset
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
+from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
+from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state
 from gaponet.train.config import TrainConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
+from gaponet.train.loggers import Loggers
 from gaponet.train.ppo import make_runner, update
-from gaponet.train.warm_start import WarmStart, fit_sensors
+from gaponet.train.sensor_fit import Report, points_of, report_of
+from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
 
 Array = np.ndarray
 
@@ -79,8 +85,9 @@ class Trainer:
         resume: bool = False,
         holdout_units: tuple[str, ...] = (),
         show: Callable[[Status], None] = lambda status: None,
+        log: tuple[str, ...] = (),
     ) -> None:
-        """Split the dataset and refuse what cannot work, before any time is spent."""
+        """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
         dataset.require_robot(robot)
         if (out / "config.json").exists() and not resume:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
@@ -94,7 +101,7 @@ class Trainer:
             budget,
             show,
         )
-        self.parts = split_entries(dataset, holdout_units)
+        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
@@ -102,14 +109,19 @@ class Trainer:
         torch.set_num_threads(config.torch_threads)
         self.net = build_network(config.model, self.n)
         self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
+        self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, with gain 1
         self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
-        self.sensor_r2 = self.reward = self.val = self.nominal = float("nan")
-        self.runner_state: dict[str, Any] | None = None
+        self.reward = self.val = self.nominal = float("nan")
+        self.sensor_r2: Report | None = None
+        self.runner_state: State | None = None
+        self.env_state: State | None = None  # of PPO's environments
+        self.warm_state: State | None = None
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
         if resume:
             self._load()
         self._write_config(holdout_units)
+        self.loggers = Loggers(log, out, asdict(config))
 
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
@@ -119,7 +131,7 @@ class Trainer:
         try:
             if not np.isfinite(self.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
-            if self.config.warm_start.rounds > self.rounds_done:
+            if recipe(self.config).rounds > self.rounds_done:
                 self._warm_start()
             self._ppo()
             self._shrink()
@@ -130,7 +142,7 @@ class Trainer:
     # ---- stages
 
     def _warm_start(self) -> None:
-        config = self.config.warm_start
+        config = recipe(self.config)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         if self.net.predictor is not None and self.rounds_done == 0:
             self.stage = "sensors"
@@ -139,17 +151,25 @@ class Trainer:
         limit = 0.99 * self.config.model.delta_max
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed)
-        warm.done = self.rounds_done
+        rounds: list[State] = []
         self.stage = "warm start"
+        if self.warm_state is not None and self._spent() < 1:
+            rounds = self.warm_state["rounds"]
+            restore_warm(warm, self.warm_state)
+            torch.set_rng_state(self.rng)
         while warm.done < config.rounds and self._spent() < 1:
+            before = round_state(warm)
             warm.round(self._tick)
-            self.rounds_done = warm.done
+            if self.sensor_r2 is not None:
+                self.sensor_r2 = warm.refresh_sensors(self.sensor_r2, self.config.threads)
+            rounds.append(before)
+            self.rounds_done, self.warm_state = warm.done, warm_state(warm, rounds)
             self.steps += config.num_envs * config.steps
             self._consider()
 
     def _ppo(self) -> None:
         ppo = self.config.ppo
-        if self._spent() >= 1:
+        if self._spent() >= 1 or self.config.model.kind == "inverse":
             return
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
@@ -158,8 +178,13 @@ class Trainer:
         if self.runner_state is not None:
             runner.alg.load(self.runner_state, None, True)
         else:
-            runner.alg.actor.mlp.load_state_dict(self.best_state)
+            runner.alg.actor.mlp.load_state_dict(self.trained_state)
+        if self.env_state is not None:
+            restore_env(env, self.env_state)
+            torch.set_rng_state(self.rng)
+        self.warm_state = None
         self.net = runner.alg.actor.mlp
+        env.inputs.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         if self.net.predictor is not None:
             self.net.predictor.requires_grad_(False)
         trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
@@ -168,23 +193,26 @@ class Trainer:
                 p.requires_grad_(self.updates >= ppo.critic_warmup)
             update(runner)
             self.updates += 1
-            self.steps += ppo.num_envs * ppo.num_steps
+            self.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
             self.reward = env.mean_reward()
             self._tick()
             if self.updates % self.config.validate_every == 0:
-                self.runner_state = runner.alg.save()
+                self.runner_state, self.env_state = runner.alg.save(), env_state(env)
                 self._consider()
-        self.runner_state = runner.alg.save()
+        self.runner_state, self.env_state = runner.alg.save(), env_state(env)
         self._consider()
 
     def _shrink(self) -> None:
-        """Less of the best correction where validation motions say so."""
+        """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
+        if not np.isfinite(self.trained):
+            return
         self.stage = "gain"
         self._tick()
-        self.net = build_network(self.config.model, self.n)
-        self.net.load_state_dict(self.best_state)
-        if choose_gain(self.net, lambda: self.validate(self.net), self.best) < 1.0:
-            self._consider()
+        with torch.random.fork_rng():
+            net = build_network(self.config.model, self.n)
+        net.load_state_dict(self.trained_state)
+        if choose_gain(net, lambda: self.validate(net), self.trained) < 1.0:
+            self._consider(net)
 
     def finish(self) -> GapModel:
         """Export the best model and write its card."""
@@ -194,6 +222,7 @@ class Trainer:
         net.load_state_dict(self.best_state)
         net.eval()
         env = self._env(max(64, len(self._conditions())), 10, seed=0)
+        self.loggers.close()
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
         return GapModel.load(self.out)
 
@@ -204,29 +233,36 @@ class Trainer:
 
     # ---- validation, checkpoints, card
 
-    def validate(self, net: torch.nn.Module | None) -> float:
+    def validate(self, net: DeltaNet | None) -> float:
         """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
 
         Nominal is the simulator before identification, also where training starts from an identified one.
         """
         picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
-        corrector = DeltaCorrector(torch_infer(net), self.config.model, self.robot) if net is not None else None
+        corrector = self._corrector(net) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
         twins = replay(picked, simulator, corrector, self.config.threads, lock_idle=True)
         op = self.robot.operated_index
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 
-    def _consider(self) -> None:
-        """Validate the present network, keep it if it is the best, write progress and checkpoint."""
-        self.val = self.validate(self.net)
+    def _corrector(self, net: DeltaNet) -> DeltaCorrector:
+        return DeltaCorrector(torch_infer(net), self.config.model, self.robot, points_of(net))
+
+    def _consider(self, shrunk: DeltaNet | None = None) -> None:
+        """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
+        net = shrunk or self.net
+        self.val = self.validate(net)
         if self.val < self.best:
-            self.best, self.best_state = self.val, copy.deepcopy(self.net.state_dict())
+            self.best, self.best_state = self.val, copy.deepcopy(net.state_dict())
+        if self.stage in ("warm start", "ppo") and self.val < self.trained:
+            self.trained, self.trained_state = self.val, copy.deepcopy(net.state_dict())
         line = {
             "stage": self.stage, "steps": self.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
             "val_mpjae": self.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
         with (self.out / "progress.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({k: v if v == v else None for k, v in line.items()}) + "\n")
+        self.loggers.write(line)
         self._save()
         self._tick()
 
@@ -248,8 +284,10 @@ class Trainer:
     def _save(self) -> None:
         state = {
             "net": self.net.state_dict(), "best_state": self.best_state, "best": self.best, "val": self.val,
+            "trained_state": self.trained_state, "trained": self.trained,
             "steps": self.steps, "seconds": self.seconds(), "rounds_done": self.rounds_done, "updates": self.updates,
-            "sensor_r2": self.sensor_r2, "runner": self.runner_state, "rng": torch.get_rng_state(),
+            "sensor_r2": self.sensor_r2,
+            "runner": self.runner_state, "env": self.env_state, "warm": self.warm_state, "rng": torch.get_rng_state(),
         }  # fmt: skip
         temporary = self.out / ".checkpoint.pt.tmp"
         torch.save(state, temporary)
@@ -259,14 +297,17 @@ class Trainer:
         try:
             state = torch.load(self.out / "checkpoint.pt", weights_only=True)
             self.net.load_state_dict(state["net"])
+            self.trained_state, self.trained = state["trained_state"], state["trained"]
+            self.env_state, self.warm_state, self.rng = state["env"], state["warm"], state["rng"]
         except (RuntimeError, KeyError, EOFError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
         self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
         self.steps, self.earlier = state["steps"], state["seconds"]
-        self.rounds_done, self.updates, self.sensor_r2 = state["rounds_done"], state["updates"], state["sensor_r2"]
+        self.rounds_done, self.updates = state["rounds_done"], state["updates"]
+        self.sensor_r2 = report_of(state["sensor_r2"])
         self.runner_state = state["runner"]
-        torch.set_rng_state(state["rng"])
+        torch.set_rng_state(self.rng)
 
     def _write_config(self, holdout_units: tuple[str, ...]) -> None:
         self.out.mkdir(parents=True, exist_ok=True)
@@ -296,7 +337,7 @@ class Trainer:
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
             val_mpjae={"model": self.best, "nominal": self.nominal},
-            sensor_r2=self.sensor_r2 if self.sensor_r2 == self.sensor_r2 else None,
+            sensor_r2=self.sensor_r2,
             seed=self.config.seed,
             gain=self.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),

@@ -1,12 +1,20 @@
-"""Fit the sensor predictor to what the simulator really answers, at visited and at random states."""
+"""Fit the sensor predictor to what the simulator really answers, at visited and at random states, and say how well.
+
+Learned points (model/points.py) have their surrogate in the predictor's place: the same, asked at random targets.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gaponet.model.deeponet import OperatorNet
+from gaponet.model.inputs import Infer
+from gaponet.model.layers import DeltaNet
+from gaponet.model.observation import Layout
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import Condition
@@ -17,10 +25,38 @@ STATES = 2048
 STEPS = 600
 BATCH = 256
 POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states is moved off the recorded ones by these
+# R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}; the mean on states as they are met, not
+# moved, at the fit ("fitted") and when last looked at ("visited"); how often it was fitted again ("refits").
+Report = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """States, and what the simulator answered there.
+
+    Attributes:
+        features: Standardised, (k, dim).
+        answers: (k, 2nm), or (k, m, 2n) where offsets are given.
+        offsets: Targets of each state relative to q, (k, m, n) rad, where they are not the fixed probes.
+        moved: 0 where a state is as it was given, 1 near it, 2 anywhere, (k,).
+    """
+
+    features: Tensor
+    answers: Tensor
+    offsets: Tensor | None
+    moved: Tensor
+
+    def __getitem__(self, rows: Any) -> Asked:
+        offsets = None if self.offsets is None else self.offsets[rows]
+        return Asked(self.features[rows], self.answers[rows], offsets, self.moved[rows])
+
+    def predicted(self, net: DeltaNet) -> tuple[Tensor, Tensor]:
+        """Mean and log-variance, standardised."""
+        return net.predictor(self.features) if self.offsets is None else net.predictor(self.features, self.offsets)
 
 
 def sensor_labels(
-    net: OperatorNet,
+    net: DeltaNet,
     robot: RobotSpec,
     x: Array,
     qpos: Array,
@@ -29,8 +65,9 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
-) -> tuple[Tensor, Tensor]:
-    """Standardised features and oracle answers: a third at recorded states, a third near them, a third anywhere.
+    move: bool = True,
+) -> Asked:
+    """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
     "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
     and inertia there are asked of the simulator, since no recorded motion needs to have been there.
@@ -38,62 +75,73 @@ def sensor_labels(
     Args:
         net: Its config says the probes.
         robot: The simulator asked.
-        x: [o_t | a_t] at those states, (k, dim).
+        x: What the network was given at those states, (k, dim).
         qpos, qvel: All joints that are not locked, (k, n_free).
         conditions: Payload and period of each state.
         locked: Joints clamped in the simulator.
         seed: Of the perturbations.
         nthread: Threads of the simulator, 0 for all cores.
+        move: False leaves all states as they are.
     """
     rng = np.random.default_rng(seed)
-    third = rng.integers(0, 3, len(qpos))
-    oracle, n = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n
+    third = rng.integers(0, 3 if move else 1, len(qpos))
+    oracle, n, at = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n, net.features.layout
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)
     q[np.ix_(near, op)] += rng.normal(0, POSITION_NOISE, (len(near), n))
     v[np.ix_(near, op)] += rng.normal(0, VELOCITY_NOISE, (len(near), n))
-    x[near, :n], x[near, n : 2 * n] = q[np.ix_(near, op)], v[np.ix_(near, op)]
+    x[near, at.q], x[near, at.v] = q[np.ix_(near, op)], v[np.ix_(near, op)]
     low, high = np.clip(robot.qpos_range[robot.operated_index].T, -np.pi, np.pi)
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
     q[np.ix_(far, op)] += shift
-    x[far] += shift_positions(shift, net.config.history, x.shape[1])
-    answers = oracle(q, v)
+    x[far] += shift_positions(shift, at)
+    offsets = None
+    if net.config.sensors == "learned":
+        limit = net.config.probe_large
+        offsets = rng.uniform(-limit, limit, (len(q), net.config.num_probes, n)).astype(np.float32)
+    answers = oracle(q, v, offsets)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
-    return features.clone(), torch.from_numpy(answers.reshape(len(q), -1))
+    return Asked(
+        features.clone(),
+        torch.from_numpy(answers if offsets is not None else answers.reshape(len(q), -1)),
+        None if offsets is None else torch.from_numpy(offsets),
+        torch.from_numpy(third),
+    )
 
 
-def shift_positions(shift: Array, history: int, dim: int) -> Array:
-    """What moving every position and target of [o_t | a_t] by shift (k, n) adds to it, (k, dim)."""
-    n, out = shift.shape[1], np.zeros((len(shift), dim))
-    out[:, :n] = out[:, -n:] = shift
-    for frame in range(history):
-        start = 2 * n + 3 * n * frame
-        out[:, start : start + n] = out[:, start + 2 * n : start + 3 * n] = shift
+def shift_positions(shift: Array, at: Layout) -> Array:
+    """What moving every position and target of [o_t | a_t] by shift (k, n) adds to x, (k, dim)."""
+    k, n = shift.shape
+    out = np.zeros((k, at.dim))
+    out[:, at.q] = out[:, at.action] = shift
+    frame = np.concatenate([shift, np.zeros((k, n)), shift], axis=1)
+    out[:, at.past] = np.tile(frame, (1, at.history))
     return out
 
 
-def fit_predictor(net: OperatorNet, features: Tensor, answers: Tensor, seed: int) -> float:
-    """Gaussian likelihood on three quarters of the states; returns R² on the rest, averaged over sensor values.
+def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: int, refit: bool = False) -> Report:
+    """Gaussian likelihood on three quarters of the states; returns R² on the rest.
 
-    The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
+    The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like. With
+    `refit` it starts from what it is and its outputs keep their scale, which is what the branch knows.
     """
     predictor = net.predictor
-    assert predictor is not None
     generator = torch.Generator().manual_seed(seed)
-    held = len(features) // 4
-    train_x, train_s = features[held:], answers[held:]
-    predictor.outputs.fit(train_s, floor=1e-6)
-    target = predictor.outputs(train_s)
+    held = len(asked.features) // 4
+    train = asked[held:]
+    if not refit:
+        predictor.outputs.fit(train.answers.reshape(-1, len(predictor.outputs.mean)), floor=1e-6)
+    target = predictor.outputs(train.answers)
     parameters = list(predictor.parameters())
     for p in parameters:
         p.requires_grad_(True)
     optimiser = torch.optim.Adam(parameters, lr=1e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
-        batch = torch.randint(0, len(train_x), (BATCH,), generator=generator)
-        mean, log_var = predictor(train_x[batch])
+        batch = torch.randint(0, len(target), (BATCH,), generator=generator)
+        mean, log_var = train[batch].predicted(net)
         loss = 0.5 * ((mean - target[batch]) ** 2 * (-log_var).exp() + log_var).mean()
         optimiser.zero_grad()
         loss.backward()
@@ -101,8 +149,37 @@ def fit_predictor(net: OperatorNet, features: Tensor, answers: Tensor, seed: int
         schedule.step()
     for p in parameters:
         p.requires_grad_(False)
+    rest = asked[:held]
+    visited = explained(net, rest[rest.moved == 0], joints)["mean"]
+    return explained(net, rest, joints) | {"fitted": visited, "visited": visited, "refits": 0}
+
+
+def explained(net: DeltaNet, asked: Asked, joints: tuple[str, ...]) -> Report:
+    """R² of the predictor's mean: the share of the answers' variance over these states, averaged over sensor values."""
     with torch.inference_mode():
-        truth = predictor.outputs(answers[:held])
-        residual = ((predictor(features[:held])[0] - truth) ** 2).mean(0)
+        truth = net.predictor.outputs(asked.answers)
+        residual = ((asked.predicted(net)[0] - truth) ** 2).mean(0)
         spread = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
-        return float((1 - residual / spread).mean())
+        r2 = (1 - residual / spread).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
+        by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
+        return {"mean": float(r2.mean()), "by_joint": by_joint, "by_probe": r2.mean((1, 2)).tolist()}
+
+
+def report_of(stored: Report | float | None) -> Report | None:
+    """The report of a checkpoint; older ones hold the mean alone, or not-a-number."""
+    if isinstance(stored, float):
+        whole = {"mean": stored, "by_joint": {}, "by_probe": [], "fitted": stored, "visited": stored, "refits": 0}
+        return whole if stored == stored else None
+    return stored
+
+
+def points_of(net: DeltaNet) -> Infer | None:
+    """x → offsets of a network that learns where to ask, else None."""
+    if not net.config.learns_points:
+        return None
+
+    def infer(x: Array) -> Array:
+        with torch.inference_mode():
+            return net.offsets(torch.from_numpy(x)).numpy()  # type: ignore[operator]
+
+    return infer

@@ -3,34 +3,47 @@
 Fitted on recorded states alone, a policy meets other states as soon as it errs and errs more. So each round rolls the
 present policy out, labels every visited state with u* − a of its row (train/inverse.py: right wherever the state is,
 the plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven
-by the labels themselves and only seeds the second.
+by the labels themselves and only seeds the second; the inverse-label baseline stops after it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
-from gaponet.model.deeponet import DeltaMLP, OperatorNet
+from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
-from gaponet.train.config import WarmStartConfig
+from gaponet.train.config import TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
-from gaponet.train.sensor_fit import STATES, fit_predictor, sensor_labels
+from gaponet.train.sensor_fit import STATES, Asked, Report, explained, fit_predictor, points_of, sensor_labels
 
 Array = np.ndarray
+
+
+def recipe(config: TrainConfig) -> WarmStartConfig:
+    """The warm start of a kind of model.
+
+    The inverse-label baseline has one round, on recorded motions that the labels lead along, undisturbed, with the
+    gradient steps of all rounds together.
+    """
+    warm = config.warm_start
+    if config.model.kind != "inverse" or not warm.rounds:
+        return warm
+    return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps, disturbance=0.0)
 
 
 class WarmStart:
     """The pool of visited states and the optimiser; `round` collects and fits once."""
 
-    def __init__(
-        self, net: OperatorNet | DeltaMLP, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int
-    ) -> None:
-        """labels: Δa* of every row of the environment's data, (N, n)."""
-        self.net, self.env, self.labels, self.config = net, env, labels, config
+    def __init__(self, net: DeltaNet, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int) -> None:
+        """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
+        self.net, self.env, self.labels, self.config = net, env, held_labels(labels, env.config.delta_hold), config
+        self.seed = seed
         self.generator = torch.Generator().manual_seed(seed)
+        self.visited: list[tuple[Array, Array, Array]] = []  # x, qpos, qvel of all environments, now and then
         self.pool_x: list[torch.Tensor] = []
         self.pool_y: list[torch.Tensor] = []
         trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
@@ -42,10 +55,15 @@ class WarmStart:
         env, net = self.env, self.net
         env.reset()
         net.eval()
+        env.inputs.points = points_of(net)
+        self.visited.clear()
         xs, ys = [], []
         disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
-        for _ in range(self.config.steps):
+        hold = env.config.delta_hold
+        for step in range(0, self.config.steps, hold):
             x = env.get_observations()["actor"]
+            if self.config.sensor_refresh is not None and step // hold % max(1, self.config.steps // hold // 8) == 0:
+                self.visited.append((x.numpy(), env.sim.qpos.copy(), env.sim.qvel.copy()))
             y = self.labels[env.row]
             xs.append(x)
             ys.append(torch.from_numpy(y))
@@ -54,8 +72,10 @@ class WarmStart:
             else:
                 with torch.inference_mode():
                     delta = net(x).numpy()
-            env.advance(delta + self._disturb(disturbance))
-            ended = np.flatnonzero(env.row >= env.last)
+            applied = delta + self._disturb(disturbance)
+            for _ in range(hold):
+                env.advance(applied)
+            ended = np.flatnonzero(env.ended())
             if ended.size:
                 env.reset(ended)
         self.pool_x.append(torch.cat(xs))
@@ -74,6 +94,38 @@ class WarmStart:
         noise[: len(noise) // 4] = 0.0
         return noise
 
+    def refresh_sensors(self, report: Report, nthread: int = 0) -> Report:
+        """R² of the predictor on states of the last round's roll-outs; fits it again where that has fallen too far.
+
+        Only copies of states are used: the roll-out environments are left as they are.
+
+        Args:
+            report: Of the last fit or check.
+            nthread: Threads of the simulator asked.
+
+        Returns:
+            The report with "visited" as it is now, or that of the new fit, with "refits" counted.
+        """
+        allowed = self.config.sensor_refresh
+        if allowed is None or self.net.predictor is None or not self.visited:
+            return report
+        joints = self.env.robot.operated
+        found = explained(self.net, self._ask_visited(STATES // 4, nthread, move=False), joints)["mean"]
+        if found >= report["fitted"] - allowed:
+            return report | {"visited": found}
+        asked = self._ask_visited(STATES, nthread, move=True)
+        new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
+        return new | {"refits": report["refits"] + 1}
+
+    def _ask_visited(self, count: int, nthread: int, move: bool) -> Asked:
+        env, seed = self.env, self.seed + self.done
+        x, q, v = (np.concatenate(part) for part in zip(*self.visited, strict=True))
+        pick = np.random.default_rng(seed).permutation(len(x))[:count]
+        conditions = [env.conditions[g] for g in np.tile(env.group, len(self.visited))[pick]]
+        return sensor_labels(
+            self.net, env.robot, x[pick], q[pick], v[pick], conditions, env.locked, seed, nthread, move
+        )
+
     def round(self, tick: Callable[[], float]) -> float:
         """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad.
 
@@ -82,7 +134,7 @@ class WarmStart:
         """
         self.collect(follow_labels=self.done == 0)
         if self.done == 0:
-            self.net.features.standardise.fit(self.net.features.relative(self.pool_x[0]))
+            self.net.fit_inputs(self.pool_x[0])
         x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
         config, net, total = self.config, self.net, 0.0
         net.train()
@@ -105,7 +157,13 @@ class WarmStart:
         return float(np.sqrt(total / config.gradient_steps))
 
 
-def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthread: int = 0) -> float:
+def held_labels(labels: Array, hold: int) -> Array:
+    """Mean of the labels of rows t … t + hold − 1, (N, n) → (N − hold + 1, n); a motion's last rows mean nothing."""
+    rows = len(labels) - hold + 1
+    return np.mean([labels[i : rows + i] for i in range(hold)], axis=0, dtype=labels.dtype)
+
+
+def fit_sensors(net: DeltaNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthread: int = 0) -> Report:
     """Standardise on the environment's recorded start states, fit the predictor there; returns held-out R²."""
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
@@ -122,7 +180,7 @@ def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int, nt
     pick = np.sort(rng.permutation(len(x))[:STATES])
     net.features.standardise.fit(net.features.relative(torch.from_numpy(x)))
     shuffled = rng.permutation(pick)
-    features, answers = sensor_labels(
+    asked = sensor_labels(
         net,
         robot,
         x[shuffled],
@@ -133,4 +191,4 @@ def fit_sensors(net: OperatorNet, env: DeltaEnv, robot: RobotSpec, seed: int, nt
         seed,
         nthread,
     )
-    return fit_predictor(net, features, answers, seed)
+    return fit_predictor(net, asked, robot.operated, seed)

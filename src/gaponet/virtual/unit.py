@@ -130,6 +130,15 @@ class VirtualRobot:
         self.events: list[list[Event]] = [[] for _ in seeds]
         self._reported = np.zeros((2, *target.shape), bool)
 
+    def set_gains(self, kp: Array, kd: Array) -> None:
+        """Gains told to the drives instead of the robot's, (n) or (N, n); they deliver their share of them.
+
+        Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles by those it finds.
+        """
+        p, at = self.physics, self.active
+        self._kp = np.broadcast_to(np.asarray(kp, float)[..., at] * p.kp_scale, self._kp.shape)
+        self._kd = np.broadcast_to(np.asarray(kd, float)[..., at] * p.kd_scale, self._kd.shape)
+
     def _settle(self, target: Array) -> None:
         """Where PD and gravity balance, and a little off it: friction keeps a joint where it happened to stop."""
         stiffness = self._kp * self.thermal.kt()

@@ -1,0 +1,77 @@
+"""Deadlines over real DDS on loopback: a virtual H1-2 (500 Hz) and a controller in two processes.
+
+    python benchmarks/loopback.py --minutes 10 --rate 50
+
+Prints what share of control periods started more than one period late or not at all, and the age of states. Watchdogs
+stay on; with --no-stop a stalled machine is counted instead of stopping the robot.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import tyro
+
+from gaponet.deploy.controller import ControlConfig, Controller
+from gaponet.deploy.drivers.unitree import UnitreeDriver
+from gaponet.deploy.safety import SafetyConfig
+from gaponet.robot import load_robot
+
+
+def main(
+    minutes: float = 10.0, rate: float = 50.0, state_rate: float = 500.0, domain: int = 42, no_stop: bool = False
+) -> None:
+    """Swing both arms gently and count.
+
+    Args:
+        minutes: Duration of the run.
+        rate: Commands per second.
+        state_rate: States per second.
+        domain: DDS domain.
+        no_stop: Let a late loop and an old state pass, and count them.
+    """
+    robot = load_robot("h1_2")
+    command = [sys.executable, "-m", "gaponet.cli.main", "virtual", "serve", "--payload-mass", "3"]
+    command += ["--domain", str(domain), "--rate", str(state_rate)]
+    served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert served.stdout is not None
+        print(served.stdout.readline().strip(), flush=True)
+        time.sleep(0.5)
+        recording = Controller(
+            UnitreeDriver(robot, domain=domain), robot, ControlConfig(rate=rate),
+            replace(SafetyConfig(), stale=1e6, overrun=1e6) if no_stop else SafetyConfig(),
+        ).run(swing(robot.qpos_home, minutes * 60, rate))  # fmt: skip
+    finally:
+        served.terminate()
+        served.wait()
+    late = np.array(recording.late) * rate
+    periods = len(late) + recording.missed
+    result = recording.summary() | {
+        "virtual": True,
+        "periods_due": periods,
+        "late_by_a_period_or_missed": float(((late > 1).sum() + recording.missed) / periods),
+    }
+    print(json.dumps({k: v for k, v in result.items() if k not in ("kp", "kd")}, indent=1))
+
+
+def swing(home: np.ndarray, seconds: float, rate: float):
+    """Elbows and shoulder pitch, 0.25 Hz, as a policy."""
+
+    def policy(k: int, state: object) -> np.ndarray | None:
+        if k >= seconds * rate:
+            return None
+        target = home.copy()
+        target[[13, 16, 20, 23]] += 0.25 * np.sin(2 * np.pi * 0.25 * k / rate)
+        return target
+
+    return policy
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

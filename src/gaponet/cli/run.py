@@ -1,0 +1,228 @@
+"""`gaponet run`: play a motion on a robot, real or virtual, with or without a model."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import tyro
+
+from gaponet.cli.out import Out
+from gaponet.deploy.controller import ControlConfig
+from gaponet.deploy.safety import SafetyConfig
+from gaponet.errors import UsageError
+
+if TYPE_CHECKING:
+    from gaponet.deploy.driver import Driver
+    from gaponet.deploy.recording import Event, Recording
+    from gaponet.motion.motion import Motion
+    from gaponet.robot import RobotSpec
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How to reach the robot."""
+
+    topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
+    """unitree: arm_sdk leaves legs and balance to the robot; lowcmd is for a robot that hangs."""
+    joints: Literal["arms", "upper_body", "all"] = "arms"
+    """unitree: what is commanded; the legs only with all, on lowcmd."""
+    domain: int = 0
+    """unitree: DDS domain."""
+    interface: str = "lo"
+    """unitree: network interface to the robot; lo for a virtual one on this machine."""
+    port: str = "/dev/ttyACM0"
+    """so101: serial port."""
+    calibration: Path | None = None
+    """so101: calibration file of LeRobot (JSON); default: the middle of the encoder is 0 rad."""
+    unit: str = "4"
+    """virtual: number or name in the fleet."""
+    fleet: str = "default"
+    """virtual: default, shifted, or a .toml file."""
+    fast: tyro.conf.FlagCreatePairsOff[bool] = False
+    """virtual: as fast as this machine can, not in real time."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """A robot, a motion and what is between them, as the command line asks for it."""
+
+    motion: str
+    driver: Literal["virtual", "unitree", "so101"] = "virtual"
+    robot: str | None = None
+    model: Path | None = None
+    payload_mass: float | None = None
+    payload_side: str = "both"
+    max_payload: float | None = None
+    reach: Reach = field(default_factory=Reach)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    yes: bool = False
+    seed: int = 0  # of a virtual robot's noise
+
+
+def run(
+    motion: str,
+    driver: Literal["virtual", "unitree", "so101"] = "virtual",
+    robot: str | None = None,
+    model: Path | None = None,
+    payload_mass: float | None = None,
+    payload_side: str = "both",
+    max_payload: float | None = None,
+    out: Path | None = None,
+    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),
+    control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
+    safety: SafetyConfig = SafetyConfig(),  # noqa: B008
+    yes: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Play a motion on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
+
+    Args:
+        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz).
+        driver: virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial).
+        robot: Name or folder; default h1_2, or so101 with that driver.
+        model: Run or artifact folder: compensate with it, so that the robot gets to where the motion says.
+        payload_mass: kg in each hand; with a model, None estimates it.
+        payload_side: both, or one hand.
+        max_payload: kg that the motion must be possible with; default 3 for named motions, so that all payloads play
+            the same one, and payload_mass for files.
+        out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npz.
+        reach: How to reach the robot.
+        control: Timing.
+        safety: Limits and watchdogs.
+        yes: Do not ask before a robot moves.
+        json: One JSON object on stdout.
+    """
+    screen = Out(json)
+    session = Request(
+        motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes
+    )
+    recording, played, _ = perform(screen, session)
+    if out:
+        screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
+    screen.result(recording.summary() | tracking(recording))
+    if recording.fault:
+        sys.exit(3)
+
+
+def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
+    """Make everything, ask, run, and say how it went."""
+    from gaponet.deploy.clock import MonotonicClock, SimulatedClock
+    from gaponet.deploy.controller import Controller, play, require_commanded
+    from gaponet.robot import load_robot
+
+    spec = load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
+    fast = asked.reach.fast and asked.driver == "virtual"
+    clock = SimulatedClock() if fast else MonotonicClock()
+    motion = find_motion(asked, spec)
+    driver, facts = make_driver(asked, spec, clock, motion)
+    require_commanded(motion, spec, driver)
+    compensator = _compensator(asked, spec)
+    controller = Controller(
+        driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass,
+        on_event=lambda event: _tell(screen, event), motion=motion.name, payload_side=asked.payload_side,
+        model=str(asked.model) if asked.model else None, **facts,
+    )  # fmt: skip
+    if asked.driver != "virtual" and not asked.yes:
+        _ask(screen, driver, motion)
+    recording = controller.run(play(motion, controller.dt), keys=not asked.yes)
+    _report(screen, recording)
+    return recording, motion, spec
+
+
+def find_motion(asked: Request, robot: RobotSpec) -> Motion:
+    """A motion file, fitted to the robot's limits, or a motion of the library."""
+    from gaponet.motion.feasible import MAX_PAYLOAD
+    from gaponet.motion.files import SUFFIXES, read_motion
+    from gaponet.motion.library import Library
+
+    name, payload = asked.motion, asked.payload_mass or 0.0
+    is_file = name.endswith(SUFFIXES)
+    heaviest = max(payload, 0.0 if is_file else MAX_PAYLOAD) if asked.max_payload is None else asked.max_payload
+    if heaviest < payload:
+        raise UsageError(f"--max-payload {heaviest:g} is less than --payload-mass {payload:g}")
+    library = Library(robot, max_payload=heaviest)
+    if not is_file:
+        return library.make(name)
+    motion = read_motion(name, robot)
+    library.add(motion)
+    return library.make(motion.name)
+
+
+def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) -> tuple[Driver, dict[str, Any]]:
+    """The driver, and what is known about the unit behind it."""
+    from gaponet.deploy.drivers.open import open_driver
+
+    reach = asked.reach
+    if asked.driver == "unitree":
+        options: dict[str, Any] = {n: getattr(reach, n) for n in ("topic", "joints", "domain", "interface")}
+        return open_driver("unitree", robot.mjcf.parent, **options), {}
+    if asked.driver == "so101":
+        return open_driver("so101", robot.mjcf.parent, port=reach.port, calibration=reach.calibration), {}
+    from gaponet.deploy.drivers.virtual import VirtualDriver
+    from gaponet.virtual.fleet import load_fleet
+
+    name = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
+    side = asked.payload_side
+    physics = load_fleet(reach.fleet, robot).unit(name)
+    payload = (asked.payload_mass or 0.0, side)
+    return VirtualDriver(robot, physics, clock, payload, name, seed=asked.seed), {"unit_id": name, "fleet": reach.fleet}
+
+
+def tracking(recording: Recording) -> dict[str, Any]:
+    """Mean |measured − asked| by joint over the run, rad: measured one period after the command, as everywhere."""
+    rows = [r for r in recording.rows if r.phase == "run" and r.target is not None]
+    if len(rows) < 2:
+        return {}
+    at = [recording.joint_names.index(name) for name in recording.commanded]
+    target, qpos = np.array([r.target for r in rows])[:, at], np.array([r.state.qpos for r in rows])[:, at]
+    error = np.abs(qpos[1:] - target[:-1])
+    moved = np.ptp(target, axis=0) > 1e-6
+    joints = {n: float(e) for n, e, m in zip(recording.commanded, error.mean(axis=0), moved, strict=True) if m}
+    return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
+
+
+def _compensator(asked: Request, robot: RobotSpec) -> Any:
+    """The compensator of a model, or None."""
+    if asked.model is None:
+        return None
+    try:
+        from gaponet.deploy.compensator import Compensator
+    except ImportError:
+        raise UsageError("--model: this version has no compensator yet; run without a model") from None
+    from gaponet.model.artifact import GapModel
+
+    return Compensator(robot, GapModel.load(asked.model), dt=1.0 / asked.control.rate, payload_side=asked.payload_side)
+
+
+def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
+    screen.say(
+        f"[bold]{driver.address}[/] will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
+        f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? "
+        "Enter to start, Ctrl-C to leave."
+    )
+    if not sys.stdin.isatty():
+        raise UsageError("no terminal to ask on; say --yes if the space around the robot is free")
+    sys.stdin.readline()
+
+
+def _tell(screen: Out, event: Event) -> None:
+    colour = "bold red" if event.kind not in ("", "end") else "cyan"
+    screen.say(f"[{colour}]{event.phase:>9}[/]  {event.kind and event.kind + ': '}{event.text}")
+
+
+def _report(screen: Out, recording: Recording) -> None:
+    facts = recording.summary()
+    three = lambda what: ", ".join(f"{facts[what][q]:.2f}" for q in ("p50", "p99", "max"))  # noqa: E731
+    error = tracking(recording).get("tracking_error_rad", {}).get("mean")
+    label = "VIRTUAL " if recording.virtual else ""
+    screen.table(f"{label}{recording.robot} at {facts['rate_hz']:g} Hz", ["what", "value"], [
+        ["periods, of which never started", f"{facts['periods']}, {recording.missed}"],
+        ["late, ms: p50, p99, max", three("late_ms")],
+        ["age of state, ms: p50, p99, max", three("state_age_ms")],
+        ["tracking error, mrad", "–" if error is None else f"{1e3 * error:.2f}"],
+    ])  # fmt: skip

@@ -1,0 +1,127 @@
+"""gaponet view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from gaponet.cli.gap import mrad
+from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.out import Out
+from gaponet.cli.progress import bar
+
+if TYPE_CHECKING:
+    from gaponet.eval.film import Clip
+    from gaponet.eval.scene import Scene
+
+
+def view(
+    dataset: tyro.conf.Positional[Path],
+    model: tuple[Path, ...] = (),
+    motion: str = "",
+    unit: str = "",
+    payload_mass: float | None = None,
+    show: str = "target,nominal,aligned,recorded",
+    render: Path | None = None,
+    web: tyro.conf.FlagCreatePairsOff[bool] = False,
+    port: int = 8080,
+    start: float | None = None,
+    duration: float = 8.0,
+    speed: float = 1.0,
+    magnify: float = 1.0,
+    ghost: bool = True,
+    closeup: bool = False,
+    fps: float = 20.0,
+    width: int = 960,
+    course: bool = True,
+    azimuth: float = 145.0,
+    elevation: float = -14.0,
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Watch one recording: target, nominal simulator, simulator with a model, and the robot, side by side.
+
+    A window opens where there is a display; --render and --web need none.
+
+    Args:
+        dataset: Dataset folder.
+        model: Run folders of gaponet train; each gives a copy of the robot in the simulator that it aligns.
+        motion: Which motion; default: one that the model was not trained on, where there is one.
+        unit: Which unit's recording, where there are several.
+        payload_mass: Which payload's recording, kg.
+        show: Copies from left to right; aligned stands for every --model.
+        render: Write a .gif, .mp4 or .png instead (the .png shows the moment of the largest nominal error).
+        web: Serve the scene to a browser instead; needs gaponet[view].
+        port: Of --web.
+        start: s into the recording; default: where most happens.
+        duration: s of the recording.
+        speed: Below 1 is slow motion.
+        magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
+        ghost: Draw the recording, translucent, into each other copy.
+        closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
+        fps: Of a film.
+        width: Of a picture, pixels; the height follows from the robots.
+        course: Draw the error against time below a picture.
+        azimuth: Camera, degrees; 180 looks at the robot's front.
+        elevation: Camera, degrees; negative looks down.
+        robot: Robot name or folder, if not the package's robot of the dataset.
+        json: One JSON object on stdout.
+    """
+    from gaponet.errors import UsageError
+    from gaponet.eval.gl import choose_gl, has_display
+
+    if render is None and not web and not has_display():
+        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
+    if render is not None:
+        choose_gl()
+    from gaponet.eval.film import Clip, require_kind
+    from gaponet.eval.scene import Scene, View
+    from gaponet.eval.side_by_side import pick, side_by_side
+
+    if render is not None:
+        require_kind(render)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    entry = pick(data, model, motion, unit, payload_mass)
+    with bar("replaying") as update:
+        shown = side_by_side(data, entry, spec, model, lambda method, done, total: update(done, total, method))
+    shown = shown.only(tuple(n for n in names(show) if n != "aligned" or model))
+    clip = Clip.of(shown, start, duration, speed, fps)
+    meta = entry.meta
+    out.say(
+        f"[bold]{meta.motion}[/], {'VIRTUAL ' if meta.virtual else ''}unit {meta.unit_id}, {meta.payload_mass:g} kg; "
+        + ", ".join(f"{m.name} {mrad(m.mpjae)} mrad" for m in shown.motions if m.method != "recorded")
+    )
+    if shown.seen:
+        out.say("[yellow]a model was trained or chosen on this recording: it is not held-out[/]")
+    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
+    rows = slice(first, last + 1)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
+    if render is not None:
+        pictures = _film(scene, clip, render, width, magnify, course)
+        size = render.stat().st_size
+        out.say(f"{render}: {pictures} picture{'s' * (pictures > 1)}, {size / 1e6:.2f} MB")
+    elif web:
+        from gaponet.eval.web import serve
+
+        serve(scene, clip, port, magnify, out.say)
+    else:
+        from gaponet.eval.watch import watch
+
+        watch(scene, clip, magnify)
+    out.result({
+        "sequence": entry.id, "virtual": meta.virtual, "seen": shown.seen, "start": clip.start,
+        "duration": clip.duration, "mpjae": {m.method: m.mpjae for m in shown.motions if m.method != "recorded"},
+        "render": None if render is None else str(render),
+    })  # fmt: skip
+
+
+def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool) -> int:
+    from gaponet.eval.film import write
+    from gaponet.eval.picture import Camera
+
+    span = (clip.start, clip.stop)
+    with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:
+        return write(camera, clip, path, lambda done, total: update(done, total, "pictures"))

@@ -1,0 +1,51 @@
+"""Clocks of a control loop. The wall clock is never asked: it may be set while a robot moves."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+SPIN = 0.0003  # s: the last part of a wait is spent awake, since a sleep ends up to this much late on a quiet Linux
+
+
+class Clock(Protocol):
+    """Seconds that only grow, and waiting for one of them."""
+
+    def now(self) -> float:
+        """s since some fixed moment."""
+
+    def wait_until(self, deadline: float) -> float:
+        """Return at an absolute time, or at once if it has passed; gives the time of return."""
+
+
+class MonotonicClock:
+    """The machine's monotonic clock, shared by all processes of one machine."""
+
+    def now(self) -> float:
+        """s since boot."""
+        return time.monotonic()
+
+    def wait_until(self, deadline: float) -> float:
+        """Sleep to shortly before the deadline, then spin. Signal handlers run meanwhile and do not shorten it."""
+        left = deadline - time.monotonic() - SPIN
+        if left > 0:
+            time.sleep(left)
+        while (now := time.monotonic()) < deadline:
+            pass
+        return now
+
+
+class SimulatedClock:
+    """Time that passes only where somebody waits: a loop against a virtual robot runs as fast as it can."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        """s."""
+        return self._now
+
+    def wait_until(self, deadline: float) -> float:
+        """Be there at once."""
+        self._now = max(self._now, deadline)
+        return self._now

@@ -1,0 +1,350 @@
+"""Controller: plays targets on a robot at a fixed rate, within limits, and stops it when something is wrong.
+
+    idle ─ fresh state ─→ blend_in ─ at the first target ─→ run ─ end ─→ blend_out ─ back ─→ damp ─ time ─→ stopped
+      └──────────────────────┴── any fault, key, signal or call ──┴────────┴──→ damp
+
+Only blend_in, run and blend_out send position commands. Damp is entered at once and for good: what caused it is
+latched, and a controller that has stopped cannot be started again. docs/deploy-safety.md says what this guarantees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from gaponet.deploy.clock import Clock, MonotonicClock
+from gaponet.deploy.driver import Driver, DriverError, State
+from gaponet.deploy.guard import Guard
+from gaponet.deploy.publisher import sole_publisher
+from gaponet.deploy.recording import Event, Recording, Row
+from gaponet.deploy.safety import Fault, Limits, SafetyConfig, Watch, limit_command, limit_delta
+from gaponet.deploy.stop import Keys, StopRequest, on_signal
+from gaponet.errors import UsageError
+from gaponet.motion.minjerk import blend, move_time
+from gaponet.motion.motion import Motion
+from gaponet.robot import RobotSpec
+
+Array = np.ndarray
+Policy = Callable[[int, State], Array | None]  # period since the start of the run, state → targets (n) rad; None: end
+
+
+class Compensator(Protocol):
+    """Changes a target so that the robot ends up where the target says (deploy.compensator). All joints, (n)."""
+
+    def reset(self, target: Array, payload_mass: float | None = None) -> None:
+        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take a while."""
+
+    def step(self, target: Array, qpos: Array, qvel: Array) -> Array:
+        """What to command so that the robot gets to `target`, (n) rad."""
+
+
+class Phase(StrEnum):
+    """Where a controller is."""
+
+    IDLE = "idle"
+    BLEND_IN = "blend_in"
+    RUN = "run"
+    BLEND_OUT = "blend_out"
+    DAMP = "damp"
+    STOPPED = "stopped"
+
+
+NEXT = {
+    Phase.IDLE: (Phase.BLEND_IN, Phase.DAMP),
+    Phase.BLEND_IN: (Phase.RUN, Phase.DAMP),
+    Phase.RUN: (Phase.BLEND_OUT, Phase.DAMP),
+    Phase.BLEND_OUT: (Phase.DAMP,),
+    Phase.DAMP: (Phase.STOPPED,),
+    Phase.STOPPED: (),
+}
+HANG = 5.0  # control periods without a sign of life after which the guard process damps the robot
+FRESH = 5  # periods in a row without a fault before anything is commanded
+PATIENCE = 5.0  # s to wait for them
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """Timing of a controller."""
+
+    rate: float = 50.0
+    """Control periods per second."""
+    blend: float = 2.0
+    """Least duration of the moves to the first target and back, s."""
+    blend_speed: float = 0.5
+    """Fastest joint in those moves, rad/s."""
+    settle: float = 0.5
+    """Standing still at the first target before the run, s."""
+    blend_out: bool = True
+    """Go back to where the robot was found before damping; a fault never waits for this."""
+    damp: float = 2.0
+    """Damping before the robot is let go, s."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.rate <= 1000:
+            raise UsageError(f"rate is {self.rate} Hz; give 1 to 1000")
+        for name in ("blend", "blend_speed", "damp"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} is {getattr(self, name)}; give a positive number")
+
+
+def play(motion: Motion, dt: float) -> Policy:
+    """A motion as a policy: row k in period k."""
+    rows = motion.sample(dt)
+    return lambda k, state: rows[k] if k < len(rows) else None
+
+
+def require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
+    """Refuse a motion that moves joints which the driver does not command."""
+    left = [name for name in motion.moved(robot) if name not in driver.commanded]
+    if left:
+        raise UsageError(
+            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
+            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
+        )
+
+
+class Controller:
+    """One run on one robot."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        robot: RobotSpec,
+        config: ControlConfig | None = None,
+        safety: SafetyConfig | None = None,
+        compensator: Compensator | None = None,
+        clock: Clock | None = None,
+        guard: bool = True,
+        payload_mass: float | None = None,
+        on_event: Callable[[Event], None] = lambda event: None,
+        **meta: Any,
+    ) -> None:
+        """
+        Args:
+            driver: The robot; not yet connected.
+            robot: Its type.
+            config: Timing.
+            safety: Limits and watchdogs.
+            compensator: Between targets and commands.
+            clock: Default the machine's monotonic clock.
+            guard: Start the process that damps the robot if this one dies, where the driver has one.
+            payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
+            on_event: Told every change of phase.
+            meta: Kept with the recording (unit, model…).
+        """
+        self.driver, self.robot, self.compensator = driver, robot, compensator
+        self.config, self.safety = config or ControlConfig(), safety or SafetyConfig()
+        self.clock, self.dt = clock or MonotonicClock(), 1.0 / self.config.rate
+        self.joints = robot.index(driver.commanded)
+        self.limits = Limits.of(robot, driver.commanded, self.safety)
+        self.watch = Watch(driver.joint_names, self.joints, self.dt, self.safety, driver.noisy)
+        self.stop = StopRequest()
+        self.phase = Phase.IDLE
+        self.recording = Recording(
+            robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
+            meta=meta | {"payload_mass": payload_mass}
+            | {name: getattr(robot, name)[self.joints].tolist() for name in ("kp", "kd")},
+        )  # fmt: skip
+        self._use_guard, self._on_event = guard, on_event
+        self._guard: Guard | None = None
+        self._payload_mass, self._prepared = payload_mass, compensator is None
+        self._ctrl: Array | None = None  # commanded joints
+        self._delta = np.zeros(len(self.joints))
+        self._since = self._fresh = 0
+        self._unfresh: Fault | None = None
+
+    def run(self, policy: Policy, keys: bool = False) -> Recording:
+        """Go through all phases; returns when stopped.
+
+        Args:
+            policy: Targets of the run, asked once a period.
+            keys: Any key on the terminal stops.
+
+        Raises:
+            DriverError: The robot could not be reached; nothing was commanded.
+            UsageError: Another process commands it, or this controller has run before.
+        """
+        if self.phase is not Phase.IDLE or self.recording.events:
+            raise UsageError("a controller runs once; make a new one")
+        with ExitStack() as stack:
+            lock = stack.enter_context(sole_publisher(self.driver.address))
+            stack.callback(self.driver.close)
+            self.driver.connect()
+            self.recording.virtual = self.driver.virtual
+            self._start_guard(lock, stack)
+            stack.enter_context(on_signal(self.stop))
+            watch_keys = stack.enter_context(Keys(self.stop)) if keys else None
+            try:
+                self._loop(policy, watch_keys)
+            except BaseException:
+                self._damp(1.0)  # a bug above this line must not leave a position command standing
+                raise
+        return self.recording
+
+    def _start_guard(self, lock: int, stack: ExitStack) -> None:
+        spec = self.driver.guard() if self._use_guard else None
+        if spec is None:
+            return
+        self._guard = Guard(spec, lock, HANG * self.dt, self.config.damp)
+        stack.callback(self._guard.release)
+        self._guard.wait_ready()
+
+    def _loop(self, policy: Policy, keys: Keys | None) -> None:
+        start, k, due = self.clock.now(), 0, 0  # due: the period that should follow the last one; k, the one that can
+        self._note(start, "", "waiting for fresh states")
+        self._began = start
+        while self.phase is not Phase.STOPPED:
+            now = self.clock.wait_until(start + k * self.dt)
+            late = now - (start + due * self.dt)
+            if keys:
+                keys.poll()
+            if self._guard and not self._guard.beat() and self.phase not in (Phase.DAMP, Phase.STOPPED):
+                self.stop("the guard process ended")
+            self.recording.late.append(late)
+            self._period(k, now, late, policy)
+            lost = int((self.clock.now() - start) / self.dt) - k  # whole periods that this one ran over
+            self.recording.missed += max(lost - 1, 0)
+            k, due = k + max(1, lost), k + 1
+
+    def _period(self, k: int, now: float, late: float, policy: Policy) -> None:
+        """Read, judge, send, note."""
+        state, fault = self._read(now, late)
+        target = None
+        if fault:
+            self._enter(Phase.DAMP, k, now, fault.kind, fault.text)
+        if self.phase is Phase.IDLE and state is not None:
+            self._ready(k, now, state, policy)
+        if self.phase in (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT) and state is not None:
+            target = self._send(k, now, state, policy)
+        phase = self.phase
+        if phase is Phase.DAMP:
+            left = 1.0 - (now - self._damping_since) / self.config.damp
+            self._damp(max(left, 0.0))
+            if left <= 0:
+                self._enter(Phase.STOPPED, k, now, "", "damped and let go")
+        if state is not None:
+            ctrl = None if target is None else self._full(self._ctrl, state)
+            self.recording.rows.append(Row(now, phase.value, target, ctrl, state))
+
+    def _read(self, now: float, late: float) -> tuple[State | None, Fault | None]:
+        """The newest state, and what stops the robot now."""
+        try:
+            state = self.driver.read()
+        except (DriverError, OSError) as error:
+            return None, self._latched(Fault("driver", str(error)))
+        fault = self.watch.check(now, state, self._ctrl, late)
+        if self.phase is Phase.IDLE:
+            self._fresh, self._unfresh = (0, fault) if fault else (self._fresh + 1, None)
+            fault = None
+        return state, self._latched(fault)
+
+    def _latched(self, fault: Fault | None) -> Fault | None:
+        if self.phase in (Phase.DAMP, Phase.STOPPED):
+            return None
+        return Fault("stop", f"asked to stop: {self.stop.reason}") if self.stop.reason else fault
+
+    def _ready(self, k: int, now: float, state: State, policy: Policy) -> None:
+        """Leave idle when states have been good for a while, and fix how long the way to the first target takes."""
+        if self._fresh < FRESH:
+            if now - self._began > PATIENCE:
+                fault = self._unfresh or Fault("stale", "no fresh state")
+                self._enter(Phase.DAMP, k, now, fault.kind, f"never ready: {fault.text}")
+            return
+        if not self._prepared:  # takes longer than a period; then wait for fresh states again
+            assert self.compensator
+            self.compensator.reset(state.qpos, self._payload_mass)
+            self._prepared, self._fresh = True, 0
+            return
+        first = policy(0, state)
+        if first is None or not np.isfinite(first[self.joints]).all():
+            self._enter(Phase.DAMP, k, now, "target", "the motion has no first target, or it is not a number")
+            return
+        self._found = np.clip(state.qpos[self.joints], self.limits.low, self.limits.high)
+        self._ctrl = self._found.copy()
+        distance = np.abs(first[self.joints] - self._found).max()
+        self._blend_time = float(move_time(distance, self.config.blend_speed, self.config.blend))
+        self._enter(Phase.BLEND_IN, k, now, "", f"to the first target in {self._blend_time:.1f} s")
+
+    def _send(self, k: int, now: float, state: State, policy: Policy) -> Array | None:
+        """Send this period's command; the target (n) it was made from, or None if there was none to be sent."""
+        target, weight = self._target(k, now, state, policy)
+        if target is None:
+            return None
+        wanted = self._full(target, state)
+        corrected = self.compensator.step(wanted, state.qpos, state.qvel) if self.compensator else wanted
+        if not np.isfinite(target).all() or not np.isfinite(corrected[self.joints]).all():
+            self._enter(Phase.DAMP, k, now, "target", "the motion or the model gave something that is not a number")
+            return None
+        assert self._ctrl is not None
+        self._delta = limit_delta(corrected[self.joints] - target, self._delta, self.dt, self.limits)
+        at = self.joints
+        out = limit_command(target + self._delta, self._ctrl, state.qpos[at], state.qvel[at], self.dt, self.limits)
+        if not out.feasible.all():
+            joint = self.driver.commanded[int(np.argmin(out.feasible))]
+            self._enter(Phase.DAMP, k, now, "torque", f"{joint}: no command is within range, rate and torque")
+            return None
+        self._ctrl = out.ctrl
+        try:
+            self.driver.write(self._full(out.ctrl, state), weight)
+        except (DriverError, OSError) as error:
+            self._enter(Phase.DAMP, k, now, "driver", str(error))
+            return None
+        return wanted
+
+    def _target(self, k: int, now: float, state: State, policy: Policy) -> tuple[Array | None, float]:
+        """Target of the commanded joints, and how far the robot is handed over; None where the phase just ended."""
+        passed = (k - self._since) * self.dt
+        if self.phase is Phase.BLEND_IN and passed >= self._blend_time + self.config.settle:
+            self._enter(Phase.RUN, k, now, "", "motion")
+        if self.phase is Phase.BLEND_IN:
+            first = policy(0, state)
+            share = float(blend(np.array(passed / self._blend_time)))
+            goal = self._found if first is None else first[self.joints]
+            return self._found + share * (goal - self._found), min(1.0, passed / self._blend_time)
+        if self.phase is Phase.RUN:
+            target = policy(k - self._since, state)
+            if target is not None:
+                self._last = np.array(target[self.joints], float)
+                return self._last, 1.0
+            self._enter(Phase.BLEND_OUT if self.config.blend_out else Phase.DAMP, k, now, "end", "end of the motion")
+            if not self.config.blend_out:
+                return None, 1.0
+            distance = np.abs(self._last - self._found).max()
+            self._blend_time = float(move_time(distance, self.config.blend_speed, self.config.blend))
+        passed = (k - self._since) * self.dt
+        if passed > self._blend_time + self.config.settle:
+            self._enter(Phase.DAMP, k, now, "end", "back where it was found")
+            return None, 1.0
+        share = float(blend(np.array(passed / self._blend_time)))
+        return self._last + share * (self._found - self._last), 1.0
+
+    def _full(self, values: Array | None, state: State) -> Array:
+        """(n): values at the commanded joints, the measured position at the others."""
+        out = np.array(state.qpos, float)
+        out[self.joints] = values
+        return out
+
+    def _damp(self, weight: float) -> None:
+        try:
+            self.driver.damp(weight)
+        except (DriverError, OSError) as error:
+            if not any(e.text == str(error) for e in self.recording.events):
+                self._note(self.clock.now(), "driver", str(error))
+
+    def _enter(self, phase: Phase, k: int, now: float, kind: str, text: str) -> None:
+        if phase not in NEXT[self.phase]:
+            raise AssertionError(f"{self.phase} → {phase}: {text}")
+        self.phase, self._since = phase, k
+        if phase is Phase.DAMP:
+            self._damping_since, self._ctrl = now, None
+        self._note(now, kind, text)
+
+    def _note(self, now: float, kind: str, text: str) -> None:
+        event = Event(now, self.phase.value, kind, text)
+        self.recording.events.append(event)
+        self._on_event(event)

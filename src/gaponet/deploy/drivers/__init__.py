@@ -1,0 +1,1 @@
+"""Drivers: one robot, or one virtual robot, behind `deploy.driver.Driver`. Vendor libraries load when one connects."""

@@ -1,0 +1,32 @@
+"""Drivers by kind; a driver's module is imported when one of its kind is opened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gaponet.deploy.driver import Driver
+from gaponet.errors import UsageError
+from gaponet.robot import load_robot
+
+KINDS = ("virtual", "unitree", "so101")
+
+
+def open_driver(kind: str, robot: str | Path, **options: Any) -> Driver:
+    """A driver, not yet connected.
+
+    Args:
+        kind: unitree or so101; virtual ones live in the caller's process and are made there (drivers.virtual).
+        robot: Name or folder.
+        options: Of the driver's class.
+    """
+    spec = load_robot(robot)
+    if kind == "unitree":
+        from gaponet.deploy.drivers.unitree import UnitreeDriver
+
+        return UnitreeDriver(spec, **options)
+    if kind == "so101":
+        from gaponet.deploy.drivers.so101 import SO101Driver
+
+        return SO101Driver(spec, **options)
+    raise UsageError(f"no driver '{kind}'; there are {', '.join(KINDS)}")

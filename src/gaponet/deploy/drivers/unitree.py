@@ -1,0 +1,238 @@
+"""UnitreeDriver: the H1-2 over DDS. State from rt/lowstate, commands to rt/arm_sdk or rt/lowcmd.
+
+Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers,
+topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for
+pitch/roll ankles. Tested against a virtual robot on real DDS only. Not checked, for want of a robot: that `tick` counts
+milliseconds (measured when connecting; arrival times are used where it does not), how the robot behaves when commands
+cease, and the sign and scale of tau_est. The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one
+roll, pitch, yaw (17 to 19 and 24 to 26): ours follows the latter, as the MJCF does; check it with one small wrist
+motion first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from gaponet.deploy.driver import DriverError, State
+from gaponet.deploy.drivers import hg
+from gaponet.deploy.safety import damping
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from gaponet.deploy.drivers.dds import Bus
+
+Array = np.ndarray
+Topic = Literal["arm_sdk", "lowcmd"]
+Joints = Literal["arms", "upper_body", "all"]
+
+LEG = ("hip_yaw", "hip_pitch", "hip_roll", "knee", "ankle_pitch", "ankle_roll")
+ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+MOTOR_NAMES = (
+    *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in LEG),
+    "torso_joint",
+    *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
+)
+WEIGHT_MOTOR = 27
+DAMPING = 4.0  # times the robot's kd: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
+VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
+TICKS = (0.001, 0.002)  # s, what a tick may be
+DRIFT = 2e-4  # how much slower the robot's clock may run than ours
+CONNECT = 3.0  # s to wait for a robot
+LISTEN = 0.4  # s to listen for its rate
+
+
+class UnitreeDriver:
+    """A `Driver` for the 27 motors of an H1-2. Legs are commanded only with joints="all" on rt/lowcmd."""
+
+    noisy = True
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        topic: Topic = "arm_sdk",
+        joints: Joints = "arms",
+        domain: int = 0,
+        interface: str = "lo",
+        sole: bool = True,
+    ) -> None:
+        """
+        Args:
+            robot: The H1-2; its kp and kd are sent with every command.
+            topic: arm_sdk leaves legs and balance to the robot; lowcmd switches off all motors that are not commanded
+                and is for a robot that hangs.
+            joints: arms, upper_body (with torso), or all.
+            domain: DDS domain; 0 on a robot.
+            interface: Network interface to the robot; lo for a virtual one on this machine.
+            sole: Refuse to connect where somebody else publishes the topic.
+        """
+        if set(robot.joint_names) != set(MOTOR_NAMES):
+            raise UsageError(f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others")
+        if joints == "all" and topic != "lowcmd":
+            raise UsageError("rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd")
+        first = {"arms": 13, "upper_body": 12, "all": 0}[joints]
+        self.robot, self.topic, self.joints = robot, topic, joints
+        self.domain, self.interface, self.sole = domain, interface, sole
+        self.address = f"unitree dds domain {domain}"
+        self.virtual = False
+        self.joint_names = robot.joint_names
+        self.commanded = tuple(name for name in robot.joint_names if MOTOR_NAMES.index(name) >= first)
+        self._motor = np.array([MOTOR_NAMES.index(name) for name in robot.joint_names])
+        self._at = robot.index(self.commanded)
+        self._command = hg.LowCmd.new()
+        self._refused = 0
+        self._bus: Bus | None = None
+
+    def connect(self) -> None:
+        """Find the robot, learn its tick and machine mode, and make sure that nobody else commands it."""
+        from gaponet.deploy.drivers import dds
+
+        self._dds = dds
+        self._bus = dds.Bus(self.domain, self.interface)
+        topic = f"rt/{self.topic}"
+        self._reader = self._bus.reader("rt/lowstate", dds.LowState)
+        self._writer = self._bus.writer(topic, dds.LowCmd)
+        others = self._bus.publishers(topic) if self.sole else 0
+        if others:
+            raise DriverError(
+                f"{others} other participant(s) publish {topic} on {self.interface}; stop them first (on the "
+                "robot: leave debug programs, and for lowcmd release the motion mode)"
+            )
+        seen = self._listen()
+        self._clock = TickClock(*seen)
+        self._state: State | None = None
+        deadline = time.monotonic() + CONNECT
+        while self._state is None:
+            self._drain()
+            if time.monotonic() > deadline:
+                raise DriverError(
+                    f"rt/lowstate on {self.interface} has {self._refused} messages, all with a wrong checksum"
+                )
+            time.sleep(0.001)
+        hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
+
+    def _listen(self) -> tuple[list[float], list[int]]:
+        """Arrival times and ticks of a while."""
+        arrivals: list[float] = []
+        ticks: list[int] = []
+        start = time.monotonic()
+        while not arrivals or time.monotonic() < arrivals[0] + LISTEN:
+            now = time.monotonic()
+            for data in self._dds.receive(self._reader)[-1:]:
+                if len(data) == hg.LowState.wire_size and hg.LowState.intact(data):
+                    arrivals.append(now)
+                    ticks.append(int(hg.LowState.view(data, "tick")[0]))
+            if now - start > CONNECT and not arrivals:
+                raise DriverError(
+                    f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
+                    f"{CONNECT:g} s. Is the robot on, the cable in, the interface right? A virtual "
+                    "one: gaponet virtual serve"
+                )
+            time.sleep(0.001)
+        return arrivals, ticks
+
+    def read(self) -> State:
+        """The newest state whose checksum is right; its time is the robot's, mapped to ours (TickClock)."""
+        self._drain()
+        assert self._state is not None
+        return self._state
+
+    def _drain(self) -> None:
+        now, newest = time.monotonic(), None
+        for data in self._dds.receive(self._reader):
+            if len(data) != hg.LowState.wire_size or not hg.LowState.intact(data):
+                self._refused += 1
+            else:
+                newest = data
+        if newest is not None:
+            self._state = self._decode(newest, now)
+        elif self._state is not None and self._refused != self._state.refused:
+            s = self._state
+            self._state = State(s.time, s.qpos, s.qvel, s.tau, s.temperature, self._refused)
+
+    def _decode(self, data: Array, now: float) -> State:
+        message, at = hg.LowState, self._motor
+        measured = self._clock.time(int(message.view(data, "tick")[0]), now)
+        self._machine = int(message.view(data, "mode_machine")[0])
+        self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
+        q, dq, tau = (message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est"))
+        temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)  # case and winding
+        return State(measured, q, dq, tau, temperature, self._refused)
+
+    def write(self, ctrl: Array, weight: float = 1.0) -> None:
+        """Targets with the robot's gains; on rt/arm_sdk the weight tells how far it hands over."""
+        self._send(ctrl, self.robot.kp, self.robot.kd, weight)
+
+    def damp(self, weight: float = 1.0) -> None:
+        """Stiffness zero and damping gains, no more than the effort limits allow at the present speed."""
+        state = self._state
+        qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
+        qvel = state.qvel if state else np.zeros(len(self._motor))
+        kd = damping(DAMPING * self.robot.kd, qvel, self.robot.effort_limit)
+        self._send(qpos, np.zeros_like(kd), kd, weight)
+
+    def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:
+        if self._bus is None:
+            return
+        motors, data = self._motor[self._at], self._command
+        for name, values in (("mode", np.ones(len(ctrl))), ("q", ctrl), ("kp", kp), ("kd", kd)):
+            column = np.zeros(hg.MOTORS)
+            column[motors] = values[self._at]
+            if name == "q" and self.topic == "arm_sdk":
+                column[WEIGHT_MOTOR] = weight
+            hg.LowCmd.set_motors(data, name, column)
+        hg.LowCmd.seal(data)
+        self._dds.send(self._writer, self._dds.LowCmd, data)
+
+    def close(self) -> None:
+        """Leave the bus; on rt/arm_sdk the last word is weight 0: the arms are the robot's own again."""
+        if self._bus is None:
+            return
+        with contextlib.suppress(DriverError):
+            self.damp(0.0)
+        self._bus = self._reader = self._writer = None  # type: ignore[assignment]
+
+    def guard(self) -> dict[str, object] | None:
+        """A second participant that is connected from the start and silent while the controller lives."""
+        return {
+            "kind": "unitree", "robot": str(self.robot.mjcf.parent), "early": True, "topic": self.topic,
+            "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
+        }  # fmt: skip
+
+
+class TickClock:
+    """Maps the robot's tick to this machine's monotonic clock, so that late messages are seen to be old.
+
+    The offset is the smallest (arrival − tick) seen, that is, the fastest way a message ever took; it may grow slowly,
+    in case the robot's clock is slower than ours.
+    """
+
+    def __init__(self, arrivals: list[float], ticks: list[int]) -> None:
+        passed = (arrivals[-1] - arrivals[0]) / max((ticks[-1] - ticks[0]) % 2**32, 1)
+        self.tick = next((t for t in TICKS if 0.7 < passed / t < 1.4), None)  # s; None: not a clock, use arrivals
+        self._last_tick, self._turns = ticks[0], 0
+        self._offset, self._at, self._time = np.inf, arrivals[0], arrivals[0]
+        for arrival, tick in zip(arrivals, ticks, strict=True):
+            self.time(tick, arrival)
+
+    def time(self, tick: int, arrival: float) -> float:
+        """When the state with this tick was measured, s, at most its arrival; the same again for the same tick."""
+        if tick == self._last_tick and np.isfinite(self._offset):
+            return self._time
+        if tick < self._last_tick - 2**31:
+            self._turns += 1
+        elif tick < self._last_tick:  # the robot started again: its clock is another one
+            self._offset = np.inf
+        self._last_tick = tick
+        if self.tick is None:
+            self._offset, self._time = 0.0, arrival
+            return arrival
+        robot = (tick + self._turns * 2**32) * self.tick
+        self._offset = min(arrival - robot, self._offset + DRIFT * max(arrival - self._at, 0.0))
+        self._at = arrival
+        self._time = robot + self._offset
+        return self._time

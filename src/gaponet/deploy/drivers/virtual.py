@@ -1,0 +1,139 @@
+"""VirtualDriver: a virtual robot in this process, in real time or as fast as the loop asks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gaponet.deploy.clock import Clock
+from gaponet.deploy.driver import DriverError, State
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import idle_joints
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.unit import VirtualRobot
+
+Array = np.ndarray
+
+STATE_PERIOD = 0.002  # s: a virtual robot speaks at 500 Hz, as the H1-2 does
+DAMPING = 4.0  # times the robot's kd while damping; see drivers.unitree
+LAG = 0.5  # s of real time that it may be behind before it gives up
+
+
+class LiveUnit:
+    """One virtual unit stepped in equal periods: what every virtual bus is built on. Knows no clock."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str],
+        start: Array | None = None,
+        seed: int = 0,
+        period: float = STATE_PERIOD,
+    ) -> None:
+        """
+        Args:
+            robot: The type.
+            physics: Of this unit.
+            payload: kg per hand, and side.
+            start: Where it stands, (n) rad; home by default.
+            seed: Of its noise.
+            period: Between two states, s.
+        """
+        self.robot, self.period = robot, period
+        locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
+        self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
+        self.ctrl = np.array(robot.qpos_home if start is None else start, float)
+        self.unit.reset(self.ctrl[None], [seed])
+        self.kp, self.kd = robot.kp, robot.kd
+        self.steps = 0
+
+    def set_gains(self, kp: Array, kd: Array) -> None:
+        """(n) N·m/rad and N·m·s/rad, if they differ from those that hold."""
+        if not (np.array_equal(kp, self.kp) and np.array_equal(kd, self.kd)):
+            self.kp, self.kd = np.array(kp, float), np.array(kd, float)
+            self.unit.set_gains(self.kp, self.kd)
+
+    def step(self) -> None:
+        """Let one period pass under the present command and gains."""
+        self.unit.step(self.ctrl[None])
+        self.steps += 1
+
+    def read(self) -> tuple[Array, Array, Array, Array]:
+        """qpos, qvel, tau, temperature as the sensors say, (n) each."""
+        reading = self.unit.read()
+        return reading.qpos[0], reading.qvel[0], reading.tau[0], reading.temperature[0]
+
+
+class VirtualDriver:
+    """A `Driver` whose robot lives in this process and ages with the controller's clock."""
+
+    virtual = True
+    noisy = True
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        clock: Clock,
+        payload: tuple[float, str] = (0.0, "both"),
+        name: str = "unit",
+        start: Array | None = None,
+        seed: int = 0,
+        period: float = STATE_PERIOD,
+    ) -> None:
+        """
+        Args:
+            robot: The type.
+            physics: Hidden parameters (virtual.fleet).
+            clock: The controller's.
+            payload: kg per hand, and side.
+            name: Of the unit, for the lock: each is one robot.
+            start: Where it stands at first, (n) rad.
+            seed: Of its noise.
+            period: Between two states, s.
+        """
+        self.address = f"virtual {robot.name} {name}"
+        self.joint_names = robot.joint_names
+        self.clock, self._given = clock, (robot, physics, payload, start, seed, period)
+        self.period = period
+        locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
+        self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
+        self._at = robot.index(self.commanded)
+
+    def connect(self) -> None:
+        """Wake it up."""
+        self.live = LiveUnit(*self._given)
+        self._begun = self.clock.now()
+        self._state = self._sense()
+
+    def read(self) -> State:
+        """Let it live until now."""
+        due = int((self.clock.now() - self._begun) / self.period + 1e-6)
+        if (due - self.live.steps) * self.period > LAG:
+            raise DriverError(f"{self.address}: this machine cannot simulate it in real time; run without real time")
+        if due > self.live.steps:
+            while self.live.steps < due:
+                self.live.step()
+            self._state = self._sense()
+        return self._state
+
+    def _sense(self) -> State:
+        return State(self._begun + self.live.steps * self.period, *self.live.read())
+
+    def write(self, ctrl: Array, weight: float = 1.0) -> None:
+        """Takes effect after the unit's own command delay."""
+        self.live.set_gains(self.live.robot.kp, self.live.robot.kd)
+        self.live.ctrl[self._at] = ctrl[self._at]
+
+    def damp(self, weight: float = 1.0) -> None:
+        """Stiffness zero, damping four times the robot's, on the commanded joints."""
+        kp, kd = self.live.robot.kp.copy(), self.live.robot.kd.copy()
+        kp[self._at], kd[self._at] = 0.0, DAMPING * kd[self._at]
+        self.live.set_gains(kp, kd)
+
+    def close(self) -> None:
+        """Nothing is left: the robot ends with the process."""
+
+    def guard(self) -> None:
+        """It dies with the controller's process."""
+        return None

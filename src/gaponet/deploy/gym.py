@@ -1,0 +1,94 @@
+"""gymnasium: an environment on AlignedSim, and a wrapper that aligns a MuJoCo environment of one's own.
+
+Needs gymnasium: pip install "gaponet[gym]".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.errors import UsageError
+from gaponet.model.artifact import GapModel
+
+Array = np.ndarray
+
+
+class TrackingEnv(gymnasium.Env):
+    """Follow joint motions on the aligned simulator.
+
+    Observation [q | q̇ | r_t+1 − q | r_t+2 − q … ], float32, of the operated joints, r the reference. Action in [−1, 1]:
+    offset of the target from r_t+1, times `reach`. Reward −mean (q − r)² / 0.01 after the step, so −1 is 0.1 rad.
+    """
+
+    def __init__(
+        self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
+    ) -> None:
+        """
+        Args:
+            sim: One simulation (num_envs None).
+            references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
+            reach: What an action of 1 adds, rad.
+            preview: Rows of the reference that are seen.
+            seed: Of the choice of motion and start.
+        """
+        if not sim.single or not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
+            raise UsageError(f"TrackingEnv needs one simulation and motions (T, {sim.n}) of at least 3 rows")
+        self.sim, self.references, self.reach, self.preview = sim, list(references), reach, preview
+        n = len(sim.op)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, ((2 + preview) * n,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n,), np.float32)
+        self.np_random = np.random.default_rng(seed)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """A motion from its first row; options may name it: {"motion": 3}."""
+        super().reset(seed=seed)
+        choice = (options or {}).get("motion")
+        self.motion = int(self.np_random.integers(len(self.references))) if choice is None else int(choice)
+        self.reference, self.t = self.references[self.motion], 0
+        self.sim.reset(self.reference[0])
+        return self._observe(), {"motion": self.motion}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """One control period; a motion's end truncates, nothing terminates."""
+        op = self.sim.op
+        target = self._row(1).copy()
+        target[op] += self.reach * np.clip(action, -1.0, 1.0)
+        self.sim.step(target)
+        self.t += 1
+        error = self.sim.qpos[op] - self._row(0)[op]
+        info = {"error": error, "delta": self.sim.delta}
+        return self._observe(), -float(np.mean(error**2)) / 0.01, False, self.t >= len(self.reference) - 2, info
+
+    def _row(self, ahead: int) -> Array:
+        return self.reference[min(self.t + ahead, len(self.reference) - 1)]
+
+    def _observe(self) -> Array:
+        op = self.sim.op
+        q = self.sim.qpos[op]
+        ahead = [self._row(k)[op] - q for k in range(1, self.preview + 1)]
+        return np.concatenate([q, self.sim.qvel[op], *ahead]).astype(np.float32)
+
+
+class AlignedActions(gymnasium.Wrapper):
+    """Any gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad: aligned."""
+
+    def __init__(self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "") -> None:
+        """Refuses other gains, joints or rates, as deploy.mujoco_loop does."""
+        super().__init__(env)
+        scene: Any = env.unwrapped
+        self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix)
+
+    def reset(self, **how: Any) -> tuple[Any, dict[str, Any]]:
+        """Another episode."""
+        self.align.reset()
+        return self.env.reset(**how)
+
+    def step(self, action: Any) -> Any:
+        """The action, corrected."""
+        return self.env.step(self.align(self.env.unwrapped.data, action))  # type: ignore[attr-defined]

@@ -1,0 +1,96 @@
+"""The network at run time: onnxruntime or plain numpy, by call or on buffers that are made once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from gaponet.errors import ModelError
+from gaponet.model.fused import FusedForward, read_weights
+
+Array = np.ndarray
+Backend = Literal["onnxruntime", "numpy"]
+
+
+@dataclass(frozen=True)
+class Bound:
+    """One batch size's buffers: write x, (B, dim) float32, call run, read delta, (B, n) float32."""
+
+    x: Array
+    delta: Array
+    run: Callable[[], object]
+
+
+class Network(Protocol):
+    """[o_t | a_t] → Δa."""
+
+    def __call__(self, x: Array) -> Array:
+        """x (B, dim) float32 → Δa (B, n) rad, a new array."""
+
+    def bind(self, batch: int) -> Bound:
+        """Buffers for `batch` rows; run() allocates nothing of Python's."""
+
+
+class OnnxNetwork:
+    """An ONNX file on onnxruntime."""
+
+    def __init__(self, path: Path, threads: int = 1, output: str = "delta") -> None:
+        """threads 0 uses all cores; one is quickest for one robot. Models with learned points also have "offsets"."""
+        self.output = output
+        try:
+            import onnxruntime as ort
+            from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
+        except ImportError:
+            raise ModelError(
+                "onnxruntime is not installed; run: pip install 'gaponet[deploy]', or load with backend='numpy'"
+            ) from None
+        options = ort.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        options.log_severity_level = 3
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the core alone
+        damaged = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.Fail, ort_errors.NoSuchFile)
+        try:
+            self.session: Any = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except damaged as error:
+            raise ModelError(
+                f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
+            ) from None
+        self.value = ort.OrtValue.ortvalue_from_numpy  # on the CPU it shares the array's memory
+
+    def __call__(self, x: Array) -> Array:
+        return self.session.run([self.output], {"x": x})[0]
+
+    def bind(self, batch: int) -> Bound:
+        x = np.zeros((batch, self.session.get_inputs()[0].shape[1]), np.float32)
+        delta = np.zeros((batch, self(x).shape[1]), np.float32)
+        binding, session = self.session.io_binding(), self.session
+        binding.bind_ortvalue_input("x", self.value(x))
+        binding.bind_ortvalue_output(self.output, self.value(delta))
+        return Bound(x, delta, lambda: session.run_with_iobinding(binding))
+
+
+class NumpyNetwork:
+    """The weights of an artifact on numpy alone: for machines without onnxruntime, and to check it."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise ModelError(
+                f"{path}: missing: this artifact was written without it, or its kind of network has no numpy form; "
+                "write it with gaponet export RUN, or load with backend='onnxruntime'"
+            )
+        self.weights = read_weights(path)
+        self._made: dict[int, FusedForward] = {}
+
+    def __call__(self, x: Array) -> Array:
+        if len(x) not in self._made:
+            self._made = {len(x): FusedForward(self.weights, len(x))}
+        return self._made[len(x)](x).copy()
+
+    def bind(self, batch: int) -> Bound:
+        forward = FusedForward(self.weights, batch)
+        x = np.zeros((batch, self.weights["relative"].shape[0]), np.float32)
+        return Bound(x, forward.delta, lambda: forward(x))

@@ -1,0 +1,205 @@
+"""A trained network as the few products that run; see model/fused.py."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gaponet.model.baselines.mlp import DeltaMLP
+from gaponet.model.deeponet import OperatorNet
+from gaponet.model.fused import CLAMP
+
+Array = np.ndarray
+Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out) or one for each joint (n, out)
+
+
+def fuse(net: nn.Module) -> dict[str, Array] | None:
+    """Weights of the fused form, float32; None for a kind of network that has none.
+
+    Computed in double precision, so that what is multiplied out here costs no accuracy.
+    """
+    if type(net) is DeltaMLP:
+        weights = _mlp(net)
+    elif type(net) is OperatorNet and _plain(net):
+        weights = (_joint if net.per_joint else _full)(net)
+    else:
+        return None
+    return {
+        k: v if v.dtype.kind == "U" else np.ascontiguousarray(v, np.float32) for k, v in weights.items()
+    }  # fmt: skip
+
+
+def _plain(net: OperatorNet) -> bool:
+    """Whether the operator is made of the parts that this file knows, and of nothing else."""
+    c = net.config
+    if c.branch != "unstacked" or c.asks_simulator or c.keeps_observation:
+        return False
+    if c.payload_input and not (c.payload_trunk and c.payload_predictor):
+        return False
+    parts = {name.split(".")[0] for name in net.state_dict()}
+    return parts <= {"features", "predictor", "branch", "trunk", "bias", "bounded"}
+
+
+def _mlp(net: DeltaMLP) -> dict[str, Array]:
+    weights = _features(net, np.arange(net.features.dim))
+    return weights | _name("trunk", _scaled(dense_layers(net.net), net)) | {
+        "kind": np.array("mlp"), "bias": np.zeros(net.n)
+    }  # fmt: skip
+
+
+def _full(net: OperatorNet) -> dict[str, Array]:
+    n, dim = net.n, net.features.dim
+    weights = _features(net, np.arange(dim))
+    branch, trunk = dense_layers(_sequential(net.branch)), dense_layers(net.trunk)
+    w, b = branch[0]
+    predictor: Layers = []
+    sensed = net.config.sensor_dim(n) if net.predictor is not None else 0
+    parts = []
+    if net.predictor is not None:
+        *predictor, (last, last_bias) = dense_layers(net.predictor.net)
+        predictor[0] = (_rows(predictor[0][0], np.arange(dim - n), dim), predictor[0][1])
+        parts.append(last[:, :sensed] @ w[:sensed])
+        b = b + last_bias[:sensed] @ w[:sensed]
+    seen = w[sensed:] if net.sees_observation else np.zeros((dim - n, w.shape[1]))
+    parts.append(_rows(seen, np.arange(dim - n), dim))
+    branch[0] = (np.concatenate(parts), b)
+    asked = [*range(n), *range(dim - n, dim), *([dim - n - 1] if net.config.payload_input else [])]
+    trunk[0] = (_rows(trunk[0][0], np.array(asked), dim), trunk[0][1])
+    weights |= _name("predictor", predictor) | _name("branch", branch) | _name("trunk", _scaled(trunk, net))
+    return weights | {"kind": np.array("full"), "bias": _bias(net)}
+
+
+def _joint(net: OperatorNet) -> dict[str, Array]:
+    n, dim, config = net.n, net.features.dim, net.config
+    depth, payload = 2 + 3 * config.history, int(config.payload_input)
+    width = depth + payload + 1
+    own = np.arange(depth) * n  # columns of joint 0; those of joint j are j further on
+    columns = np.concatenate(
+        [np.concatenate([own + j, np.full(payload, depth * n), [dim - n + j]]) for j in range(n)]
+    ).astype(int)
+    weights = _features(net, columns)
+    branch, trunk = dense_layers(_sequential(net.branch)), dense_layers(net.trunk)
+    predictor: Layers = []
+    (w, b), sensed = branch[0], 0
+    parts = []
+    if net.predictor is not None:
+        predictor = dense_layers(net.predictor.net)
+        first = np.zeros((len(columns), predictor[0][0].shape[1]))
+        at = np.arange(n)[:, None] * width + np.arange(depth)
+        first[at.ravel()] = predictor[0][0][columns[at.ravel()]]
+        if payload:
+            first[depth] = predictor[0][0][depth * n]  # its first copy
+        predictor[0] = (first, predictor[0][1])
+        sensed = 2 * config.num_probes
+        order = (np.arange(sensed)[None, :] * n + np.arange(n)[:, None]).ravel()  # joint by joint
+        predictor[-1] = (predictor[-1][0][:, order], predictor[-1][1][order])
+        parts.append(w[n : n + sensed])
+    seen = w[n + sensed :] if net.sees_observation else np.zeros((depth + payload, w.shape[1]))
+    parts.append(_rows(seen, np.arange(depth + payload), width))
+    branch[0] = (np.concatenate(parts), w[:n] + b)
+    w, b = trunk[0]
+    asked = np.array([width - 1] + [width - 2] * payload)
+    trunk[0] = (_rows(w[n:], asked, width), w[:n] + b)
+    weights |= _name("predictor", predictor) | _name("branch", branch) | _name("trunk", _scaled(trunk, net))
+    return weights | {"kind": np.array("joint"), "bias": _bias(net)}
+
+
+def _features(net: OperatorNet | DeltaMLP, columns: Array) -> dict[str, Array]:
+    """R, mean and 1/std of the features in the given order, which may name one twice."""
+    features = net.features
+    relative = features.relative(torch.eye(features.dim)).numpy()
+    mean, std = (v.double().numpy()[columns] for v in (features.standardise.mean, features.standardise.std))
+    return {"relative": relative[:, columns], "mean": mean, "scale": 1.0 / std, "delta_max": np.array(_limit(net))}
+
+
+def _sequential(net: nn.Module) -> nn.Sequential:
+    """An unstacked branch."""
+    assert isinstance(net, nn.Sequential)
+    return net
+
+
+def dense_layers(net: nn.Sequential) -> Layers:
+    """Weights (in, out) and biases of Linear layers with ELU between, double precision."""
+    linear = [m for m in net if isinstance(m, nn.Linear)]
+    return [(m.weight.detach().double().numpy().T, m.bias.detach().double().numpy()) for m in linear]
+
+
+def _rows(weight: Array, where: Array, rows: int) -> Array:
+    """A first layer that is fed all of z but looks at `where` only."""
+    out = np.zeros((rows, weight.shape[1]))
+    out[where] = weight
+    return out
+
+
+def _limit(net: OperatorNet | DeltaMLP) -> float:
+    return float(net.bounded.delta_max)
+
+
+def _scaled(layers: Layers, net: OperatorNet | DeltaMLP) -> Layers:
+    """The last layer in units of Δ_max / gain."""
+    weight, bias = layers[-1]
+    factor = float(net.bounded.gain) / _limit(net)
+    return [*layers[:-1], (weight * factor, bias * factor)]
+
+
+def _bias(net: OperatorNet) -> Array:
+    return net.bias.detach().double().numpy() * float(net.bounded.gain) / _limit(net)
+
+
+def _name(part: str, layers: Layers) -> dict[str, Array]:
+    return {
+        f"{part}.{i}.{k}": v for i, pair in enumerate(layers) for k, v in zip(("weight", "bias"), pair, strict=True)
+    }
+
+
+class FusedNet(nn.Module):
+    """The fused form in torch, for the exporters: x (B, dim) → Δa (B, n). All shapes but B are constants."""
+
+    relative: Tensor
+    mean: Tensor
+    scale: Tensor
+    bias: Tensor
+    total: Tensor
+    delta_max: Tensor
+
+    def __init__(self, weights: dict[str, Array]) -> None:
+        super().__init__()
+        self.kind, self.n = str(weights["kind"]), len(weights["bias"])
+        counts = {p: sum(k.startswith(p + ".") for k in weights) // 2 for p in ("predictor", "branch", "trunk")}
+        self.predictor, self.branch, self.trunk = (range(counts[p]) for p in ("predictor", "branch", "trunk"))
+        self.width = weights["relative"].shape[1] // (self.n if self.kind == "joint" else 1)  # of z as rows
+        self.sensed = weights["branch.0.weight"].shape[0] - self.width if self.branch else 0
+        for name, value in weights.items():
+            if name != "kind":
+                value = value.T if name.endswith(".weight") or name == "relative" else value
+                self.register_buffer(name.replace(".", "_"), torch.from_numpy(np.ascontiguousarray(value)))
+        basis = weights[f"trunk.{len(self.trunk) - 1}.weight"].shape[1] // (1 if self.kind == "joint" else self.n)
+        self.register_buffer("total", torch.eye(self.n).repeat_interleave(basis, dim=1))  # Σ over a joint's basis
+
+    def layers(self, part: str, x: Tensor, last_elu: bool = False) -> Tensor:
+        """The same as fused.Dense."""
+        indices = getattr(self, part)
+        for i in indices:
+            weight, bias = getattr(self, f"{part}_{i}_weight"), getattr(self, f"{part}_{i}_bias")
+            if bias.dim() == 2:
+                n, width = bias.shape
+                x = (nn.functional.linear(x, weight).reshape(-1, n, width) + bias).reshape(-1, width)
+            else:
+                x = nn.functional.linear(x, weight, bias)
+            x = nn.functional.elu(x) if last_elu or i < len(indices) - 1 else x
+        return x
+
+    def forward(self, x: Tensor) -> Tensor:
+        z = nn.functional.linear(x, self.relative, -self.mean)
+        z = (z * self.scale).clamp(-CLAMP, CLAMP)
+        rows = z.reshape(-1, self.width) if self.kind == "joint" else z
+        y = self.layers("trunk", rows)
+        if self.branch:
+            see = rows
+            if self.predictor:
+                sensed = self.layers("predictor", z, last_elu=self.kind == "full")
+                see = torch.cat([sensed.reshape(-1, self.sensed) if self.kind == "joint" else sensed, rows], dim=1)
+            y = self.layers("branch", see) * y
+            y = nn.functional.linear(y.reshape(-1, self.total.shape[1]), self.total, self.bias)
+        return torch.tanh(y) * self.delta_max

@@ -1,0 +1,130 @@
+"""What every network here is made of: dense layers, the features of x, the bound on Δa, and the form they share.
+
+All take x = [o_t | a_t | more] (model/observation.py) and return Δa_t; normalisers are buffers inside, so the exported
+file needs nothing beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gaponet.model.config import ModelConfig
+from gaponet.model.observation import Layout
+
+
+def dense(inputs: int, hidden: Sequence[int], outputs: int, zero: bool = False) -> nn.Sequential:
+    """Linear layers with ELU between; with `zero` it starts by answering 0."""
+    layers: list[nn.Module] = []
+    for width in hidden:
+        layers += [nn.Linear(inputs, width), nn.ELU()]
+        inputs = width
+    head = nn.Linear(inputs, outputs)
+    if zero:
+        nn.init.zeros_(head.weight)
+        nn.init.zeros_(head.bias)
+    return nn.Sequential(*layers, head)
+
+
+def size(net: nn.Module) -> int:
+    """Number of parameters."""
+    return sum(p.numel() for p in net.parameters())
+
+
+class Standardise(nn.Module):
+    """(x − mean) / std with statistics of the training set; std has a floor so that a constant input stays harmless."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("std", torch.ones(dim))
+
+    def fit(self, x: Tensor, floor: float = 1e-4) -> None:
+        """Take mean and std from samples, (N, dim)."""
+        self.mean.copy_(x.mean(0))
+        self.std.copy_(x.std(0).clamp_min(floor))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self.mean) / self.std
+
+
+class Features(nn.Module):
+    """[o_t | a_t] with history and action expressed relative to the present position, then standardised.
+
+    A lag of 10 mrad is invisible in absolute joint angles that span a radian; relative to q_t it is the signal.
+    """
+
+    def __init__(self, config: ModelConfig, n: int) -> None:
+        super().__init__()
+        self.n, self.history = n, config.history
+        self.layout = Layout(config, n)
+        self.dim = self.layout.query.stop
+        self.standardise = Standardise(self.dim)
+
+    def relative(self, x: Tensor) -> Tensor:
+        """(B, dim of x) → (B, dim): positions and targets of the past, and a_t, minus q_t."""
+        at = self.layout
+        return self._relative(x[:, at.observation], x[:, at.action])
+
+    def _relative(self, o: Tensor, action: Tensor) -> Tensor:
+        n, at = self.n, self.layout
+        q = o[:, at.q]
+        frames = o[:, at.past].reshape(-1, self.history, 3, n)
+        shift = torch.stack([q, torch.zeros_like(q), q], dim=1).unsqueeze(1)  # (B, 1, 3, n)
+        return torch.cat([o[:, at.state], (frames - shift).flatten(1), o[:, at.payload], action - q], dim=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
+        return self.standardise(self.relative(x)).clamp(-5.0, 5.0)
+
+    def at_refresh(self, x: Tensor) -> Tensor:
+        """The features as they were when the sensors were last refreshed; the action's columns mean nothing."""
+        relative = self._relative(x[:, self.layout.refresh], x[:, self.layout.action])
+        return self.standardise(relative).clamp(-5.0, 5.0)
+
+    def joint_wise(self, z: Tensor) -> Tensor:
+        """State and past of each joint, (B, dim) → (B, n, 2 + 3H)."""
+        return z[:, : self.layout.past.stop].reshape(-1, 2 + 3 * self.history, self.n).transpose(1, 2)
+
+
+class Bounded(nn.Module):
+    """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
+
+    The gain is 1 while training; train/gain.py lowers it where less of a correction does better.
+    """
+
+    gain: Tensor
+
+    def __init__(self, delta_max: float) -> None:
+        super().__init__()
+        self.delta_max = delta_max
+        self.register_buffer("gain", torch.tensor(1.0))
+
+    def forward(self, y: Tensor) -> Tensor:
+        return self.delta_max * torch.tanh(self.gain * y / self.delta_max)
+
+
+class DeltaNet(nn.Module):
+    """A network that corrects: x = [o_t | a_t | more] → Δa, (B, n) rad, within ±Δ_max."""
+
+    predictor: Any
+    """A network that answers in the simulator's place: fitted before all else (train/sensor_fit.py), then frozen."""
+    sample_sensors: bool
+    """True while supervised fitting asks it."""
+
+    def __init__(self, config: ModelConfig, n: int) -> None:
+        super().__init__()
+        self.config, self.n = config, n
+        self.features = Features(config, n)
+        self.bounded = Bounded(config.delta_max)
+        self.predictor, self.sample_sensors = None, False
+
+    def fit_inputs(self, x: Tensor) -> None:
+        """Take the statistics of inputs from samples of x."""
+        self.features.standardise.fit(self.features.relative(x))

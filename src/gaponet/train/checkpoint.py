@@ -1,0 +1,89 @@
+"""What a run must remember to go on as if it had never stopped, bit for bit: tensors, numbers, text; no pickled code.
+
+Networks and optimisers keep themselves; here is the rest: random numbers, environments in mid-motion, and the warm
+start's pool. The pool is hundreds of megabytes and follows from the networks that collected it, so those are kept and
+roll out again.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import torch
+
+from gaponet.train.env import DeltaEnv
+from gaponet.train.warm_start import WarmStart
+
+State = dict[str, Any]
+ROWS = ("row", "first", "last", "previous", "now")  # of each environment
+
+
+def rng_text(rng: np.random.Generator) -> str:
+    """State of a generator; its integers have 128 bits."""
+    return json.dumps(rng.bit_generator.state)
+
+
+def set_rng(rng: np.random.Generator, text: str) -> None:
+    """Undo rng_text."""
+    rng.bit_generator.state = json.loads(text)
+
+
+def env_state(env: DeltaEnv) -> State:
+    """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
+    arrays = {name: getattr(env, name) for name in ROWS} | _inputs(env) | env.sim.state()
+    return {
+        "arrays": {name: torch.from_numpy(np.array(x)) for name, x in arrays.items()},
+        "episode_length": env.episode_length_buf.clone(),
+        "reward": (env.reward_sum, env.reward_count),
+        "rng": rng_text(env.rng),
+    }
+
+
+def _inputs(env: DeltaEnv) -> dict[str, np.ndarray]:
+    """What the next observation remembers."""
+    return {"frames": env.inputs.history.frames, "age": env.inputs.age, "more": env.inputs.more}
+
+
+def restore_env(env: DeltaEnv, state: State) -> None:
+    """Undo env_state in an environment made alike."""
+    arrays = {name: x.numpy() for name, x in state["arrays"].items()}
+    for name in ROWS:
+        getattr(env, name)[:] = arrays[name]
+    for name, x in _inputs(env).items():
+        x[:] = arrays[name]
+    env.sim.set_state(arrays)
+    env.episode_length_buf[:] = state["episode_length"]
+    env.reward_sum, env.reward_count = state["reward"]
+    set_rng(env.rng, state["rng"])
+
+
+def round_state(warm: WarmStart) -> State:
+    """What the next round's roll-outs follow from."""
+    net = {name: x.clone() for name, x in warm.net.state_dict().items()}
+    return {"net": net, "rng": rng_text(warm.env.rng)}
+
+
+def warm_state(warm: WarmStart, rounds: list[State]) -> State:
+    """A warm start between rounds; `rounds`: round_state before each of them."""
+    return {
+        "rounds": rounds,
+        "optimiser": warm.optimiser.state_dict(),
+        "generator": warm.generator.get_state(),
+        "env_rng": rng_text(warm.env.rng),
+    }
+
+
+def restore_warm(warm: WarmStart, state: State) -> None:
+    """Roll the past rounds out again, then undo warm_state; the network is left as it is."""
+    present = {name: x.clone() for name, x in warm.net.state_dict().items()}
+    for i, before in enumerate(state["rounds"]):
+        warm.net.load_state_dict(before["net"])
+        set_rng(warm.env.rng, before["rng"])
+        warm.collect(follow_labels=i == 0)
+    warm.net.load_state_dict(present)
+    warm.optimiser.load_state_dict(state["optimiser"])
+    warm.generator.set_state(state["generator"])
+    set_rng(warm.env.rng, state["env_rng"])
+    warm.done = len(state["rounds"])

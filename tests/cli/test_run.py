@@ -1,0 +1,74 @@
+"""gaponet run and record on a virtual robot in this process, as fast as it goes."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+from arm import commands
+
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.motion.files import write_motion
+from gaponet.motion.motion import Motion
+
+FAST = ["--fast", "--yes", "--json", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
+
+
+@pytest.fixture
+def motion(arm, tmp_path):
+    path = tmp_path / "sway.npz"
+    write_motion(path, Motion("sway", "whole_body", 0.02, commands(30, seed=1)), arm)
+    return str(path)
+
+
+def test_record_makes_a_dataset_with_unit_payload_and_gains(arm, motion, tmp_path, capsys):
+    out = tmp_path / "set"
+    command = ["record", "--motion", motion, "--out", str(out), "--unit-id", "4", "--payload-mass", "0.1"]
+    command += ["--robot", str(arm.mjcf.parent), "--payload-side", "hand", "--repetitions", "2", *FAST]
+    assert main(command) == 0
+    result = json.loads(capsys.readouterr().out)
+    data = Dataset(out)
+    assert len(data) == 2
+    assert result["written"] == [e.id for e in data.entries]
+    first, second = data.entries
+    assert (first.meta.unit_id, first.meta.payload_mass, first.meta.virtual) == ("virtual-4", 0.1, True)
+    assert (first.meta.repetition, second.meta.repetition) == (0, 1)
+    assert first.meta.notes["controller"]["kp"] == arm.kp.tolist()
+    sequence = data.read(first)
+    assert sequence.dt == 0.02
+    assert np.abs(sequence.qpos - sequence.ctrl).max() < 0.3
+    assert (out / first.meta.source).is_file()
+
+
+def test_a_stopped_run_says_so_and_is_not_added(arm, motion, tmp_path, capsys):
+    out = tmp_path / "set"
+    command = ["record", "--motion", motion, "--out", str(out), "--unit-id", "4", "--payload-mass", "0"]
+    command += ["--robot", str(arm.mjcf.parent), *FAST, "--safety.temperature", "20"]
+    assert main(command) == 2
+    assert "it was not added" in capsys.readouterr().err
+    assert len(Dataset(out)) == 0
+
+
+def test_a_motion_of_legs_is_refused_before_anything_is_opened(tmp_path, capsys):
+    from gaponet.robot import load_robot
+
+    robot = load_robot("h1_2")
+    ctrl = np.repeat(robot.qpos_home[None], 20, axis=0)
+    ctrl[:, robot.index(["left_knee_joint"])] = np.linspace(0, 0.1, 20)[:, None]
+    write_motion(tmp_path / "knee.npz", Motion("knee", "joint", 0.02, ctrl), robot)
+    assert main(["run", "--driver", "unitree", "--motion", str(tmp_path / "knee.npz"), "--yes"]) == 2
+    assert "moves left_knee_joint, which unitree dds domain 0 does not command" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+def test_a_real_robot_is_not_moved_without_asking(arm, tmp_path, capsys, monkeypatch):
+    from gaponet.robot import load_robot
+
+    robot = load_robot("h1_2")
+    ctrl = np.repeat(robot.qpos_home[None], 20, axis=0)
+    write_motion(tmp_path / "still.npz", Motion("still", "joint", 0.02, ctrl), robot)
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert main(["run", "--driver", "unitree", "--motion", str(tmp_path / "still.npz")]) == 2
+    assert "no terminal to ask on" in capsys.readouterr().err

@@ -1,0 +1,121 @@
+"""The aligned simulator is the replay with the model's corrector, whichever way it is stepped."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from arm import TOML, commands, recordings, write_arm
+
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.errors import ModelError, UsageError
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import drawn_states, export
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import replay
+
+CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+
+
+def small_model(robot, folder):
+    """A model that corrects by some ten mrad."""
+    torch.manual_seed(0)
+    net = build_network(CONFIG, len(robot.operated))
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    export(net, folder, make_card(CONFIG, robot, dt=[robot.dt]), drawn_states(net))
+    return GapModel.load(folder)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def model(robot, tmp_path_factory):
+    return small_model(robot, tmp_path_factory.mktemp("run") / "model")
+
+
+def test_it_is_the_replay_with_the_corrector(robot, model):
+    sequences = recordings(robot, 3, rows=40, kp=0.7)
+    twins = replay(sequences, robot, model.corrector(robot))
+    sim = AlignedSim(robot, model, np.array([s.meta.payload_mass for s in sequences]), num_envs=3)
+    sim.reset(*(np.stack([getattr(s, name)[0] for s in sequences]) for name in ("qpos", "qvel")))
+    for t in range(39):
+        sim.step(np.stack([s.ctrl[t] for s in sequences]))
+        np.testing.assert_allclose(
+            sim.delta, np.stack([w.ctrl[t] - s.ctrl[t] for w, s in zip(twins, sequences, strict=True)]), atol=1e-6
+        )
+        np.testing.assert_allclose(sim.qpos, np.stack([w.qpos[t + 1] for w in twins]), atol=1e-6)
+    assert np.abs(sim.delta).max() > 1e-3
+
+
+def test_one_simulation_takes_flat_arrays(robot, model):
+    one, two = AlignedSim(robot, model, 0.2), AlignedSim(robot, model, 0.2, num_envs=2)
+    for target in commands(20, 0):
+        one.step(target)
+        two.step(np.stack([target, target]))
+    assert one.qpos.shape == one.qvel.shape == one.delta.shape == (2,)
+    np.testing.assert_allclose(two.qpos, np.stack([one.qpos, one.qpos]), atol=1e-6)
+
+
+def test_one_of_several_begins_anew(robot, model):
+    sim, fresh = AlignedSim(robot, model, num_envs=2), AlignedSim(robot, model)
+    for target in commands(15, 0):
+        sim.step(target)
+    sim.reset(np.array([[0.1, -0.1]]), ids=np.array([1]))
+    fresh.reset(np.array([0.1, -0.1]))
+    for target in commands(15, 1):
+        sim.step(target)
+        fresh.step(target)
+    np.testing.assert_allclose(sim.qpos[1], fresh.qpos, atol=1e-6)
+
+
+def test_late_servos_follow_the_target_in_force_at_the_start(robot, tmp_path):
+    late = replace(robot, delay=[0.05, 0.0])
+    model = small_model(late, tmp_path)
+    sequences = recordings(robot, 1, rows=20)
+    twin = replay(sequences, late, model.corrector(late))[0]
+    sim = AlignedSim(late, model)
+    sim.reset(sequences[0].qpos[0], sequences[0].qvel[0], sequences[0].ctrl[0])
+    for t in range(19):
+        sim.step(sequences[0].ctrl[t])
+    np.testing.assert_allclose(sim.qpos, twin.qpos[-1], atol=1e-6)
+
+
+def test_a_mujoco_loop_of_ones_own_is_aligned_by_one_call_a_period(robot, model):
+    mj_model = build_model(robot, 0.2)
+    data, align, sim = mujoco.MjData(mj_model), MujocoAligner(model, mj_model, 0.02, 0.2), AlignedSim(robot, model, 0.2)
+    for _ in range(2):
+        mujoco.mj_resetData(mj_model, data)
+        align.reset()
+        sim.reset()
+        for target in commands(25, 3):
+            data.ctrl[:] = align(data, target)
+            mujoco.mj_step(mj_model, data, robot.decimation)
+            sim.step(target)
+        np.testing.assert_allclose(data.qpos, sim.qpos, atol=1e-6)
+
+
+def test_what_the_model_was_not_trained_for_is_refused(robot, model, tmp_path):
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 100\.0 Hz"):
+        AlignedSim(robot, model, dt=0.01)
+    with pytest.raises(ModelError, match="gains or limits changed"):
+        AlignedSim(write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0")), model)
+    with pytest.raises(UsageError, match="'elbow' is corrected by the model and cannot be locked"):
+        AlignedSim(robot, model, locked=("elbow",))
+
+
+def test_a_scene_that_does_not_fit_is_refused(robot, model):
+    mj_model = build_model(robot)
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz"):
+        MujocoAligner(model, mj_model, 0.01, 0.0)
+    with pytest.raises(ModelError, match="corrects joint 'left/shoulder', the scene has shoulder, elbow"):
+        MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
+    mj_model.actuator_gainprm[1, 0] = 25.0
+    with pytest.raises(ModelError, match="joint 'elbow': kp is 25 in the scene, the model was trained with 20"):
+        MujocoAligner(model, mj_model, 0.02, 0.0)

@@ -1,0 +1,225 @@
+"""The compensator on an arm with weak, late servos: it follows, and stays calm whatever happens."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import TOML, XML, commands, write_arm
+
+from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.errors import UsageError
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.backends import Bound
+from gaponet.model.config import ModelConfig
+from gaponet.sim.batch import BatchSim
+
+CONFIG = ModelConfig(history=2, payload_max=0.4)
+WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
+NOW = CompensatorConfig(blend=0.0)
+
+
+class Exact:
+    """The operator of that arm in closed form, in the place of a network."""
+
+    def __call__(self, x):
+        return ((WEAK - 1.0) * (x[:, -2:] - x[:, :2])).astype(np.float32)
+
+    def bind(self, batch):
+        x, delta = np.zeros((batch, CONFIG.observation_dim(2) + 2), np.float32), np.zeros((batch, 2), np.float32)
+        return Bound(x, delta, lambda: np.copyto(delta, self(x)))
+
+
+class WeakArm:
+    """The robot: weak servos, commands `late` periods under way and sometimes lost, a payload that may change."""
+
+    masses = (0.0, 0.4)
+
+    def __init__(self, robot, payload=0.0, late=0, lost=0.0, seed=0):
+        weak = replace(robot, kp=WEAK * robot.kp)
+        self.sim = BatchSim(weak, [(m, "both", robot.dt) for m in (payload, *self.masses)], 1)
+        self.late, self.lost, self.rng = late, lost, np.random.default_rng(seed)
+
+    def start(self, qpos):
+        self.sim.reset(slice(None), np.tile(qpos, (3, 1)), 0.0)
+        self.sent = [np.array(qpos)] * (self.late + 1)
+        for _ in range(200):
+            self.step(np.array(qpos))
+
+    def load(self, heavy):
+        for field in self.sim.fields.values():
+            field[0] = field[1 + heavy]
+
+    def step(self, u):
+        self.sent.append(self.sent[-1] if self.rng.random() < self.lost else u)
+        self.sim.step(np.tile(self.sent[-1 - self.late], (3, 1)))
+
+    @property
+    def qpos(self):
+        return self.sim.qpos[0].copy()
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def model(robot):
+    return GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Exact())
+
+
+def play(arm, targets, compensator=None, payload=0.0, events=None):
+    """Positions and commands, (T, 2) each; events {period: call}."""
+    arm.start(targets[0])
+    if compensator is not None:
+        compensator.reset(targets[0], payload)
+    q, u = [], []
+    for t, target in enumerate(targets):
+        (events or {}).get(t, lambda: None)()
+        q.append(arm.qpos)
+        u.append(target if compensator is None else compensator.step(target, arm.qpos))
+        arm.step(u[-1])
+    return np.array(q), np.array(u)
+
+
+def error(q, targets, skip=50):
+    return float(np.abs(q - targets)[skip:].mean())
+
+
+def test_the_robot_does_what_the_nominal_simulator_does(robot, model):
+    targets = commands(200, 1)
+    nominal = BatchSim(robot, [(0.2, "both", 0.02)], 1)
+    nominal.reset(slice(None), targets[:1], np.zeros((1, 2)))
+    for _ in range(200):
+        nominal.step(targets[:1])
+    expected = []
+    for target in targets:
+        expected.append(nominal.qpos[0].copy())
+        nominal.step(target[None])
+    config = replace(NOW, aim="simulator", feedback=0.0)
+    raw, _ = play(WeakArm(robot, 0.2), targets)
+    q, _ = play(WeakArm(robot, 0.2), targets, Compensator(robot, model, config, payload_step=0.1), 0.2)
+    assert error(q, expected) < 0.1 * error(raw, expected)
+
+
+def test_the_robot_reaches_its_target_under_a_payload(robot, model):
+    targets = np.repeat(commands(200, 1)[:1], 200, axis=0)
+    raw, _ = play(WeakArm(robot, 0.4), targets)
+    q, _ = play(WeakArm(robot, 0.4), targets, Compensator(robot, model, NOW), 0.4)
+    assert error(q, targets) < 0.2 * error(raw, targets)
+
+
+def test_what_is_measured_changes_nothing_without_feedback(robot, model):
+    targets = commands(60, 2)
+    one, two = (Compensator(robot, model, replace(NOW, feedback=0.0)) for _ in range(2))
+    for compensator in (one, two):
+        compensator.reset(targets[0], 0.0)
+    rng = np.random.default_rng(0)
+    for target in targets:
+        np.testing.assert_array_equal(one.step(target, rng.normal(0, 1, 2)), two.step(target, None))
+
+
+def test_commands_blend_in(robot, model):
+    target = np.array([0.5, 0.3])
+    compensator = Compensator(robot, model, CompensatorConfig(blend=1.0))
+    compensator.reset(target, 0.4)
+    u = np.array([compensator.step(target, None) for _ in range(80)])
+    np.testing.assert_array_equal(u[0], target)
+    assert np.abs(u[-1] - target).max() > 0.05
+    assert np.abs(np.diff(u, axis=0)).max() < 0.1 * np.abs(u[-1] - target).max()
+
+
+@pytest.mark.parametrize("late", [0, 4])
+@pytest.mark.parametrize("lost", [0.0, 0.2])
+def test_steps_of_command_and_payload_die_out(robot, model, late, lost):
+    targets = np.repeat([[0.3, -0.2], [-0.4, 0.5], [0.2, 0.2]], 150, axis=0)
+    arm, compensator = WeakArm(robot, 0.0, late, lost), Compensator(robot, model, NOW)
+
+    def load(heavy, mass):
+        arm.load(heavy)
+        compensator.set_payload(mass)
+
+    q, u = play(arm, targets, compensator, 0.0, {200: lambda: load(1, 0.4), 350: lambda: load(0, 0.0)})
+    assert np.abs(u - targets).max() <= NOW.limit + 1e-12
+    for end in (150, 300, 450):
+        assert np.abs(np.diff(u[end - 20 : end], axis=0)).max() < 1e-3
+        assert np.abs(q[end - 20 : end] - targets[end - 20 : end]).max() < 0.02
+
+
+def test_an_arm_that_swings_on_its_servos_is_not_stirred_up(tmp_path):
+    swinging = write_arm(
+        tmp_path, TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.0"), XML.replace('damping="0.5"', 'damping="0.05"')
+    )
+    model = GapModel(Path("exact"), make_card(CONFIG, swinging, dt=[0.02]), CONFIG, Exact())
+    targets = np.repeat([[0.3, -0.2], [-0.4, 0.5]], 400, axis=0)
+    calm = {}
+    for name, config in (("default", NOW), ("fast", replace(NOW, feedback=5.0, feedback_time=0.0))):
+        q, _ = play(WeakArm(swinging, 0.4, late=4), targets, Compensator(swinging, model, config), 0.4)
+        calm[name] = float(np.abs(np.diff(q[-100:], axis=0)).max())
+    assert calm["default"] < 1e-3 < calm["fast"]
+
+
+def test_a_lead_makes_up_for_dead_time(robot, model):
+    targets = commands(200, 1)
+    late = {}
+    for lead in (0, 3):
+        ahead = np.concatenate([targets[lead:], np.repeat(targets[-1:], lead, axis=0)])
+        compensator = Compensator(robot, model, replace(NOW, lead=lead))
+        q, _ = play(WeakArm(robot, 0.2, late=3), ahead, compensator, 0.2)
+        late[lead] = error(q, targets)
+    assert late[3] < 0.4 * late[0]
+
+
+def test_a_payload_that_nobody_announced_is_found(robot, model):
+    targets = np.repeat([[0.3, -0.2]], 500, axis=0)
+    arm, compensator = WeakArm(robot), Compensator(robot, model, NOW, payload_step=0.1)
+    q, _ = play(arm, targets, compensator, None, {100: lambda: arm.load(1)})
+    assert compensator.payload_mass[0] == pytest.approx(0.4, abs=0.12)  # the servo law overrates torque by 1 / 0.8
+    assert np.abs(q[-20:] - targets[-20:]).max() < 0.02
+    assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
+
+
+def test_a_blocked_joint_winds_nothing_up(robot, model):
+    target = np.array([0.3, 0.3])
+    compensator = Compensator(robot, model, replace(NOW, limit=0.05))
+    compensator.reset(target, 0.0)
+    for _ in range(500):  # 10 s against a stop
+        compensator.step(target, np.array([-0.5, -0.5]))
+    wound = compensator.integral.copy()
+    assert np.abs(wound).max() <= NOW.feedback_limit
+    periods = 0
+    while (compensator.saturated > 0).any():  # it slips free, a little beyond the target
+        compensator.step(target, np.array([0.4, 0.4]))
+        periods += 1
+    assert periods <= 50
+
+
+def test_without_fresh_states_feedback_waits(robot, model):
+    compensator = Compensator(robot, model, NOW)
+    compensator.reset(np.zeros(2), 0.0)
+    for _ in range(20):
+        compensator.step(np.zeros(2), np.array([0.1, 0.1]))
+    before = compensator.integral.copy()
+    compensator.step(np.zeros(2), None)
+    np.testing.assert_array_equal(compensator.integral, before)
+    assert (before < 0).all()
+
+
+def test_several_robots_are_compensated_as_each_alone(robot, model):
+    targets = np.stack([commands(40, 0), commands(40, 1)], axis=1)
+    both = Compensator(robot, model, NOW, num_envs=2, payload_step=0.1)
+    both.reset(targets[0], np.array([0.0, 0.3]))
+    alone = [Compensator(robot, model, NOW, payload_step=0.1) for _ in range(2)]
+    for i, c in enumerate(alone):
+        c.reset(targets[0, i], (0.0, 0.3)[i])
+    for target in targets:
+        u = both.step(target, 0.9 * target)
+        np.testing.assert_allclose(u, [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)], atol=1e-9)
+
+
+def test_other_arrays_and_robots_are_refused(robot, model):
+    with pytest.raises(UsageError, match="all 2 joints of arm"):
+        Compensator(robot, model).reset(np.zeros(3), 0.0)
+    with pytest.raises(UsageError, match="gain must be"):
+        CompensatorConfig(gain=0.0)

@@ -1,0 +1,182 @@
+"""Faults on real DDS: robot and controller in two processes, on loopback. What arrives at the robot is judged."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
+
+from deploy.robot_process import RobotProcess
+
+from gaponet.deploy.controller import ControlConfig, Controller
+from gaponet.deploy.driver import DriverError
+from gaponet.deploy.drivers.unitree import UnitreeDriver
+from gaponet.deploy.recording import Recording
+from gaponet.deploy.safety import Limits, SafetyConfig
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec, load_robot
+
+pytestmark = pytest.mark.faults
+
+DOMAIN = 20 + os.getpid() % 150
+SLOW = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=0.3)  # machines that run tests are busy
+ROBOT = load_robot("h1_2")
+AT = 4  # period of the run in which the fault is injected
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[RobotProcess]:
+    robot = RobotProcess(DOMAIN)
+    yield robot
+    robot.kill()
+
+
+def swing(k: int) -> np.ndarray:
+    """Both arms swing wider than they may."""
+    target = ROBOT.qpos_home.copy()
+    target[13:] += 2.5 * np.sin(0.8 * k)
+    return target
+
+
+def run(at_fault, robot: RobotSpec = ROBOT, domain: int = DOMAIN) -> Recording:
+    """Swing; do something in period AT; give up long after."""
+
+    def policy(k, state):
+        if k == AT:
+            at_fault()
+        return swing(k) if k < AT + 30 else None
+
+    driver = UnitreeDriver(robot, domain=domain)
+    return Controller(driver, robot, SLOW, guard=False).run(policy)
+
+
+def judge(recording: Recording, heard: dict[str, list]) -> None:
+    """What the robot heard: never outside the limits, and once damped, damped for good."""
+    arms = ROBOT.index(recording.commanded)
+    ctrl, kp, _kd, _qvel = (np.array(heard[n])[:, arms] for n in ("ctrl", "kp", "kd", "qvel"))
+    limits = Limits.of(ROBOT, recording.commanded, SafetyConfig())
+    stiff = (kp > 0).all(axis=1)
+    assert (stiff | (kp == 0).all(axis=1)).all()
+    assert (np.diff(stiff.astype(int)) <= 0).all(), "a position command after damping"
+    assert not stiff[-1]
+    assert (ctrl[stiff] >= limits.low - 1e-6).all()
+    assert (ctrl[stiff] <= limits.high + 1e-6).all()
+    assert (np.abs(np.diff(ctrl[stiff], axis=0)) <= limits.speed * 0.1 + 1e-6).all()
+    np.testing.assert_array_equal(np.array(heard["kp"])[:, :13], 0.0)  # legs and torso are never commanded
+    assert heard["refused"] == 0
+    for row in recording.rows:
+        if row.ctrl is not None:
+            asked = limits.kp * (row.ctrl[arms] - row.state.qpos[arms]) - limits.kd * row.state.qvel[arms]
+            assert (np.abs(asked) <= limits.effort + 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "periods"),
+    [
+        ("stop", "stale", 3), ("repeat", "stale", 3), ("late", "stale", 3), ("checksum", "stale", 3),
+        ("freeze", "frozen", 3), ("nan", "nan", 1), ("jump", "jump", 1), ("hot", "temperature", 1),
+    ],
+)  # fmt: skip
+def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
+    served.ask("clear")
+    recording = run(lambda: served.ask(f"fault {fault}"))
+    assert recording.fault is not None
+    assert recording.fault.kind == kind
+    sent_after = sum(r.phase == "run" for r in recording.rows) - (AT + 1)
+    assert 0 <= sent_after <= periods  # position commands between the fault and damping
+    judge(recording, served.ask("heard"))
+
+
+def test_a_robot_that_comes_back_is_not_commanded_again(served):
+    domain = DOMAIN + 1
+    robots = [RobotProcess(domain)]
+
+    def cut():
+        robots[0].kill()
+
+    driver = UnitreeDriver(ROBOT, domain=domain)
+    config = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=8.0)
+    controller = Controller(driver, ROBOT, config, guard=False)
+
+    def policy(k, state):
+        if k == AT:
+            cut()
+        return swing(k)
+
+    def told(event):
+        if event.phase == "damp":
+            robots.append(RobotProcess(domain))
+
+    controller._on_event = told
+    recording = controller.run(policy)
+    assert recording.fault.kind == "stale"
+    heard = robots[1].ask("heard")
+    robots[1].kill()
+    assert len(heard["kp"]) > 0
+    np.testing.assert_array_equal(heard["kp"], 0.0)
+
+
+CONTROLLER = """
+import sys
+from deploy.test_faults import ROBOT, SLOW, swing
+from gaponet.deploy.controller import Controller
+from gaponet.deploy.drivers.unitree import UnitreeDriver
+Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW).run(lambda k, state: swing(k))
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
+def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how):
+    served.ask("clear")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
+    process = subprocess.Popen([sys.executable, "-c", CONTROLLER, str(DOMAIN)], env=environment)
+    try:
+        wait(lambda: len(served.ask("heard")["kp"]) > 10)
+        with pytest.raises(UsageError, match="another process commands this robot"):
+            run(lambda: None)
+        process.send_signal(how)
+        wait(lambda: not np.any(served.ask("heard")["kp"][-1]))
+        heard = served.ask("heard")
+        stiff = np.any(heard["kp"], axis=1)
+        assert (np.diff(stiff.astype(int)) <= 0).all()
+        wait(lambda: served.ask("heard")["weight"][-1] < 0.05)  # in the end the arms are handed back
+    finally:
+        process.kill()
+        process.wait()
+
+
+def wait(done, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_two_publishers_on_the_bus_are_refused(served):
+    served.ask("clear")
+    first = UnitreeDriver(ROBOT, domain=DOMAIN)
+    first.connect()
+    with pytest.raises(DriverError, match="publish rt/arm_sdk"):
+        UnitreeDriver(ROBOT, domain=DOMAIN).connect()
+    first.close()
+
+
+def test_without_a_robot_it_says_where_it_looked():
+    with pytest.raises(DriverError, match="nobody speaks on rt/lowstate, domain 231, interface lo"):
+        UnitreeDriver(ROBOT, domain=231).connect()
+    with pytest.raises(DriverError, match="no network interface 'eth99'"):
+        UnitreeDriver(ROBOT, interface="eth99").connect()
+
+
+def test_legs_are_commanded_only_when_asked_for_on_lowcmd():
+    assert not any("hip" in j or "knee" in j or "ankle" in j for j in UnitreeDriver(ROBOT, "lowcmd").commanded)
+    with pytest.raises(UsageError, match="does not take the legs"):
+        UnitreeDriver(ROBOT, "arm_sdk", "all")

@@ -1,0 +1,85 @@
+"""Learned baselines: size, what they see, the Fourier matrices."""
+
+import pytest
+import torch
+
+from gaponet.errors import UsageError
+from gaponet.model.baselines.fno import SpectralConv, dft
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network, operator_size
+from gaponet.model.layers import size
+
+KINDS = ("mlp", "transformer", "fno")
+
+
+def x(config, n, batch=7):
+    torch.manual_seed(0)
+    return torch.randn(batch, config.input_dim(n))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "inverse"])
+def test_an_untrained_baseline_corrects_nothing(kind):
+    config = ModelConfig(kind=kind)
+    assert build_network(config, 5)(x(config, 5)).abs().max() == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_number_of_the_observation_and_the_action_is_seen(kind):
+    config, n = ModelConfig(kind=kind, history=3), 2
+    net = build_network(config, n)
+    head = (net.net if kind == "mlp" else net.head)[-1]
+    torch.nn.init.normal_(head.weight, std=0.01)
+    data = x(config, n, batch=1).requires_grad_(True)
+    net(data).sum().backward()
+    assert (data.grad != 0).all()
+
+
+@pytest.mark.parametrize("config", [ModelConfig(), ModelConfig(coupling="full", history=8)], ids=["joint", "full"])
+def test_a_matched_mlp_has_the_operators_parameters_within_one_percent(config):
+    operator = size(build_network(config, 10))
+    matched = build_network(
+        ModelConfig(kind="mlp", mlp_match=True, history=config.history, coupling=config.coupling), 10
+    )
+    assert operator_size(matched.config, 10) == operator
+    assert abs(size(matched) / operator - 1) < 0.01
+
+
+def test_building_a_matched_mlp_leaves_the_seed_alone():
+    config = ModelConfig(kind="mlp", mlp_match=True)
+    torch.manual_seed(0)
+    first = build_network(config, 2).net[0].weight
+    torch.manual_seed(0)
+    assert torch.equal(torch.nn.Linear(first.shape[1], first.shape[0]).weight, first)
+
+
+def test_proportions_are_needed_to_match():
+    with pytest.raises(UsageError, match="give the proportions"):
+        ModelConfig(kind="mlp", mlp_match=True, mlp_hidden=())
+
+
+def test_heads_share_the_width():
+    with pytest.raises(UsageError, match="multiple of transformer_heads"):
+        ModelConfig(transformer_width=30)
+
+
+def test_all_frequencies_give_the_samples_back():
+    for count in (2, 5, 9):
+        forward, inverse = dft(count, count + 1)
+        assert torch.allclose(inverse @ forward, torch.eye(count), atol=1e-5)
+
+
+def test_the_matrices_are_the_fourier_transform_of_a_padded_signal():
+    signal = torch.randn(5)
+    expected = torch.fft.rfft(signal, 10)[:4]
+    answer = dft(5, 4)[0] @ signal
+    assert torch.allclose(answer[:4], expected.real, atol=1e-5)
+    assert torch.allclose(answer[4:], expected.imag, atol=1e-5)
+
+
+def test_a_spectral_layer_multiplies_frequencies_by_complex_matrices():
+    torch.manual_seed(0)
+    layer, data = SpectralConv(5, 3, 4), torch.randn(2, 5, 3)
+    weight = torch.complex(layer.weight[0], layer.weight[1])
+    spectrum = torch.zeros(2, 6, 3, dtype=torch.complex64)
+    spectrum[:, :4] = torch.einsum("bki,kio->bko", torch.fft.rfft(data, 10, dim=1)[:, :4], weight)
+    assert torch.allclose(layer(data), torch.fft.irfft(spectrum, 10, dim=1)[:, :5], atol=1e-5)

@@ -1,0 +1,56 @@
+"""The supervised start: labels of held corrections, the baseline's recipe, the sensor predictor's refresh."""
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.train.config import RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.train.env import DeltaEnv
+from gaponet.train.warm_start import WarmStart, fit_sensors, held_labels, recipe
+
+
+def test_a_held_correction_has_the_mean_label_of_its_rows():
+    labels = np.array([[1.0], [2.0], [6.0], [4.0]], np.float32)
+    assert held_labels(labels, 3).tolist() == [[3.0], [4.0]]
+    np.testing.assert_array_equal(held_labels(labels, 1), labels)
+
+
+def test_the_inverse_baseline_is_one_undisturbed_round():
+    warm = WarmStartConfig(rounds=4, gradient_steps=50)
+    assert recipe(TrainConfig(warm_start=warm)) == warm
+    once = recipe(TrainConfig(ModelConfig(kind="inverse"), warm_start=warm))
+    assert (once.rounds, once.gradient_steps, once.disturbance) == (1, 200, 0.0)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    torch.manual_seed(0)
+    robot = write_arm(tmp_path_factory.mktemp("arm"))
+    config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
+    env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
+    net = build_network(config, 2)
+    return net, env, fit_sensors(net, env, robot, seed=0)
+
+
+def test_a_predictor_that_no_longer_holds_is_fitted_again_beside_the_roll_outs(fitted):
+    net, env, report = fitted
+    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2, sensor_refresh=0.1)
+    warm = WarmStart(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
+    warm.round(lambda: 0.0)
+    good = warm.refresh_sensors(report)
+    assert good["refits"] == 0
+    assert good["mean"] == report["mean"]
+    scale = net.predictor.outputs.std.clone()
+    net.predictor.net[-1].bias.data += 0.7
+    state, row, random = env.sim.qpos.copy(), env.row.copy(), env.rng.bit_generator.state
+    again = warm.refresh_sensors(good)
+    assert again["refits"] == 1
+    assert again["visited"] > report["fitted"] - 0.1
+    assert torch.equal(net.predictor.outputs.std, scale)  # the branch knows the answers on this scale
+    assert not any(p.requires_grad for p in net.predictor.parameters())
+    np.testing.assert_array_equal(env.sim.qpos, state)
+    np.testing.assert_array_equal(env.row, row)
+    assert env.rng.bit_generator.state == random
