@@ -9,7 +9,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.train.config import RewardConfig, TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
-from gaponet.train.warm_start import WarmStart, fit_sensors, held_labels, recipe
+from gaponet.train.warm_start import WarmStart, held_labels, recipe
 
 
 def test_a_held_correction_has_the_mean_label_of_its_rows():
@@ -32,21 +32,32 @@ def fitted(tmp_path_factory):
     config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
     env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
-    return net, env, fit_sensors(net, env, robot, seed=0)
+    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2, sensor_refresh=0.1)
+    warm = WarmStart(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
+    warm.begin()
+    return warm
+
+
+def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
+    net, before = fitted.net, fitted.net.features.standardise.mean.clone()
+    assert before.abs().max() > 0
+    fitted.round(lambda: 0.0)
+    assert torch.equal(net.features.standardise.mean, before)
+    assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
 
 
 def test_a_predictor_that_no_longer_holds_is_fitted_again_beside_the_roll_outs(fitted):
-    net, env, report = fitted
-    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2, sensor_refresh=0.1)
-    warm = WarmStart(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
+    warm, net, env, report = fitted, fitted.net, fitted.env, fitted.report
     warm.round(lambda: 0.0)
-    good = warm.refresh_sensors(report)
+    warm.refresh_sensors()
+    good = warm.report
     assert good["refits"] == 0
     assert good["mean"] == report["mean"]
     scale = net.predictor.outputs.std.clone()
     net.predictor.net[-1].bias.data += 0.7
     state, row, random = env.sim.qpos.copy(), env.row.copy(), env.rng.bit_generator.state
-    again = warm.refresh_sensors(good)
+    warm.refresh_sensors()
+    again = warm.report
     assert again["refits"] == 1
     assert again["visited"] > report["fitted"] - 0.1
     assert torch.equal(net.predictor.outputs.std, scale)  # the branch knows the answers on this scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -34,6 +35,10 @@ COMMANDS = {
     "demo": "gaponet.cli.demo:demo",
     "bench": "gaponet.cli.bench:bench",
 }
+
+
+# torch's threads and the simulator's take turns on the same cores: one that waits must not spin (a factor of five).
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 
 def load(command: str) -> Callable[..., Any]:

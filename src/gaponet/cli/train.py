@@ -14,7 +14,7 @@ from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 from gaponet.model.config import Kind
 from gaponet.robot import RobotSpec
-from gaponet.train.config import TrainConfig
+from gaponet.train.config import FAST_PPO, TrainConfig
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
@@ -27,6 +27,7 @@ def train(
     model: Kind = "gaponet",
     budget: str = "10m",
     resume: tyro.conf.FlagCreatePairsOff[bool] = False,
+    fast: tyro.conf.FlagCreatePairsOff[bool] = False,
     robot: str | None = None,
     holdout_units: tuple[str, ...] = (),
     log: tuple[Literal["tensorboard", "wandb"], ...] = (),
@@ -43,6 +44,7 @@ def train(
         model: gaponet, or a baseline: mlp, transformer, fno, inverse.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
+        fast: PPO with one pass over each batch and a small critic, whatever --ppo says.
         robot: Robot name or folder, if not the package's robot of the dataset.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.
@@ -51,7 +53,7 @@ def train(
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
-    config = replace(config, model=replace(config.model, kind=model))
+    config = replace(config, model=replace(config.model, kind=model), ppo=FAST_PPO if fast else config.ppo)
     trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
     card = trained.card
     val = card["val_mpjae"]

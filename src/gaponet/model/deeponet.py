@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from gaponet.model.baselines.fno import DeltaFNO
 from gaponet.model.baselines.mlp import DeltaMLP, matched_hidden
@@ -30,6 +32,12 @@ class SensorPredictor(nn.Module):
         """Takes standardised features; the action, their last n columns, is not looked at."""
         mean, log_var = self.net(features[:, self.seen]).chunk(2, dim=1)
         return mean, log_var.clamp(-10.0, 4.0)
+
+    def mean(self, features: Tensor) -> Tensor:
+        """The mean alone, (B, 2nm)."""
+        hidden: nn.Module = self.net[:-1]
+        head: Any = self.net[-1]
+        return linear(hidden(features[:, self.seen]), head.weight.chunk(2)[0], head.bias.chunk(2)[0])
 
 
 class Stacked(nn.Module):
@@ -68,6 +76,7 @@ class OperatorNet(DeltaNet):
         sensed, seen, asked = self.input_dims(config, n)
         outputs = config.num_basis * (1 if self.per_joint else n)
         inputs = sensed * (config.sensors != "off") + seen * self.sees_observation + n * self.per_joint
+        self.branch_inputs = inputs
         if config.branch == "stacked":
             nets = [dense(inputs, config.branch_hidden, outputs // config.num_basis) for _ in range(config.num_basis)]
             self.branch: nn.Module = Stacked(nets)
@@ -93,11 +102,16 @@ class OperatorNet(DeltaNet):
         if self.config.sensors == "oracle":
             self.answers.fit(x[:, self.features.layout.answers], floor=1e-6)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t | more], (B, input_dim) → Δa, (B, n), rad."""
+    def prepare(self, x: Tensor) -> Tensor:
+        """x = [o_t | a_t | more], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
         z = self.features(x)
         sensors = self.sensors(x, z) if self.config.sensors != "off" else None
         see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
+        return torch.cat([see, ask], dim=-1)
+
+    def correct(self, prepared: Tensor) -> Tensor:
+        """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
+        see, ask = prepared.split([self.branch_inputs, prepared.shape[-1] - self.branch_inputs], dim=-1)
         shape = (-1, self.n, self.config.num_basis)
         branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
@@ -113,9 +127,11 @@ class OperatorNet(DeltaNet):
                 each = answers.reshape(-1, self.config.num_probes, 2 * self.n)
                 return self.predictor.outputs(each).clamp(-5.0, 5.0).flatten(1)
             mean, log_var = (y.flatten(1) for y in self.predictor(refreshed, self.points(refreshed)))
+        elif not self.sample_sensors:
+            return self.predictor.mean(refreshed)
         else:
             mean, log_var = self.predictor(refreshed)
-        return mean + torch.randn_like(mean) * (0.5 * log_var).exp() if self.sample_sensors else mean
+        return mean + torch.randn_like(mean) * (0.5 * log_var).exp()
 
     def offsets(self, x: Tensor) -> Tensor:
         """Where learned points ask the simulator, relative to q_t, (B, m, n) rad."""

@@ -16,11 +16,14 @@ import numpy as np
 import torch
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.model.baselines.mlp import matched_hidden
 from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.layers import size
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs, replay
-from gaponet.train.config import FAST_PPO, RewardConfig, TrainConfig
+from gaponet.train.config import FAST_PPO, PPOConfig, RewardConfig, TrainConfig
 from gaponet.train.env import DeltaEnv
 
 Array = np.ndarray
@@ -72,13 +75,13 @@ def bench_train(
     """
     from gaponet.train.ppo import make_runner, update
 
-    torch.set_num_threads(config.torch_threads)
-    config = replace(config, ppo=replace(config.ppo, num_envs=num_envs))
+    torch.set_num_threads(config.learner_threads)
+    config = replace(config, ppo=_scaled(config.ppo, num_envs))
     steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
     env = _environment(robot, config.model, num_envs, config.threads)
-    runner = make_runner(env, config)
-    fast_steps = FAST_PPO.num_steps
-    fast = make_runner(env, replace(config, ppo=replace(FAST_PPO, num_envs=num_envs)))
+    net = build_network(config.model, env.num_actions)
+    runner = make_runner(env, net, config.ppo)
+    fast = make_runner(env, build_network(config.model, env.num_actions), _scaled(FAST_PPO, num_envs))
     turns: dict[str, Turn] = {
         "bare Batch loop": _bare_loop(robot, num_envs, steps, config.threads),
         "environment step": _idle_steps(env, steps),
@@ -88,13 +91,17 @@ def bench_train(
         "PPO": lambda: update(runner),
         "PPO, fast preset": lambda: update(fast),
     }
-    counts = dict.fromkeys(turns, batch) | {"PPO, fast preset": num_envs * fast_steps}
+    counts = dict.fromkeys(turns, batch) | {"PPO, fast preset": num_envs * FAST_PPO.num_steps}
     if baseline:
         from gaponet.train.bench_sb3 import batched, separate
 
         model = batched(env, config)
         turns["stable-baselines3, batched"] = lambda: model.learn(batch, reset_num_timesteps=False)
         counts["stable-baselines3, batched"] = batch
+        if config.model.kind != "mlp":
+            mlp = batched(env, config, matched_hidden(config.model, env.num_actions, size(net)))
+            turns["stable-baselines3, batched, an MLP"] = lambda: mlp.learn(batch, reset_num_timesteps=False)
+            counts["stable-baselines3, batched, an MLP"] = batch
         single, samples, close = separate(robot, config, _motions(robot, 8))
         turns["stable-baselines3, SubprocVecEnv"] = lambda: single.learn(samples, reset_num_timesteps=False)
         counts["stable-baselines3, SubprocVecEnv"] = samples
@@ -109,9 +116,14 @@ def bench_train(
         "speeds": speeds,
         "expected": expected,
         "share_of_expected": speeds["PPO"]["control_steps_per_s"] / expected,
-        "parameters": sum(p.numel() for p in runner.alg.actor.mlp.parameters()),
+        "parameters": size(net),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
+
+
+def _scaled(ppo: PPOConfig, num_envs: int) -> PPOConfig:
+    """For another number of environments, with mini-batches of the same size."""
+    return replace(ppo, num_envs=num_envs, mini_batches=max(1, ppo.mini_batches * num_envs // ppo.num_envs))
 
 
 def take_turns(turns: dict[str, Turn], rounds: int) -> dict[str, float]:
@@ -166,11 +178,10 @@ def _idle_steps(env: DeltaEnv, steps: int) -> Turn:
 
 
 def _inference(runner: Any, steps: int) -> None:
-    """Actor, critic and sampling, nothing stored."""
-    obs = runner.env.get_observations()
+    """Features, sensors, actor, critic and sampling, nothing stored."""
     with torch.inference_mode():
         for _ in range(steps):
-            runner.alg.act(obs)
+            runner.alg.act(runner.env.get_observations())
 
 
 def _collect(runner: Any) -> None:

@@ -16,10 +16,14 @@ import mujoco
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
+from torch import nn
 
 from gaponet.data.sequence import Sequence
 from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.layers import dense
 from gaponet.model.observation import History, frames_before
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_model
@@ -33,9 +37,15 @@ PROCESSES = 8
 PROCESS_STEPS = 256  # control periods per update and process
 
 
-def batched(env: DeltaEnv, config: TrainConfig) -> PPO:
-    """stable-baselines3's PPO on the environment that gaponet trains in."""
-    return _ppo(_Batched(env), config, config.ppo.num_steps)
+def batched(env: DeltaEnv, config: TrainConfig, hidden: tuple[int, ...] | None = None) -> PPO:
+    """stable-baselines3's PPO on the environment that gaponet trains in, with the same network or with an MLP.
+
+    Args:
+        env: Ours.
+        config: Network and PPO.
+        hidden: Hidden layers of an MLP in the network's place.
+    """
+    return _ppo(_Batched(env), config, config.ppo.num_steps, hidden)
 
 
 def separate(robot: RobotSpec, config: TrainConfig, motions: ListOf[Sequence]) -> tuple[PPO, int, Callable[[], None]]:
@@ -47,25 +57,61 @@ def separate(robot: RobotSpec, config: TrainConfig, motions: ListOf[Sequence]) -
     return _ppo(env, config, PROCESS_STEPS), PROCESSES * PROCESS_STEPS, env.close
 
 
-def _ppo(env: VecEnv, config: TrainConfig, num_steps: int) -> PPO:
-    """Networks of the MLP's size, everything else as in ours; mini-batches are as many, not as large."""
+class _Networks(nn.Module):
+    """Our network and a critic, as stable-baselines3 wants them."""
+
+    def __init__(self, model: ModelConfig, n: int, critic_hidden: ListOf[int]) -> None:
+        super().__init__()
+        self.net = build_network(model, n)
+        if self.net.predictor is not None:
+            self.net.predictor.requires_grad_(False)
+        *hidden, last = critic_hidden
+        self.critic = nn.Sequential(dense(model.input_dim(n), hidden, last), nn.ELU())
+        self.latent_dim_pi, self.latent_dim_vf = n, last
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return self.net(x), self.critic(x)
+
+    def forward_actor(self, x: torch.Tensor) -> torch.Tensor:
+        return self.net(x)
+
+    def forward_critic(self, x: torch.Tensor) -> torch.Tensor:
+        return self.critic(x)
+
+
+class SameNetwork(ActorCriticPolicy):
+    """stable-baselines3's policy whose mean is our network."""
+
+    def __init__(self, *args: Any, model: ModelConfig, critic_hidden: tuple[int, ...], **kwargs: Any) -> None:
+        self.model, self.critic_hidden = model, critic_hidden
+        super().__init__(*args, **kwargs)
+        self.action_net = nn.Identity()
+
+    def _build_mlp_extractor(self) -> None:
+        n = self.action_space.shape[0]  # type: ignore[index]
+        self.mlp_extractor = _Networks(self.model, n, self.critic_hidden)  # type: ignore[assignment]
+
+
+def _ppo(env: VecEnv, config: TrainConfig, num_steps: int, hidden: tuple[int, ...] | None = None) -> PPO:
+    """The same network or an MLP, everything else as in ours, mini-batches as large."""
     ppo, model = config.ppo, config.model
+    policy: dict[str, Any] = {"log_std_init": math.log(ppo.init_std), "ortho_init": False}
+    if hidden is None:
+        policy |= {"model": model, "critic_hidden": ppo.critic_hidden}
+    else:
+        policy |= {"net_arch": {"pi": list(hidden), "vf": list(ppo.critic_hidden)}, "activation_fn": nn.ELU}
     return PPO(
-        "MlpPolicy",
+        SameNetwork if hidden is None else "MlpPolicy",
         env,
         n_steps=num_steps,
         n_epochs=ppo.epochs,
-        batch_size=env.num_envs * num_steps // ppo.mini_batches,
+        batch_size=min(ppo.num_envs * ppo.num_steps // ppo.mini_batches, env.num_envs * num_steps),
         learning_rate=ppo.learning_rate,
         gamma=ppo.gamma,
         gae_lambda=ppo.lam,
         clip_range=ppo.clip,
         device="cpu",
-        policy_kwargs={
-            "net_arch": {"pi": list(model.mlp_hidden), "vf": list(ppo.critic_hidden)},
-            "activation_fn": torch.nn.ELU,
-            "log_std_init": math.log(ppo.init_std),
-        },
+        policy_kwargs=policy,
     )
 
 

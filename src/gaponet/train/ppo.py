@@ -7,16 +7,58 @@ import io
 import math
 from typing import Any
 
+import torch
+from rsl_rl.env import VecEnv
 from rsl_rl.models import MLPModel
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
+from torch import nn
 
-from gaponet.model.config import ModelConfig
-from gaponet.model.deeponet import build_network
-from gaponet.train.config import PPOConfig, TrainConfig
+from gaponet.model.layers import DeltaNet
+from gaponet.train.config import PPOConfig
 from gaponet.train.env import DeltaEnv
 
 STD_RANGE = (0.001, math.exp(-1))  # rad
+
+
+class PreparedEnv(VecEnv):
+    """An environment whose actor observation is what the network prepares from it.
+
+    Features and sensors are not trained here, so each sample passes them once, not once in every epoch of every update.
+    """
+
+    def __init__(self, env: DeltaEnv, net: DeltaNet) -> None:
+        self.env, self.net = env, net
+        self.num_envs, self.num_actions, self.device, self.cfg = env.num_envs, env.num_actions, env.device, env.cfg
+        self.max_episode_length, self.episode_length_buf = env.max_episode_length, env.episode_length_buf
+
+    def get_observations(self) -> TensorDict:
+        """Groups "actor", flattened, and "critic"."""
+        return self._prepared(self.env.get_observations())
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        """As the environment's."""
+        obs, reward, done, extras = self.env.step(actions)
+        return self._prepared(obs), reward, done, extras
+
+    def _prepared(self, obs: TensorDict) -> TensorDict:
+        with torch.inference_mode():
+            actor = self.net.prepare(obs["actor"]).flatten(1)
+        return TensorDict({"actor": actor, "critic": obs["critic"]}, batch_size=obs.batch_size)
+
+
+class Correct(nn.Module):
+    """The trained part of a network on flattened prepared inputs."""
+
+    def __init__(self, net: DeltaNet) -> None:
+        super().__init__()
+        self.net = net
+        with torch.inference_mode():
+            self.shape = net.prepare(torch.zeros(1, net.config.input_dim(net.n))).shape[1:]
+
+    def forward(self, prepared: torch.Tensor) -> torch.Tensor:
+        """(B, …) flattened → Δa, (B, n) rad."""
+        return self.net.correct(prepared.reshape(-1, *self.shape))
 
 
 class DeltaActor(MLPModel):
@@ -28,18 +70,27 @@ class DeltaActor(MLPModel):
         obs_groups: dict[str, list[str]],
         obs_set: str,
         output_dim: int,
-        model: ModelConfig,
+        net: DeltaNet,
         distribution_cfg: dict[str, Any],
     ) -> None:
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims=(1,), distribution_cfg=distribution_cfg)
-        self.mlp = build_network(model, output_dim)
+        self.mlp = Correct(net)
 
 
-def make_runner(env: DeltaEnv, config: TrainConfig) -> OnPolicyRunner:
-    """A silent runner; call `update` for one iteration. Its actor's network is `runner.alg.actor.mlp`."""
-    ppo = config.ppo
+def make_runner(env: DeltaEnv, net: DeltaNet, ppo: PPOConfig) -> OnPolicyRunner:
+    """A silent runner that trains a copy of net, its sensor predictor excepted; call `update` for one iteration."""
+    prepared = PreparedEnv(env, net)
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the models
-        return OnPolicyRunner(env, _runner_config(config.model, ppo), log_dir=None, device="cpu")
+        runner = OnPolicyRunner(prepared, _runner_config(net, ppo), log_dir=None, device="cpu")
+    prepared.net = trained_by(runner)
+    if prepared.net.predictor is not None:
+        prepared.net.predictor.requires_grad_(False)
+    return runner
+
+
+def trained_by(runner: OnPolicyRunner) -> DeltaNet:
+    """The network that a runner trains."""
+    return runner.alg.actor.mlp.net
 
 
 def update(runner: OnPolicyRunner) -> None:
@@ -47,7 +98,7 @@ def update(runner: OnPolicyRunner) -> None:
     runner.learn(1)
 
 
-def _runner_config(model: ModelConfig, ppo: PPOConfig) -> dict[str, Any]:
+def _runner_config(net: DeltaNet, ppo: PPOConfig) -> dict[str, Any]:
     return {
         "num_steps_per_env": ppo.num_steps,
         "save_interval": 10**9,
@@ -55,7 +106,7 @@ def _runner_config(model: ModelConfig, ppo: PPOConfig) -> dict[str, Any]:
         "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
         "actor": {
             "class_name": DeltaActor,
-            "model": model,
+            "net": net,
             "distribution_cfg": {
                 "class_name": "GaussianDistribution",
                 "init_std": ppo.init_std,
@@ -75,7 +126,7 @@ def _runner_config(model: ModelConfig, ppo: PPOConfig) -> dict[str, Any]:
             "num_mini_batches": ppo.mini_batches,
             "learning_rate": ppo.learning_rate,
             "desired_kl": ppo.desired_kl,
-            "gamma": ppo.gamma**model.delta_hold,  # a step is a decision
+            "gamma": ppo.gamma**net.config.delta_hold,  # a step is a decision
             "lam": ppo.lam,
             "clip_param": ppo.clip,
             "entropy_coef": 0.0,

@@ -44,9 +44,9 @@ from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
 from gaponet.train.loggers import Loggers
-from gaponet.train.ppo import make_runner, update
+from gaponet.train.ppo import make_runner, trained_by, update
 from gaponet.train.sensor_fit import Report, points_of, report_of
-from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
+from gaponet.train.warm_start import WarmStart, fit_inputs, recipe
 
 Array = np.ndarray
 
@@ -106,7 +106,7 @@ class Trainer:
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
         torch.manual_seed(config.seed)
-        torch.set_num_threads(config.torch_threads)
+        torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, self.n)
         self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
         self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, with gain 1
@@ -144,14 +144,15 @@ class Trainer:
     def _warm_start(self) -> None:
         config = recipe(self.config)
         env = self._env(config.num_envs, 10**9, self.config.seed)
-        if self.net.predictor is not None and self.rounds_done == 0:
-            self.stage = "sensors"
-            self._tick()
-            self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed, self.config.threads)
         limit = 0.99 * self.config.model.delta_max
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
-        warm = WarmStart(self.net, env, labels, config, self.config.seed)
+        warm = WarmStart(self.net, env, labels, config, self.config.seed, self.config.threads)
+        warm.report = self.sensor_r2
         rounds: list[State] = []
+        if self.rounds_done == 0:
+            self.stage = "sensors" if self.net.predictor is not None else "inputs"
+            self._tick()
+            warm.begin()
         self.stage = "warm start"
         if self.warm_state is not None and self._spent() < 1:
             rounds = self.warm_state["rounds"]
@@ -160,8 +161,8 @@ class Trainer:
         while warm.done < config.rounds and self._spent() < 1:
             before = round_state(warm)
             warm.round(self._tick)
-            if self.sensor_r2 is not None:
-                self.sensor_r2 = warm.refresh_sensors(self.sensor_r2, self.config.threads)
+            warm.refresh_sensors()
+            self.sensor_r2 = warm.report
             rounds.append(before)
             self.rounds_done, self.warm_state = warm.done, warm_state(warm, rounds)
             self.steps += config.num_envs * config.steps
@@ -174,19 +175,19 @@ class Trainer:
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
         env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        runner = make_runner(env, self.config)
+        if self.updates == 0 and not recipe(self.config).rounds:
+            x = env.get_observations()["actor"]
+            self.sensor_r2 = fit_inputs(self.net, env, x, self.config.seed, self.config.threads)
+        else:
+            self.net.load_state_dict(self.trained_state)
+        runner = make_runner(env, self.net, ppo)
         if self.runner_state is not None:
             runner.alg.load(self.runner_state, None, True)
-        else:
-            runner.alg.actor.mlp.load_state_dict(self.trained_state)
         if self.env_state is not None:
             restore_env(env, self.env_state)
             torch.set_rng_state(self.rng)
-        self.warm_state = None
-        self.net = runner.alg.actor.mlp
+        self.warm_state, self.net = None, trained_by(runner)
         env.inputs.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
-        if self.net.predictor is not None:
-            self.net.predictor.requires_grad_(False)
         trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
         while self._spent() < 1:
             for p in trained:  # first let the critic learn what the policy is worth

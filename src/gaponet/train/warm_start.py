@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from gaponet.model.layers import DeltaNet
-from gaponet.robot import RobotSpec
 from gaponet.train.config import TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.sensor_fit import STATES, Asked, Report, explained, fit_predictor, points_of, sensor_labels
@@ -38,10 +37,15 @@ def recipe(config: TrainConfig) -> WarmStartConfig:
 class WarmStart:
     """The pool of visited states and the optimiser; `round` collects and fits once."""
 
-    def __init__(self, net: DeltaNet, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int) -> None:
+    report: Report | None = None
+    """How well the sensor predictor explains the simulator, where there is one."""
+
+    def __init__(
+        self, net: DeltaNet, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int, nthread: int = 0
+    ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.labels, self.config = net, env, held_labels(labels, env.config.delta_hold), config
-        self.seed = seed
+        self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.visited: list[tuple[Array, Array, Array]] = []  # x, qpos, qvel of all environments, now and then
         self.pool_x: list[torch.Tensor] = []
@@ -49,6 +53,12 @@ class WarmStart:
         trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
         self.optimiser = torch.optim.AdamW(trained, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.done = 0
+
+    def begin(self) -> None:
+        """Before the first round: statistics of inputs, and on them the sensor predictor, where labels lead along."""
+        self.collect(follow_labels=True)
+        self.pool_y.clear()
+        self.report = fit_inputs(self.net, self.env, self.pool_x.pop(), self.seed, self.nthread)
 
     def collect(self, follow_labels: bool) -> None:
         """Roll out for config.steps, motions restarting where they end."""
@@ -94,36 +104,30 @@ class WarmStart:
         noise[: len(noise) // 4] = 0.0
         return noise
 
-    def refresh_sensors(self, report: Report, nthread: int = 0) -> Report:
-        """R² of the predictor on states of the last round's roll-outs; fits it again where that has fallen too far.
+    def refresh_sensors(self) -> None:
+        """Look at the predictor's R² on states of the last round's roll-outs; fit it again where that fell too far.
 
-        Only copies of states are used: the roll-out environments are left as they are.
-
-        Args:
-            report: Of the last fit or check.
-            nthread: Threads of the simulator asked.
-
-        Returns:
-            The report with "visited" as it is now, or that of the new fit, with "refits" counted.
+        Only copies of states are used: the roll-out environments are left as they are. `report` then has "visited" as
+        it is now, or is that of the new fit, with "refits" counted.
         """
-        allowed = self.config.sensor_refresh
-        if allowed is None or self.net.predictor is None or not self.visited:
-            return report
+        allowed, report = self.config.sensor_refresh, self.report
+        if allowed is None or report is None or not self.visited:
+            return
         joints = self.env.robot.operated
-        found = explained(self.net, self._ask_visited(STATES // 4, nthread, move=False), joints)["mean"]
-        if found >= report["fitted"] - allowed:
-            return report | {"visited": found}
-        asked = self._ask_visited(STATES, nthread, move=True)
-        new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
-        return new | {"refits": report["refits"] + 1}
+        found = explained(self.net, self._ask_visited(STATES // 4, move=False), joints)["mean"]
+        self.report = report | {"visited": found}
+        if found < report["fitted"] - allowed:
+            asked = self._ask_visited(STATES, move=True)
+            new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
+            self.report = new | {"refits": report["refits"] + 1}
 
-    def _ask_visited(self, count: int, nthread: int, move: bool) -> Asked:
+    def _ask_visited(self, count: int, move: bool) -> Asked:
         env, seed = self.env, self.seed + self.done
         x, q, v = (np.concatenate(part) for part in zip(*self.visited, strict=True))
         pick = np.random.default_rng(seed).permutation(len(x))[:count]
         conditions = [env.conditions[g] for g in np.tile(env.group, len(self.visited))[pick]]
         return sensor_labels(
-            self.net, env.robot, x[pick], q[pick], v[pick], conditions, env.locked, seed, nthread, move
+            self.net, env.robot, x[pick], q[pick], v[pick], conditions, env.locked, seed, self.nthread, move
         )
 
     def round(self, tick: Callable[[], float]) -> float:
@@ -133,8 +137,6 @@ class WarmStart:
         or budget, lowers the step size.
         """
         self.collect(follow_labels=self.done == 0)
-        if self.done == 0:
-            self.net.fit_inputs(self.pool_x[0])
         x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
         config, net, total = self.config, self.net, 0.0
         net.train()
@@ -163,8 +165,18 @@ def held_labels(labels: Array, hold: int) -> Array:
     return np.mean([labels[i : rows + i] for i in range(hold)], axis=0, dtype=labels.dtype)
 
 
-def fit_sensors(net: DeltaNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthread: int = 0) -> Report:
-    """Standardise on the environment's recorded start states, fit the predictor there; returns held-out R²."""
+def fit_inputs(net: DeltaNet, env: DeltaEnv, x: torch.Tensor, seed: int, nthread: int = 0) -> Report | None:
+    """Before all training: statistics of the inputs from samples x, (N, dim), and on them the sensor predictor.
+
+    Returns:
+        Its R² on held-out states; None for a network without one.
+    """
+    net.fit_inputs(x)
+    return fit_sensors(net, env, seed, nthread) if net.predictor is not None else None
+
+
+def fit_sensors(net: DeltaNet, env: DeltaEnv, seed: int, nthread: int = 0) -> Report:
+    """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
     qs: list[Array] = []
@@ -178,11 +190,10 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthre
         groups.append(env.group)
     x, q, v, group = (np.concatenate(part) for part in (xs, qs, vs, groups))
     pick = np.sort(rng.permutation(len(x))[:STATES])
-    net.features.standardise.fit(net.features.relative(torch.from_numpy(x)))
     shuffled = rng.permutation(pick)
     asked = sensor_labels(
         net,
-        robot,
+        env.robot,
         x[shuffled],
         q[shuffled],
         v[shuffled],
@@ -191,4 +202,4 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, robot: RobotSpec, seed: int, nthre
         seed,
         nthread,
     )
-    return fit_predictor(net, asked, robot.operated, seed)
+    return fit_predictor(net, asked, env.robot.operated, seed)

@@ -70,9 +70,9 @@ class DeltaFNO(DeltaNet):
         self.pointwise = nn.ModuleList(nn.Linear(width, width) for _ in layers)
         self.head = dense(width, (4 * width,), n, zero=True)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t] → Δa, (B, n), rad."""
-        v = self.tokens(self.features(x))
+    def correct(self, prepared: Tensor) -> Tensor:
+        """Features → Δa, (B, n) rad."""
+        v = self.tokens(prepared)
         for spectral, pointwise in zip(self.spectral, self.pointwise, strict=True):
             v = gelu(spectral(v) + pointwise(v))
         return self.bounded(self.head(v[:, -1]))

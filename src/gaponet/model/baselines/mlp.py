@@ -19,9 +19,9 @@ class DeltaMLP(DeltaNet):
         super().__init__(config, n)
         self.net = dense(self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero=True)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t] → Δa, (B, n), rad."""
-        return self.bounded(self.net(self.features(x)))
+    def correct(self, prepared: Tensor) -> Tensor:
+        """Features → Δa, (B, n) rad."""
+        return self.bounded(self.net(prepared))
 
 
 def matched_hidden(config: ModelConfig, n: int, parameters: int) -> tuple[int, ...]:

@@ -41,7 +41,7 @@ class DeltaTransformer(DeltaNet):
         self.norm = nn.LayerNorm(width)
         self.head = dense(width, (), n, zero=True)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t] → Δa, (B, n), rad."""
-        tokens = self.blocks(self.tokens(self.features(x)))
+    def correct(self, prepared: Tensor) -> Tensor:
+        """Features → Δa, (B, n) rad."""
+        tokens = self.blocks(self.tokens(prepared))
         return self.bounded(self.head(self.norm(tokens[:, -1])))
