@@ -14,7 +14,8 @@ from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 from gaponet.model.config import Kind
 from gaponet.robot import RobotSpec
-from gaponet.train.config import FAST_PPO, TrainConfig
+from gaponet.train.config import TrainConfig
+from gaponet.train.config import fast as fast_preset
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
@@ -44,7 +45,7 @@ def train(
         model: gaponet, or a baseline: mlp, transformer, fno, inverse.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
-        fast: PPO with one pass over each batch and a small critic, whatever --ppo says.
+        fast: Networks half as wide and PPO with one pass over each batch, whatever the fields below say.
         robot: Robot name or folder, if not the package's robot of the dataset.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.
@@ -53,7 +54,8 @@ def train(
     """
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
-    config = replace(config, model=replace(config.model, kind=model), ppo=FAST_PPO if fast else config.ppo)
+    config = replace(config, model=replace(config.model, kind=model))
+    config = fast_preset(config) if fast else config
     trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
     card = trained.card
     val = card["val_mpjae"]

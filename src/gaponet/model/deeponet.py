@@ -111,7 +111,8 @@ class OperatorNet(DeltaNet):
 
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
-        see, ask = prepared.split([self.branch_inputs, prepared.shape[-1] - self.branch_inputs], dim=-1)
+        rows = prepared.flatten(0, -2)  # two-dimensional, so that linear layers need no copy of a part
+        see, ask = rows[:, : self.branch_inputs], rows[:, self.branch_inputs :]
         shape = (-1, self.n, self.config.num_basis)
         branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)

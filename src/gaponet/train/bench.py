@@ -10,6 +10,7 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from gaponet.model.layers import size
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs, replay
-from gaponet.train.config import FAST_PPO, PPOConfig, RewardConfig, TrainConfig
+from gaponet.train.config import RewardConfig, TrainConfig, fast
 from gaponet.train.env import DeltaEnv
 
 Array = np.ndarray
@@ -71,17 +72,19 @@ def bench_train(
         baseline: Whether stable-baselines3 takes part; it has to be installed.
 
     Returns:
-        speeds by name, expected (control steps/s) and share of it, parameters, peak_memory_bytes.
+        speeds by name, expected (control steps/s) and share of it, times_sb3 (PPO's speed over that of each
+        stable-baselines3), parameters, peak_memory_bytes.
     """
     from gaponet.train.ppo import make_runner, update
 
     torch.set_num_threads(config.learner_threads)
-    config = replace(config, ppo=_scaled(config.ppo, num_envs))
+    config = _for_envs(config, num_envs)
+    quick = fast(config)
     steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
     env = _environment(robot, config.model, num_envs, config.threads)
     net = build_network(config.model, env.num_actions)
     runner = make_runner(env, net, config.ppo)
-    fast = make_runner(env, build_network(config.model, env.num_actions), _scaled(FAST_PPO, num_envs))
+    quick_runner = make_runner(env, build_network(quick.model, env.num_actions), quick.ppo)
     turns: dict[str, Turn] = {
         "bare Batch loop": _bare_loop(robot, num_envs, steps, config.threads),
         "environment step": _idle_steps(env, steps),
@@ -89,22 +92,25 @@ def bench_train(
         "collection": lambda: _collect(runner),
         "update": lambda: _update(runner),
         "PPO": lambda: update(runner),
-        "PPO, fast preset": lambda: update(fast),
+        "PPO, fast preset": lambda: update(quick_runner),
     }
-    counts = dict.fromkeys(turns, batch) | {"PPO, fast preset": num_envs * FAST_PPO.num_steps}
+    counts = dict.fromkeys(turns, batch)
+    learners: dict[str, Any] = {}
     if baseline:
-        from gaponet.train.bench_sb3 import batched, separate
+        from gaponet.train.bench_sb3 import THEIR_BATCH, batched, separate
 
-        model = batched(env, config)
-        turns["stable-baselines3, batched"] = lambda: model.learn(batch, reset_num_timesteps=False)
-        counts["stable-baselines3, batched"] = batch
+        ours = batch // config.ppo.mini_batches
+        learners = {
+            "stable-baselines3": batched(env, config, THEIR_BATCH),
+            f"… with mini-batches of {ours:,}": batched(env, config, ours),
+        }
         if config.model.kind != "mlp":
-            mlp = batched(env, config, matched_hidden(config.model, env.num_actions, size(net)))
-            turns["stable-baselines3, batched, an MLP"] = lambda: mlp.learn(batch, reset_num_timesteps=False)
-            counts["stable-baselines3, batched, an MLP"] = batch
+            hidden = matched_hidden(config.model, env.num_actions, size(net))
+            learners["… and an MLP of as many parameters"] = batched(env, config, ours, hidden)
         single, samples, close = separate(robot, config, _motions(robot, 8))
-        turns["stable-baselines3, SubprocVecEnv"] = lambda: single.learn(samples, reset_num_timesteps=False)
-        counts["stable-baselines3, SubprocVecEnv"] = samples
+        learners["stable-baselines3, SubprocVecEnv"] = single
+        counts |= dict.fromkeys(learners, batch) | {"stable-baselines3, SubprocVecEnv": samples}
+        turns |= {name: partial(m.learn, counts[name], reset_num_timesteps=False) for name, m in learners.items()}
     try:
         seconds = take_turns(turns, rounds)
     finally:
@@ -116,14 +122,17 @@ def bench_train(
         "speeds": speeds,
         "expected": expected,
         "share_of_expected": speeds["PPO"]["control_steps_per_s"] / expected,
+        "times_sb3": {name: speeds["PPO"]["ratio"] / speeds[name]["ratio"] for name in learners},
         "parameters": size(net),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }
 
 
-def _scaled(ppo: PPOConfig, num_envs: int) -> PPOConfig:
+def _for_envs(config: TrainConfig, num_envs: int) -> TrainConfig:
     """For another number of environments, with mini-batches of the same size."""
-    return replace(ppo, num_envs=num_envs, mini_batches=max(1, ppo.mini_batches * num_envs // ppo.num_envs))
+    ppo = config.ppo
+    parts = max(1, ppo.mini_batches * num_envs // ppo.num_envs)
+    return replace(config, ppo=replace(ppo, num_envs=num_envs, mini_batches=parts))
 
 
 def take_turns(turns: dict[str, Turn], rounds: int) -> dict[str, float]:

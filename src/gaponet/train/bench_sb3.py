@@ -33,19 +33,21 @@ from gaponet.train.env import DeltaEnv
 
 Array = np.ndarray
 
+THEIR_BATCH = 64  # samples in a mini-batch, where nothing else is said
 PROCESSES = 8
 PROCESS_STEPS = 256  # control periods per update and process
 
 
-def batched(env: DeltaEnv, config: TrainConfig, hidden: tuple[int, ...] | None = None) -> PPO:
+def batched(env: DeltaEnv, config: TrainConfig, batch_size: int, hidden: tuple[int, ...] | None = None) -> PPO:
     """stable-baselines3's PPO on the environment that gaponet trains in, with the same network or with an MLP.
 
     Args:
         env: Ours.
         config: Network and PPO.
+        batch_size: Samples in a mini-batch.
         hidden: Hidden layers of an MLP in the network's place.
     """
-    return _ppo(_Batched(env), config, config.ppo.num_steps, hidden)
+    return _ppo(_Batched(env), config, config.ppo.num_steps, batch_size, hidden)
 
 
 def separate(robot: RobotSpec, config: TrainConfig, motions: ListOf[Sequence]) -> tuple[PPO, int, Callable[[], None]]:
@@ -54,7 +56,7 @@ def separate(robot: RobotSpec, config: TrainConfig, motions: ListOf[Sequence]) -
         partial(SingleEnv, robot, motions, config.model, seed) for seed in range(PROCESSES)
     ]
     env = SubprocVecEnv(make, start_method="spawn")
-    return _ppo(env, config, PROCESS_STEPS), PROCESSES * PROCESS_STEPS, env.close
+    return _ppo(env, config, PROCESS_STEPS, THEIR_BATCH), PROCESSES * PROCESS_STEPS, env.close
 
 
 class _Networks(nn.Module):
@@ -92,8 +94,10 @@ class SameNetwork(ActorCriticPolicy):
         self.mlp_extractor = _Networks(self.model, n, self.critic_hidden)  # type: ignore[assignment]
 
 
-def _ppo(env: VecEnv, config: TrainConfig, num_steps: int, hidden: tuple[int, ...] | None = None) -> PPO:
-    """The same network or an MLP, everything else as in ours, mini-batches as large."""
+def _ppo(
+    env: VecEnv, config: TrainConfig, num_steps: int, batch_size: int, hidden: tuple[int, ...] | None = None
+) -> PPO:
+    """The same network or an MLP, everything else as in ours."""
     ppo, model = config.ppo, config.model
     policy: dict[str, Any] = {"log_std_init": math.log(ppo.init_std), "ortho_init": False}
     if hidden is None:
@@ -105,7 +109,7 @@ def _ppo(env: VecEnv, config: TrainConfig, num_steps: int, hidden: tuple[int, ..
         env,
         n_steps=num_steps,
         n_epochs=ppo.epochs,
-        batch_size=min(ppo.num_envs * ppo.num_steps // ppo.mini_batches, env.num_envs * num_steps),
+        batch_size=batch_size,
         learning_rate=ppo.learning_rate,
         gamma=ppo.gamma,
         gae_lambda=ppo.lam,
