@@ -42,6 +42,7 @@ class WebScene:
         self.labels = self._labels()
         self._aim()
         meta, gui = scene.shown.real.meta, self.server.gui
+        gui.main_panel.dock_right()  # beside the robots, not in front of them
         head = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
         head += f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
         gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
@@ -99,7 +100,7 @@ class WebScene:
         across, up = self.scene.view.axes
         camera, toward = self.server.initial_camera, np.cross(across, up)
         camera.look_at = self.scene.middle
-        camera.position = self.scene.middle + 1.8 * self.scene.extent * toward
+        camera.position = self.scene.middle + 2.0 * self.scene.extent * toward
         camera.fov = np.radians(45)
 
 
