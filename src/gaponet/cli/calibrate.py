@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from typing import Literal
 
@@ -67,7 +68,9 @@ def calibrate(
         [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
     ])  # fmt: skip
     if found.payload_mass is not None:
-        out.say(f"payload {found.payload_mass:.2f} ± {found.payload_std:.2f} kg in each hand that carries")
+        known = found.payload_std is not None and isfinite(found.payload_std)  # it takes two windows to tell
+        spread = f" ± {found.payload_std:.2f}" if known else ""
+        out.say(f"payload {found.payload_mass:.2f}{spread} kg in each hand that carries")
     out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; {path}")
     out.say(f"next: gaponet eval {run} {dataset}")
     out.result(asdict(found))
