@@ -93,7 +93,7 @@ def result(
         for word, title, colour in named:
             if word in found:
                 methods[title] = (colour, masses, [at(found[word], m) for m in by])
-        panels.append((f"{q.payload:g} kg left out, {q.name} the others ({study.who})", methods))
+        panels.append((f"{q.payload:g} kg left out, {q.name} the others\n{study.who}", methods))
     figure = lines(panels, ("payload per hand, kg", "MPJAE, mrad"), [(m, f"{m:g}") for m in masses],
                    marked=[q.payload for q in asked])  # fmt: skip
     return Result(
