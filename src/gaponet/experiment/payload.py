@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
 from gaponet.data.store import Dataset
@@ -10,7 +11,7 @@ from gaponet.eval.colours import COLOURS
 from gaponet.experiment.cells import Found, Show, Study, baselines, outcomes, spread, train_all
 from gaponet.experiment.draw import lines
 from gaponet.experiment.result import Cell as TableCell
-from gaponet.experiment.result import Result, Table, compared, label
+from gaponet.experiment.result import Result, Spread, Table, compared, label
 from gaponet.train.compare import Cell
 
 ALL, BLIND = "gaponet", ":payload_input=off"
@@ -70,7 +71,6 @@ def result(
 ) -> Result:
     """Table, figure and sentences; base as of evaluate_baselines."""
     by = sorted(base["nominal"]["known"]["by_payload"], key=float)
-    at = lambda cells, mass: spread(cells, "known", "by_payload", mass, "mpjae")  # noqa: E731
     titles = {ALL: "GAPONet trained on all payloads", ALL + BLIND: "GAPONet trained on all payloads, mass not told"}
     for q in asked:
         told, blind = q.words
@@ -103,11 +103,16 @@ def result(
     )  # fmt: skip
 
 
+def at(runs: ListOf[Found], mass: str) -> Spread:
+    """Error at a payload over seeds, mrad."""
+    return spread(runs, "known", "by_payload", mass, "mpjae")
+
+
 def _sentences(asked: tuple[Question, ...], found: dict[str, list[Found]], base: Found) -> list[str]:
     out = []
     for q in asked:
         mass = next(m for m in base["nominal"]["known"]["by_payload"] if float(m) == q.payload)
-        error = {w: spread(f, "known", "by_payload", mass, "mpjae") for w, f in found.items()}
+        error = {w: at(f, mass) for w, f in found.items()}
         nominal = base["nominal"]["known"]["by_payload"][mass]["mpjae"] * 1e3
         told, blind = q.words
         if told not in error:
