@@ -79,8 +79,10 @@ def result(
     rows: list[tuple[TableCell, ...]] = [
         ("nominal simulator", *(at([base["nominal"]], m) for m in by)),
         ("delay + offset", *(at([base["delay_offset"]], m) for m in by)),
-        *((title, *(at(found[word], m) for m in by)) for word, title in titles.items() if word in found),
     ]
+    for word, title in titles.items():
+        if word in found:
+            rows.append((title, *(at(found[word], m) for m in by)))
     columns = ("MPJAE, mrad", *(f"{float(m):g} kg" for m in by))
     caption = (
         "Held-out motions, whole-motion free run, mean ± std over seeds; delay + offset is fitted on all payloads."
