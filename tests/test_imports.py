@@ -11,7 +11,7 @@ SOURCE = Path(gaponet.__file__).parent
 # A module may import from its own rank or a lower one.
 RANKS = [
     {"errors", "packaged", "robot", "robot_folder"}, {"data"}, {"gap"}, {"sim"}, {"motion"}, {"virtual", "collect"},
-    {"model"}, {"train", "deploy"}, {"eval"}, {"cli"},
+    {"model"}, {"train", "deploy"}, {"eval"}, {"experiment"}, {"cli"},
 ]  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl")
 

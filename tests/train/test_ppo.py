@@ -3,14 +3,11 @@
 import torch
 from arm import recordings, write_arm
 
-from gaponet.data.store import Dataset
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.train.budget import Budget
-from gaponet.train.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.train.config import PPOConfig, RewardConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.ppo import Correct, PreparedEnv, make_runner, trained_by, update
-from gaponet.train.run import Trainer
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
 PPO = PPOConfig(num_envs=16, num_steps=8, epochs=1, mini_batches=2, critic_warmup=0, learning_rate=1e-3)
@@ -31,16 +28,3 @@ def test_the_prepared_observation_corrects_as_the_network_does(tmp_path):
         name.split(".")[0] for name, p in trained_by(runner).named_parameters() if not torch.equal(p, before[name])
     }
     assert changed == {"branch", "trunk", "bias"}
-
-
-def test_ppo_from_nothing_knows_the_scale_of_its_inputs_and_what_the_simulator_answers(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    data = Dataset.create(tmp_path / "data", robot)
-    for sequence in recordings(robot, 8, rows=60, kp=0.5):
-        data.append(sequence)
-    config = TrainConfig(MODEL, warm_start=WarmStartConfig(rounds=0), ppo=PPO, episode_s=0.5)
-    trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 8))
-    trainer.run()
-    assert trainer.updates == 2
-    assert trainer.sensor_r2["mean"] > 0.3
-    assert trainer.net.features.standardise.mean.abs().max() > 0

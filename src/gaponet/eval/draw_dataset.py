@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
@@ -70,9 +71,15 @@ def draw_all(
 def save(fig: Figure, path: Path) -> list[Path]:
     """SVG with letters as outlines, so that it looks the same everywhere, and PNG for screens and slides."""
     files = [path.with_suffix(".svg"), path.with_suffix(".png")]
+    how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
     with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):  # type: ignore[arg-type]
-        fig.savefig(files[0], metadata={"Date": None})
-        fig.savefig(files[1], dpi=200)
+        for file, options in zip(files, how, strict=True):
+            temporary = file.with_name(f".{os.getpid()}.{file.name}")
+            try:
+                fig.savefig(temporary, **options)
+                os.replace(temporary, file)
+            finally:
+                temporary.unlink(missing_ok=True)
     return files
 
 

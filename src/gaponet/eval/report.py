@@ -2,48 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gaponet.data.store import Dataset, write_text
 from gaponet.errors import DatasetError, ModelError
+from gaponet.eval.page import facts_table, figure, page, table
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 Array = np.ndarray
 Tell = Callable[[str, float, float], None]
-
-CSS = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 1080px; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.7rem; margin-bottom: .2rem }
-h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
-table { border-collapse: collapse; margin: .6rem 0 }
-th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #eee }
-th { background: #fafafa }
-th:first-child, td:first-child, .facts td { text-align: left; vertical-align: top }
-.facts td:first-child { color: #666; white-space: nowrap }
-tr.best td { font-weight: 600 }
-.tag { display: inline-block; padding: .1rem .6rem; border-radius: 1rem; color: #fff; font: 600 .85rem system-ui }
-.real { background: #1b7f3b }
-.virtual { background: #7b3fa0 }
-.warn { background: #fff4e0; border-left: 4px solid #d99000; padding: .4rem .8rem; margin: .3rem 0 }
-.lead { font-size: 1.1rem }
-.row { display: flex; flex-wrap: wrap; gap: 1rem }
-figure { margin: 1rem 0 }
-figcaption { color: #666; font-size: .88rem }
-svg, img { max-width: 100%; height: auto }
-code { background: #f4f4f4; padding: 0 .25rem }
-"""
 
 
 def write_report(
@@ -74,9 +48,9 @@ def write_report(
     curve = [json.loads(line) for line in lines if line.strip()]
     progress("drawing", 0, 1)
     budget = _json(run / "budget.json") if (run / "budget.json").is_file() else None
-    page = _page(model.card, config, metrics, arrays, curve, spec, budget)
+    text = _page(model.card, config, metrics, arrays, curve, spec, budget)
     path = run / "report.html"
-    write_text(path, page)
+    write_text(path, text)
     progress("drawing", 1, 1)
     return path
 
@@ -126,29 +100,25 @@ def _page(
         "<h2>Errors, whole-motion free run on held-out recordings</h2>" if metrics["unseen"]
         else "<h2>Errors, whole-motion free run (some recordings were used in training)</h2>",
         _totals(methods, draw.NAMES, ratio),
-        '<div class="row">', _figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
-        _figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
+        '<div class="row">', figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+        figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
     ]  # fmt: skip
     if len(methods["nominal"]["by_payload"]) > 1:
-        body.append(_figure(draw.by_payload(methods), "Payload in each hand."))
+        body.append(figure(draw.by_payload(methods), "Payload in each hand."))
     body += ["</div>", "<h2>Trajectories</h2>", *_trajectories(arrays, metrics, robot)]
     if budget is not None:
         body += [
             "<h2>Where the gap comes from</h2>",
-            _figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (hollow: adds to it)."),
+            figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (hollow: adds to it)."),
         ]
     body += [
         "<h2>Training</h2>", '<div class="row">',
-        _figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
+        figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
         _training_table(card, config), "</div>",
         "<h2>By motion</h2>", _by_motion(methods, draw.NAMES),
         "<h2>What exactly</h2>", _facts(card, metrics),
     ]  # fmt: skip
-    title = f"{robot.name} {name}"
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{CSS}</style></head><body>{''.join(body)}</body></html>\n"
-    )
+    return page(f"{robot.name} {name}", "".join(body))
 
 
 def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[str]:
@@ -162,7 +132,7 @@ def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: Robo
         worst = sorted(np.argsort(-errors)[:3].tolist())
         fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(metrics["methods"]), shown["dt"])
         where = html.escape(f"unit {shown['unit_id']}, {shown['payload_mass']:g} kg")
-        yield _figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({where}): {caption}")
+        yield figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({where}): {caption}")
 
 
 def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
@@ -215,20 +185,6 @@ def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> str:
     )
 
 
-def _facts_table(rows: list[list[str]]) -> str:
-    body = "".join(f"<tr><td>{html.escape(k)}</td><td>{html.escape(v)}</td></tr>" for k, v in rows)
-    return f'<table class="facts">{body}</table>'
-
-
-def _table(head: list[str], rows: list[list[str]], best: int | None = None) -> str:
-    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
-    body = "".join(
-        f"<tr{' class=best' if i == best else ''}>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>"
-        for i, row in enumerate(rows)
-    )
-    return f"<table><tr>{cells}</tr>{body}</table>"
-
-
 def _totals(methods: dict[str, Any], names: dict[str, str], ratio: dict[str, float]) -> str:
     head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static, mrad", "dynamic, mrad",
             "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
@@ -238,13 +194,13 @@ def _totals(methods: dict[str, Any], names: dict[str, str], ratio: dict[str, flo
          f"{m['large_0.1'] * 100:.2f} %", f"{m['correlation']:.4f}"]
         for n, m in methods.items()
     ]  # fmt: skip
-    return _table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
+    return table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
 
 
 def _by_motion(methods: dict[str, Any], names: dict[str, str]) -> str:
     head = ["motion, MPJAE in mrad", *(names[n] for n in methods)]
     keys = methods["nominal"]["by_motion"]
-    return _table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
+    return table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
 
 
 def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
@@ -262,7 +218,7 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
         ["seed", str(card["seed"])],
         ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
     ]  # fmt: skip
-    return _facts_table(rows)
+    return facts_table(rows)
 
 
 def _r2(found: dict[str, Any] | float | None) -> str:
@@ -284,18 +240,4 @@ def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> str:
         ["artifacts", ", ".join(f"{n} {a['weights']} (seed {a['seed']})" for n, a in metrics["artifacts"].items())],
         ["versions", ", ".join(f"{k} {v}" for k, v in card["versions"].items())],
     ]  # fmt: skip
-    return _facts_table(rows)
-
-
-def _figure(fig: Figure, caption: str) -> str:
-    """Inline SVG where it is small, PNG where a plot has many points."""
-    buffer = io.BytesIO()
-    fig.savefig(buffer, format="svg")
-    data = buffer.getvalue().decode()
-    if len(data) > 400_000:
-        buffer = io.BytesIO()
-        fig.savefig(buffer, format="png", dpi=150)
-        image = f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
-    else:
-        image = data[data.index("<svg") :]
-    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+    return facts_table(rows)

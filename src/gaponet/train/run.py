@@ -101,7 +101,7 @@ class Trainer:
             budget,
             show,
         )
-        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads)
+        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
@@ -116,6 +116,7 @@ class Trainer:
         self.runner_state: State | None = None
         self.env_state: State | None = None  # of PPO's environments
         self.warm_state: State | None = None
+        self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
         if resume:
@@ -126,13 +127,16 @@ class Trainer:
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
         self.nominal = self.validate(None)
-        self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
+        if self.baseline is None:
+            self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
             if not np.isfinite(self.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
             if recipe(self.config).rounds > self.rounds_done:
                 self._warm_start()
+            elif not recipe(self.config).rounds and self.runner_state is None:
+                self._cold_start()
             self._ppo()
             self._shrink()
         except KeyboardInterrupt:
@@ -168,6 +172,15 @@ class Trainer:
             self.steps += config.num_envs * config.steps
             self._consider()
 
+    def _cold_start(self) -> None:
+        """PPO alone also needs the statistics of its inputs, and sensors that answer."""
+        self.stage = "sensors"
+        self._tick()
+        env = self._env(self.config.warm_start.num_envs, 10**9, self.config.seed)
+        x = env.get_observations()["actor"]
+        self.sensor_r2 = fit_inputs(self.net, env, x, self.config.seed, self.config.threads)
+        self.trained_state = copy.deepcopy(self.net.state_dict())
+
     def _ppo(self) -> None:
         ppo = self.config.ppo
         if self._spent() >= 1 or self.config.model.kind == "inverse":
@@ -175,11 +188,7 @@ class Trainer:
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
         env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        if self.updates == 0 and not recipe(self.config).rounds:
-            x = env.get_observations()["actor"]
-            self.sensor_r2 = fit_inputs(self.net, env, x, self.config.seed, self.config.threads)
-        else:
-            self.net.load_state_dict(self.trained_state)
+        self.net.load_state_dict(self.trained_state)
         runner = make_runner(env, self.net, ppo)
         if self.runner_state is not None:
             runner.alg.load(self.runner_state, None, True)
@@ -327,6 +336,7 @@ class Trainer:
 
     def _card(self) -> dict[str, Any]:
         seen = self.train_set
+        assert self.baseline is not None
         return make_card(
             self.config.model,
             self.robot,
