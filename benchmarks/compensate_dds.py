@@ -40,7 +40,11 @@ def main(
     for motion in motions:
         options = ["--motion", motion, "--payload-mass", f"{payload_mass:g}"]
         raw, compensated = (
-            play(domain, ["--unit", unit, "--payload-mass", f"{payload_mass:g}", "--rate", f"{state_rate:g}"], options + m)
+            play(
+                domain,
+                ["--unit", unit, "--payload-mass", f"{payload_mass:g}", "--rate", f"{state_rate:g}"],
+                options + m,
+            )
             for m in ([], ["--model", str(run)])
         )
         before, after = (1e3 * r["tracking_error_rad"]["mean"] for r in (raw, compensated))
