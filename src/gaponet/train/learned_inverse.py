@@ -22,7 +22,7 @@ from gaponet.robot import RobotSpec
 Array = np.ndarray
 
 HIDDEN = (256, 128)
-CONVERGED = CompensatorConfig(iterations=12, feedback=0.0, blend=0.0)  # 0.5¹² of an error that is small to begin with
+CONVERGED = CompensatorConfig(iterations=8, feedback=0.0, blend=0.0)  # 0.5⁸ of an error that is small to begin with
 HELD_OUT = 0.1  # share of the motions that only judge
 
 
@@ -47,7 +47,7 @@ def visit(robot: RobotSpec, model: GapModel, targets: list[Array], masses: Array
     return np.stack(x), np.stack(offset)
 
 
-def fit_inverse(net: DeltaNet, x: Array, offset: Array, steps: int, batch: int = 1024, seed: int = 0) -> None:
+def fit_inverse(net: DeltaNet, x: Array, offset: Array, steps: int, batch: int = 512, seed: int = 0) -> None:
     """Least squares, Adam with a falling step size; x (k, dim), offset (k, n) rad."""
     inputs, labels = torch.from_numpy(x), torch.from_numpy(offset)
     net.fit_inputs(inputs)
@@ -64,7 +64,7 @@ def fit_inverse(net: DeltaNet, x: Array, offset: Array, steps: int, batch: int =
 
 
 def learn_inverse(
-    robot: RobotSpec, model: GapModel, motions: list[Array], steps: int = 3000, seed: int = 0
+    robot: RobotSpec, model: GapModel, motions: list[Array], steps: int = 2000, seed: int = 0
 ) -> dict[str, float]:
     """Fit and write the inverse of a model, beside it.
 
