@@ -62,7 +62,7 @@ def _inverse(screen: Out, run: Path, model: GapModel) -> None:
     kept = run / "robot"
     robot = load_robot(kept if (kept / "robot.toml").is_file() else model.card["robot"])
     library = Library(robot, INVERSE_SEED, model.config.payload_max)
-    motions = [library.make(name).sample(robot.dt) for name in library.names()[::2]]  # of all kinds, all joints
+    motions = [library.make(name).sample(robot.dt) for name in library.names()[::2]]
     facts = learn_inverse(robot, model, motions)
     screen.say(
         f"{model.path / INVERSE}: misses {1e3 * facts['rms_missed']:.2f} of {1e3 * facts['rms_offset']:.2f} mrad (rms) "
