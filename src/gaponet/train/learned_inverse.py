@@ -35,7 +35,7 @@ def visit(robot: RobotSpec, model: GapModel, targets: list[Array], masses: Array
         targets: N motions, (T, n) rad each, cut to the shortest.
         masses: (N,) kg.
     """
-    compensator = Compensator(robot, model, CONVERGED, num_envs=len(targets), nthread=0)
+    compensator = Compensator(robot, model, CONVERGED, num_envs=len(targets))
     rows = min(len(target) for target in targets)
     played = np.stack([target[:rows] for target in targets], axis=1)
     compensator.reset(played[0], masses)
