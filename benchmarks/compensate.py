@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from gaponet.data.store import Dataset
-from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.deploy.compensator import INVERSE, Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import idle_joints
@@ -33,6 +33,7 @@ METHODS: dict[str, CompensatorConfig | None] = {
     "target: gravity + feedback": replace(AT_ONCE, iterations=0),
     "target: gravity + G": replace(AT_ONCE, feedback=0.0),
     "target: gravity + G + feedback": AT_ONCE,
+    "the same, learned inverse": replace(AT_ONCE, inverse="learned"),  # after gaponet export RUN --to inverse
     "the same, payload not told": AT_ONCE,
     "the same, targets 40 ms ahead": replace(AT_ONCE, lead=2),
 }
@@ -57,6 +58,8 @@ def main(
     print(f"VIRTUAL unit {unit}, {', '.join(motions)}; kg: {', '.join(f'{p:g}' for p in payloads)}")
     for name, config in METHODS.items():
         if only and name not in (*only, "uncompensated"):
+            continue
+        if config is not None and config.inverse == "learned" and not (model.path / INVERSE).is_dir():
             continue
         told = None if "not told" in name else mass
         q, u, aimed = play(robot, model, unit, targets, mass, config, told)

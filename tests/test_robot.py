@@ -111,3 +111,10 @@ def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
         write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")
     with pytest.raises(RobotError, match="mass = 3"):
         write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")
+
+
+@pytest.mark.parametrize("name", ["so101", "h1_2"])
+def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
+    save_robot(load_robot(name), tmp_path / "here")
+    (tmp_path / "here").rename(tmp_path / "there")
+    assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"

@@ -27,7 +27,8 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     text = (source / "robot.toml").read_text(encoding="utf-8").split(MARK)[0].rstrip() + "\n"
     xml = robot.mjcf.read_text(encoding="utf-8")
     folder.mkdir(parents=True, exist_ok=True)
-    if re.search(r"<include\b|\bfile=|dir=", xml):  # it refers to files beside it: point at it where it is
+    # An MJCF that refers to files beside it stays where it is.
+    if re.search(r"<include\b|\bfile=|\b(mesh|texture|asset)dir=", xml):
         text = re.sub(r"(?m)^mjcf *=.*\n", "", text)
         text = f"mjcf = '{robot.mjcf.resolve()}'\n" + text
     else:

@@ -54,6 +54,16 @@ def test_it_is_the_replay_with_the_corrector(robot, model):
     assert np.abs(sim.delta).max() > 1e-3
 
 
+def test_without_a_model_it_is_the_nominal_simulator(robot):
+    sequence = recordings(robot, 1, rows=30)[0]
+    sim = AlignedSim(robot, None)
+    sim.reset(sequence.qpos[0], sequence.qvel[0])
+    for t in range(29):
+        sim.step(sequence.ctrl[t])
+        np.testing.assert_allclose(sim.qpos, sequence.qpos[t + 1], atol=1e-9)
+        np.testing.assert_array_equal(sim.delta, 0.0)
+
+
 def test_one_simulation_takes_flat_arrays(robot, model):
     one, two = AlignedSim(robot, model, 0.2), AlignedSim(robot, model, 0.2, num_envs=2)
     for target in commands(20, 0):

@@ -239,6 +239,31 @@ def test_a_compensator_acts_within_its_bounds(arm):
     np.testing.assert_allclose(delta[:, 1], -0.01, atol=1e-12)
 
 
+def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
+    class Guard:
+        beats = 0
+
+        def beat(self):
+            self.beats += 1
+            return True
+
+    class Slow:
+        def reset(self, target, payload_mass=None):
+            assert guard.beats == 0  # from the first beat on, the guard damps a robot that it hears nothing of
+            clock.wait_until(clock.now() + 0.4)
+
+        def step(self, target, qpos, qvel):
+            return target
+
+    clock, guard = SimulatedClock(), Guard()
+    driver = Tampered(arm, clock)
+    controller = Controller(driver, arm, QUICK, compensator=Slow(), clock=clock)
+    controller._guard = guard
+    recording = controller.run(play(MOTION, controller.dt))
+    assert recording.fault is None
+    assert guard.beats > 40
+
+
 def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
     monkeypatch.setattr("gaponet.deploy.controller.PATIENCE", 0.3)
     recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+
+if TYPE_CHECKING:
+    from gaponet.model.artifact import GapModel
+
+INVERSE_SEED = 7  # of the motions it is fitted on; recipes have 0
 
 
 def export(
     run: tyro.conf.Positional[Path],
-    to: Literal["onnx", "torchscript"] = "onnx",
+    to: Literal["onnx", "torchscript", "inverse"] = "onnx",
     out: Path | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Write a run's model again (onnx, with the weights for numpy), or as TorchScript for simulators in torch.
+    """Write a run's model again: as ONNX with the weights for numpy, as TorchScript, or inverted.
 
     Args:
         run: Run folder of gaponet train; for torchscript an artifact folder will do.
         to: onnx: model.onnx, weights.npz and card.json. torchscript: delta.pt, with history and limits inside.
-        out: Folder for onnx, file for torchscript; default the run's model folder.
+            inverse: a network fitted to the compensator's fixed point, beside the model; a minute or two.
+        out: Folder for onnx, file for torchscript; default the run's model folder. Not for inverse.
         json: One JSON object on stdout.
     """
     from gaponet.model.artifact import GapModel
@@ -30,6 +37,11 @@ def export(
     from gaponet.model.torchscript import FILE, export_torchscript
 
     screen, model = Out(json), GapModel.load(run)
+    if to == "inverse":
+        if out is not None:
+            raise UsageError("--out: a compensator looks for the inverse beside its model; leave --out away")
+        _inverse(screen, run, model)
+        return
     if to == "torchscript":
         path = out or model.path / FILE
         difference = export_torchscript(model, run, path)
@@ -39,3 +51,21 @@ def export(
         difference = write(net, path, model.card, drawn_states(net))
     screen.say(f"{path}: differs by {difference:.1e} rad from what was trained")
     screen.result({"path": str(path), "to": to, "parity_rad": difference})
+
+
+def _inverse(screen: Out, run: Path, model: GapModel) -> None:
+    from gaponet.deploy.compensator import INVERSE
+    from gaponet.motion.library import Library
+    from gaponet.robot import load_robot
+    from gaponet.train.learned_inverse import learn_inverse
+
+    kept = run / "robot"
+    robot = load_robot(kept if (kept / "robot.toml").is_file() else model.card["robot"])
+    library = Library(robot, INVERSE_SEED, model.config.payload_max)
+    motions = [library.make(name).sample(robot.dt) for name in library.names()[::2]]
+    facts = learn_inverse(robot, model, motions)
+    screen.say(
+        f"{model.path / INVERSE}: misses {1e3 * facts['rms_missed']:.2f} of {1e3 * facts['rms_offset']:.2f} mrad (rms) "
+        f"on motions held out of {len(motions)}"
+    )
+    screen.result({"path": str(model.path / INVERSE), "to": "inverse"} | facts)

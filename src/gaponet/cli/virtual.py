@@ -24,7 +24,7 @@ def virtual(
     interface: str = "lo",
     rate: float = 500.0,
     seconds: float | None = None,
-    fault: Literal["none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum"] = "none",
+    fault: Literal["none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock"] = "none",
     fault_at: float = 2.0,
     heard: Path | None = None,
     link: Path | None = None,

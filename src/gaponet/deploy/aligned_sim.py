@@ -26,7 +26,7 @@ class AlignedSim:
     def __init__(
         self,
         robot: RobotSpec,
-        model: GapModel,
+        model: GapModel | None,
         payload_mass: Array | float = 0.0,
         payload_side: str = "both",
         dt: float | None = None,
@@ -38,7 +38,7 @@ class AlignedSim:
 
         Args:
             robot: The simulator that the model corrects: the package's robot, or RUN/robot after an identification.
-            model: What training made.
+            model: What training made; None for the nominal simulator behind the same calls.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
             payload_side: "both", or the side of one mount.
             dt: Control period, s; default the robot's.
@@ -47,7 +47,8 @@ class AlignedSim:
             locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them.
         """
         self.dt = robot.dt if dt is None else dt
-        model.require(robot, self.dt)
+        if model is not None:
+            model.require(robot, self.dt)
         self.robot, self.model, self.single = robot, model, num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
@@ -60,7 +61,7 @@ class AlignedSim:
         if missing:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
-        self.loop = model.loop(self.num_envs)
+        self.loop = None if model is None else model.loop(self.num_envs)
         self._depth = 1 + int(np.ceil(robot.delay.max() / self.dt))
         self.target = np.zeros((self.num_envs, self.n))
         self.reset()
@@ -101,7 +102,8 @@ class AlignedSim:
         v = np.broadcast_to(np.asarray(qvel, float), (count, self.n))
         u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), (count, self.n))
         self.sim.reset(ids, q, v, past=np.repeat(u[:, None], self._depth, axis=1))
-        self.loop.reset(ids)
+        if self.loop is not None:
+            self.loop.reset(ids)
         self.target[ids] = u
         self._asked = self.target[:, self.op]
 
@@ -110,6 +112,7 @@ class AlignedSim:
         sim, op, target = self.sim, self.op, self.target
         target[:] = ctrl
         self._asked = target[:, op]
-        self.loop.delta(sim.qpos[:, op], sim.qvel[:, op], self._asked, self.payload_mass)
-        target[:, op] = self.loop.applied
+        if self.loop is not None:
+            self.loop.delta(sim.qpos[:, op], sim.qvel[:, op], self._asked, self.payload_mass)
+            target[:, op] = self.loop.applied
         sim.step(target)

@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from gaponet.deploy.payload import PayloadEstimate
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
@@ -31,6 +31,7 @@ from gaponet.sim.model import idle_joints
 
 Array = np.ndarray
 
+INVERSE = "inverse"  # folder of the learned inverse beside the model (train/learned_inverse.py)
 SETTLE = 100  # control periods in which the shadow comes to rest at a start
 
 
@@ -40,6 +41,9 @@ class CompensatorConfig:
 
     aim: Literal["target", "simulator"] = "target"
     """target: the commanded positions. simulator: what the nominal simulator makes of them."""
+    inverse: Literal["fixed_point", "learned"] = "fixed_point"
+    """How u + G(u) = a′ is solved. learned: by one answer of a network that was fitted to the fixed point (gaponet
+    export RUN --to inverse)."""
     gain: float = 0.5
     """γ of an iteration; 0.5 converges wherever a change of u changes u + G(u) by a factor between 0 and 4."""
     iterations: int = 2
@@ -116,7 +120,7 @@ class Compensator:
         self.low, self.high = robot.qpos_range[self.op].T
         self.kp = robot.kp[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
-        self.loop = model.loop(num)
+        self.loop = (_learned_inverse(model) if config.inverse == "learned" else model).loop(num)
         self.estimate = PayloadEstimate(self.shadow, self.at, robot, len(self.masses), self.dt)
         self._carried = np.full(num, -1)
 
@@ -193,8 +197,10 @@ class Compensator:
 
     def _solve(self, wanted: Array) -> Array:
         """u with u + G(u) = wanted, G at the shadow."""
-        loop, gain = self.loop, self.config.gain
+        loop, gain, self.wanted = self.loop, self.config.gain, wanted
         q, v = (x[: self.num_envs, self.at] for x in (self.shadow.qpos, self.shadow.qvel))
+        if self.config.inverse == "learned":
+            return loop.answer(q, v, wanted, self.payload_mass)
         return loop.solve(q, v, wanted, self.payload_mass, self.offset, gain, self.config.iterations)
 
     def _observe(self, q: Array, qvel: Array | None, tau: Array | None) -> None:
@@ -232,3 +238,14 @@ class Compensator:
         if values.shape != (shape[1:] if self.single else shape):
             raise UsageError(f"compensator: arrays hold all {shape[1]} joints of {self.robot.name}, got {values.shape}")
         return values.reshape(shape)
+
+
+def _learned_inverse(model: GapModel) -> GapModel:
+    """The network beside a model that inverts it, and no other."""
+    folder = model.path / INVERSE
+    if not folder.is_dir():
+        raise ModelError(f"{model.path} has no learned inverse; make one: gaponet export RUN --to inverse")
+    inverse = GapModel.load(folder)
+    if inverse.card.get("inverse_of") != model.weights_hash():
+        raise ModelError(f"{folder} was learned from other weights; make it anew: gaponet export RUN --to inverse")
+    return inverse

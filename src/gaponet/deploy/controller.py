@@ -203,13 +203,18 @@ class Controller:
             late = now - (start + due * self.dt)
             if keys:
                 keys.poll()
-            if self._guard and not self._guard.beat() and self.phase not in (Phase.DAMP, Phase.STOPPED):
+            # Preparing the compensator may take long; the guard takes the first beat for the begin of life.
+            if self._guard and self._prepared and not self._guard.beat() and not self._ended:
                 self.stop("the guard process ended")
             self.recording.late.append(late)
             self._period(k, now, late, policy)
             lost = int((self.clock.now() - start) / self.dt) - k  # whole periods that this one ran over
             self.recording.missed += max(lost - 1, 0)
             k, due = k + max(1, lost), k + 1
+
+    @property
+    def _ended(self) -> bool:
+        return self.phase in (Phase.DAMP, Phase.STOPPED)
 
     def _period(self, k: int, now: float, late: float, policy: Policy) -> None:
         """Read, judge, send, note."""
@@ -244,7 +249,7 @@ class Controller:
         return state, self._latched(fault)
 
     def _latched(self, fault: Fault | None) -> Fault | None:
-        if self.phase in (Phase.DAMP, Phase.STOPPED):
+        if self._ended:
             return None
         return Fault("stop", f"asked to stop: {self.stop.reason}") if self.stop.reason else fault
 

@@ -96,6 +96,16 @@ class DeltaLoop:
         self.history.push(qpos, qvel, wanted)
         return wanted + offset
 
+    def answer(self, qpos: Array, qvel: Array, wanted: Array, payload_mass: Array) -> Array:
+        """What `solve` gives, where this network was fitted to it (train/learned_inverse.py): wanted + its answer."""
+        if self.any_fresh:
+            self._begin(qpos, qvel, wanted)
+        self.history.observe(qpos, qvel, payload_mass, out=self.observation)
+        self.action[:] = wanted
+        self.bound.run()
+        self.history.push(qpos, qvel, wanted)
+        return wanted + self.bound.delta
+
     def _begin(self, q: Array, v: Array, a: Array) -> None:
         ids = np.flatnonzero(self.fresh)
         self.history.reset(ids, *(np.repeat(x[ids, None], self.history.depth, axis=1) for x in (q, v, a)))

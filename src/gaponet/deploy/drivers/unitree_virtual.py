@@ -22,9 +22,10 @@ from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
-FaultKind = Literal["none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum"]
+FaultKind = Literal["none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock"]
 
 LATE = 0.3  # s by which messages of the fault "late" are held back
+CLOCK_STEP = 10.0  # s by which the robot's clock is ahead while the fault "clock" holds
 ARMS = 12  # motors from here on belong to rt/arm_sdk
 
 
@@ -148,7 +149,8 @@ class VirtualH12:
         readings = self._readings(fault)
         message, data = hg.LowState, self._message
         if fault != "repeat":
-            message.view(data, "tick")[0] = round(k * 1000 / self.rate) % 2**32
+            ahead = CLOCK_STEP if fault == "clock" else 0.0
+            message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
         for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
             column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
             column[: len(MOTOR_NAMES)] = values[self._order, None] if name == "temperature" else values[self._order]

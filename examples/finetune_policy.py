@@ -1,0 +1,322 @@
+"""Fine-tune a policy in the aligned simulator, then play it on a robot it has never met: ASAP's use of a gap model.
+
+    python examples/finetune_policy.py RUN        # RUN: gaponet train (or demo) on virtual H1-2 units 1 to 3
+
+A small network learns by PPO, in the nominal simulator, to make the arms follow motions with 0 to 3 kg in each hand. It
+then learns on in the aligned simulator and, to be fair, as long in the nominal one. All three are played on VIRTUAL
+unit 4 with other motions than they have learnt from; neither the gap model nor a policy has seen that unit.
+
+The policy is told the measured state, the reference up to 0.2 s ahead, the payload, its last action, and what the
+nominal model says that the reference takes: torque by inverse dynamics, over kp. What it answers is added to the
+reference. It runs alone on the robot: the gap model takes part in training only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import io
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from rsl_rl.env import VecEnv
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.model.artifact import GapModel
+from gaponet.motion.library import Library
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.sim.dynamics import inverse_dynamics
+from gaponet.sim.model import build_model, idle_joints
+from gaponet.virtual.fleet import load_fleet
+from gaponet.virtual.unit import VirtualRobot
+
+Array = np.ndarray
+
+KINDS = ("reach", "pick_and_place", "lift", "wave", "stir", "mirror", "carry", "wander")
+LEARN = [f"{kind}-{variant}" for kind in KINDS for variant in ("both-0", "both-1", "left-0", "right-0")]
+TRY = [f"{kind}-both-0" for kind in KINDS]
+LEARN_SEED, TRY_SEED = 101, 202  # other numbers make other motions; those of the package's recipes have seed 0
+AHEAD = (2, 3, 5, 8, 11)  # rows of the reference that are seen beside the next one
+REACH, LIMIT = 0.1, 0.4  # rad that an action of 1 adds to the reference, and the most that any may
+NOISE = (0.0005, 0.02)  # rad, rad/s: in what a policy is told while it learns
+EPISODE = 200  # control periods
+WARMTH = 12.0  # K above ambient, of the unit's motors
+SKIP = 50  # control periods at the start of a motion that are not counted
+
+PPO: dict[str, Any] = {
+    "num_steps_per_env": 16, "save_interval": 10**9, "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+    "actor": {
+        "class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "elu",
+        "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": 0.2, "std_type": "log"},
+    },
+    "critic": {"class_name": "MLPModel", "hidden_dims": [128, 128], "activation": "elu"},
+    "algorithm": {
+        "class_name": "PPO", "num_learning_epochs": 4, "num_mini_batches": 4, "learning_rate": 1e-3,
+        "desired_kl": 0.02, "gamma": 0.9, "lam": 0.9, "clip_param": 0.2, "entropy_coef": 0.0, "max_grad_norm": 1.0,
+        "schedule": "adaptive",
+    },
+}  # fmt: skip
+
+
+class Task:
+    """Motions to follow and what a policy is told of them: rows of all motions one after another.
+
+    Attributes:
+        joints: Free joints, as in AlignedSim.
+        op: The operated ones among them.
+        reference: (rows, free) rad.
+        load: Nominal torque over kp at no payload and at the heaviest, (2, rows, n) rad.
+        first, last: Rows of each motion.
+    """
+
+    def __init__(self, robot: RobotSpec, ctrls: list[Array], heaviest: float) -> None:
+        self.locked = idle_joints(robot, robot.operated)
+        self.joints = tuple(name for name in robot.joint_names if name not in self.locked)
+        free, operated = robot.index(self.joints), robot.operated_index
+        self.op = np.searchsorted(free, operated)
+        self.reference = np.concatenate(ctrls)[:, free]
+        self.last = np.cumsum([len(c) for c in ctrls]) - 1
+        self.first = np.append(0, self.last[:-1] + 1)
+        self.heaviest, self.n = heaviest, len(operated)
+        loads = []
+        for mass in (0.0, heaviest):
+            model = build_model(robot, mass)
+            moves = [[c, v := np.gradient(c, robot.dt, axis=0), np.gradient(v, robot.dt, axis=0)] for c in ctrls]
+            torque = np.concatenate([inverse_dynamics(model, *move) for move in moves])
+            damped = robot.kd * np.concatenate([move[1] for move in moves])  # the servo brakes what it drives
+            loads.append(((torque + damped) / robot.kp)[:, operated])
+        self.load = np.array(loads)
+
+    def observe(self, q: Array, v: Array, row: Array, last: Array, mass: Array, action: Array) -> Array:
+        """What a policy is told, (N, 5 n + n len(AHEAD) + 1) float32.
+
+        Args:
+            q, v: Measured now, operated joints, (N, n) rad, rad/s.
+            row, last: Where the motion stands, and its last row, (N,).
+            mass: kg, (N,).
+            action: The last one, (N, n).
+        """
+        at = np.minimum(row + 1, last)
+        then = self.reference[at][:, self.op]
+        ahead = [self.reference[np.minimum(row + k, last)][:, self.op] - then for k in AHEAD]
+        share = (mass / self.heaviest)[:, None]
+        load = (1 - share) * self.load[0, at] + share * self.load[1, at]
+        parts = [then, (q - then) / REACH, 0.3 * v, load / REACH, action, share, *[a / REACH for a in ahead]]
+        return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def target(self, row: Array, last: Array, action: Array) -> Array:
+        """What is sent, (N, free) rad: the next row of the reference, and the action on the operated joints."""
+        out = self.reference[np.minimum(row + 1, last)]
+        out[:, self.op] += np.clip(REACH * action, -LIMIT, LIMIT)
+        return out
+
+
+class TrackingEnv(VecEnv):
+    """num_envs simulations that follow motions from a random row on; rsl_rl's interface."""
+
+    def __init__(self, task: Task, sim: AlignedSim, seed: int) -> None:
+        self.task, self.sim, self.rng = task, sim, np.random.default_rng(seed)
+        self.cfg: dict[str, Any] = {}
+        self.device, self.num_envs, self.num_actions = "cpu", sim.num_envs, task.n
+        self.max_episode_length = EPISODE
+        self.episode_length_buf = torch.zeros(sim.num_envs, dtype=torch.long)
+        self.row, self.last = np.zeros((2, sim.num_envs), int)
+        self.action = np.zeros((sim.num_envs, task.n))
+        self.error: list[float] = []
+        self._begin(np.arange(sim.num_envs))
+
+    def _begin(self, ids: Array) -> None:
+        motion = self.rng.integers(len(self.task.first), size=len(ids))
+        self.row[ids] = self.rng.integers(self.task.first[motion], self.task.last[motion] - 20)
+        self.last[ids] = self.task.last[motion]
+        reference = self.task.reference
+        speed = (reference[self.row[ids] + 1] - reference[self.row[ids]]) / self.sim.dt
+        self.sim.reset(reference[self.row[ids]], speed, ids=ids)
+        self.action[ids] = 0.0
+        self.episode_length_buf[torch.from_numpy(ids)] = 0
+
+    def get_observations(self) -> TensorDict:
+        """Of a noisy state."""
+        shape = (self.num_envs, self.task.n)
+        q, v = (x[:, self.task.op] + s * self.rng.standard_normal(shape) for x, s in zip(
+            (self.sim.qpos, self.sim.qvel), NOISE, strict=True))  # fmt: skip
+        seen = self.task.observe(q, v, self.row, self.last, self.sim.payload_mass, self.action)
+        return TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[self.num_envs])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Reward: minus the mean error in units of 20 mrad, and a little for calm actions."""
+        action = actions.numpy().astype(float)
+        self.sim.step(self.task.target(self.row, self.last, action))
+        self.row += 1
+        error = np.abs(self.sim.qpos - self.task.reference[self.row])[:, self.task.op].mean(axis=1)
+        rough = np.square(action - self.action).mean(axis=1)
+        self.action[:] = action
+        self.error.append(float(error.mean()))
+        self.episode_length_buf += 1
+        done = (self.row >= self.last) | (self.episode_length_buf.numpy() >= EPISODE)
+        if done.any():
+            self._begin(np.flatnonzero(done))
+        dones = torch.from_numpy(done)
+        reward = torch.from_numpy((-error / 0.02 - 0.02 * rough).astype(np.float32))
+        return self.get_observations(), reward, dones, {"time_outs": dones}
+
+
+class Unit:
+    """One virtual unit, once per payload and motion, behind the calls of AlignedSim; its sensors are all one sees."""
+
+    def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array) -> None:
+        physics = load_fleet("default", robot).unit(name)
+        payloads = [(float(mass), "both") for mass in payload_mass]
+        self.robots = VirtualRobot(robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0)
+        self.payload_mass, self.free, self.home = payload_mass, robot.index(task.joints), robot.qpos_home
+
+    def reset(self, qpos: Array) -> None:
+        self.robots.reset(self._full(qpos), list(range(len(qpos))), WARMTH)
+
+    def step(self, ctrl: Array) -> None:
+        self.robots.step(self._full(ctrl))
+
+    def _full(self, values: Array) -> Array:
+        out = np.tile(self.home, (len(values), 1))
+        out[:, self.free] = values
+        return out
+
+    @property
+    def qpos(self) -> Array:
+        return self.robots.read().qpos[:, self.free]
+
+    @property
+    def qvel(self) -> Array:
+        return self.robots.read().qvel[:, self.free]
+
+
+def make_runner(env: TrackingEnv, start: OnPolicyRunner | None = None) -> OnPolicyRunner:
+    """PPO on an environment, from scratch or from where another runner stands."""
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
+        runner = OnPolicyRunner(env, copy.deepcopy(PPO), log_dir=None, device="cpu")
+    if start is not None:
+        runner.alg.actor.load_state_dict(start.alg.actor.state_dict())
+        runner.alg.critic.load_state_dict(start.alg.critic.state_dict())
+        runner.alg.learning_rate = start.alg.learning_rate
+    return runner
+
+
+def train(name: str, runner: OnPolicyRunner, env: TrackingEnv, updates: int) -> OnPolicyRunner:
+    """Learn, and say the error of the policy as it explores."""
+    start = time.perf_counter()
+    for k in range(1, updates + 1):
+        runner.learn(1)
+        if k % max(updates // 4, 1) == 0:
+            error, env.error = 1e3 * float(np.mean(env.error)), []
+            print(
+                f"{name}: {k} of {updates} updates, {time.perf_counter() - start:.0f} s, {error:.1f} mrad", flush=True
+            )
+    return runner
+
+
+def follow(task: Task, plant: AlignedSim | Unit, policy: OnPolicyRunner | None) -> Array:
+    """Mean |q − reference| of every simulation or unit, (N,) rad: one motion of the task each, in turn, to its end."""
+    count = len(plant.payload_mass)
+    motion = np.arange(count) % len(task.first)
+    row, last, action = task.first[motion].copy(), task.last[motion], np.zeros((count, task.n))
+    plant.reset(task.reference[row])
+    actor = None if policy is None else policy.get_inference_policy()
+    total, rows = np.zeros(count), np.zeros(count)
+    for t in range(int((last - row).max())):
+        if actor is not None:
+            q, v = plant.qpos[:, task.op], plant.qvel[:, task.op]
+            seen = torch.from_numpy(task.observe(q, v, row, last, plant.payload_mass, action))
+            with torch.inference_mode():
+                action = actor(TensorDict({"policy": seen}, batch_size=[count])).numpy().astype(float)
+        plant.step(task.target(row, last, action))
+        going = row < last
+        row = np.minimum(row + 1, last)
+        error = np.abs(plant.qpos - task.reference[row])[:, task.op].mean(axis=1)
+        if t >= SKIP:
+            total, rows = total + going * error, rows + going
+    return total / rows
+
+
+def motions(robot: RobotSpec, heaviest: float, seed: int, names: list[str]) -> list[Array]:
+    """Upper-body motions that a seed makes, at the control period, (T, n) rad each."""
+    library = Library(robot, seed, heaviest)
+    return [library.make(name).sample(robot.dt) for name in names]
+
+
+def main(
+    run: tyro.conf.Positional[Path],
+    first: int = 150,
+    more: int = 80,
+    num_envs: int = 256,
+    seeds: tuple[int, ...] = (0,),
+    unit: str = "virtual-4",
+    quick: bool = False,
+) -> None:
+    """Learn, fine-tune, play on the unseen unit; print mean |error| to the reference in mrad.
+
+    Args:
+        run: Folder of gaponet train, H1-2.
+        first: PPO updates in the nominal simulator.
+        more: Further updates, once in the aligned and once in the nominal simulator.
+        num_envs: Simulations side by side.
+        seeds: All is learnt anew with each.
+        unit: Of the default fleet.
+        quick: Only see that it runs.
+    """
+    begin = time.perf_counter()
+    torch.set_num_threads(1)  # the simulators take the other cores
+    first, more, num_envs, names = (2, 1, 16, LEARN[:2]) if quick else (first, more, num_envs, LEARN)
+    model = GapModel.load(run, threads=0)
+    corrected = load_robot(run / "robot")  # the simulator that the model corrects: nominal, or identified
+    robot = corrected.nominal or corrected
+    heaviest = float(max(model.card["payload_seen"])) or model.config.payload_max
+    task = Task(robot, motions(robot, heaviest, LEARN_SEED, names), heaviest)
+    unseen = Task(robot, motions(robot, heaviest, TRY_SEED, TRY[: len(names)]), heaviest)
+    mass, tried = np.resize(np.linspace(0, heaviest, 4), num_envs), np.repeat([0.0, heaviest], len(unseen.first))
+    plants: dict[str, AlignedSim | Unit] = {
+        "nominal simulator": AlignedSim(robot, None, tried, num_envs=len(tried), locked=task.locked),
+        "aligned simulator": AlignedSim(corrected, model, tried, num_envs=len(tried), locked=task.locked),
+        unit: Unit(robot, unseen, unit, tried),
+    }
+    found: dict[str, list[Array]] = {}
+
+    def judge(name: str, policy: OnPolicyRunner | None) -> None:
+        errors = [follow(unseen, plant, policy).reshape(2, -1).mean(axis=1) for plant in plants.values()]
+        found.setdefault(name, []).append(1e3 * np.array(errors))
+
+    print(f"{len(task.first)} motions to learn from, {len(unseen.first)} to try; {time.perf_counter() - begin:.0f} s")
+    judge("reference as target", None)
+    for seed in seeds:
+        torch.manual_seed(seed)
+        env = TrackingEnv(task, AlignedSim(robot, None, mass, num_envs=num_envs, locked=task.locked), seed)
+        policy = train("nominal", make_runner(env), env, first)
+        judge("policy, nominal", policy)
+        env.error = []
+        longer = make_runner(env, policy)
+        aligned = TrackingEnv(task, AlignedSim(corrected, model, mass, num_envs=num_envs, locked=task.locked), seed)
+        judge("policy, fine-tuned", train("fine-tuning", make_runner(aligned, policy), aligned, more))
+        judge("policy, nominal as long", train("nominal, on", longer, env, more))
+    print(table(found, list(plants), heaviest))
+    print(f"{time.perf_counter() - begin:.0f} s in all")
+
+
+def table(found: dict[str, list[Array]], plants: list[str], heaviest: float) -> str:
+    """Markdown: mean over seeds (± standard deviation), at no payload and at the heaviest."""
+    columns = [f"{plant}, {p:g} kg" for plant in plants for p in (0, heaviest)]
+    lines = [f"| mean abs error, mrad; units are VIRTUAL | {' | '.join(columns)} |"]
+    lines.append("| --- |" + " ---: |" * len(columns))
+    for name, errors in found.items():
+        mean, spread = np.mean(errors, axis=0).ravel(), np.std(errors, axis=0).ravel()
+        cells = [f"{m:.1f} ± {s:.1f}" if len(errors) > 1 else f"{m:.1f}" for m, s in zip(mean, spread, strict=True)]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,67 @@
+"""The fine-tuning example on a two-joint arm."""
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from arm import commands, write_arm
+
+from gaponet.deploy.aligned_sim import AlignedSim
+
+FILE = Path(__file__).parents[2] / "examples" / "finetune_policy.py"
+SPEC = importlib.util.spec_from_file_location("finetune_policy", FILE)
+example = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(example)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def task(robot):
+    return example.Task(robot, [commands(120, seed) for seed in range(2)], 0.4)
+
+
+class Reader:
+    """A policy that sends what the nominal model says the reference takes."""
+
+    def __init__(self, task):
+        self.n = task.n
+
+    def get_inference_policy(self):
+        return lambda obs: obs["policy"][:, 3 * self.n : 4 * self.n]
+
+
+def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, task):
+    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, nthread=1)
+    alone, fed = example.follow(task, sim, None), example.follow(task, sim, Reader(task))
+    assert (fed < 0.35 * alone).all()
+
+
+def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkeypatch):
+    from gaponet.virtual.fleet import Fleet
+    from gaponet.virtual.physics import neutral
+
+    monkeypatch.setattr(example, "load_fleet", lambda *_: Fleet("none", "arm", 0, (), {"unit": neutral(2)}))
+    unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]))
+    sim = AlignedSim(robot, None, np.array([0.0, 0.4]), num_envs=2, nthread=1)
+    on_unit, in_sim = (example.follow(task, plant, Reader(task)) for plant in (unit, sim))
+    np.testing.assert_allclose(on_unit, in_sim, atol=2e-3)
+
+
+def test_ppo_learns_to_hold_the_arm_up_and_hands_its_policy_on(robot, task):
+    torch.manual_seed(0)
+    mass = np.full(32, 0.4)
+    env = example.TrackingEnv(task, AlignedSim(robot, None, mass, num_envs=32, nthread=1), seed=0)
+    policy = example.train("nominal", example.make_runner(env), env, 20)
+    sim = AlignedSim(robot, None, np.array([0.4, 0.4]), num_envs=2, nthread=1)
+    learnt = example.follow(task, sim, policy)
+    assert learnt.mean() < 0.9 * example.follow(task, sim, None).mean()
+    weaker = AlignedSim(replace(robot, kp=0.8 * robot.kp), None, mass, num_envs=32, nthread=1)
+    on = example.make_runner(example.TrackingEnv(task, weaker, seed=0), policy)
+    np.testing.assert_array_equal(example.follow(task, sim, on), learnt)
