@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 
 from gaponet.cli.out import Out
+from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.deploy.controller import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
 from gaponet.errors import UsageError
@@ -62,6 +63,7 @@ class Request:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     yes: bool = False
     seed: int = 0  # of a virtual robot's noise
+    compensation: CompensatorConfig = field(default_factory=CompensatorConfig)
 
 
 def run(
@@ -76,6 +78,7 @@ def run(
     reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
     safety: SafetyConfig = SafetyConfig(),  # noqa: B008
+    compensation: CompensatorConfig = CompensatorConfig(),  # noqa: B008
     yes: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -94,14 +97,16 @@ def run(
         reach: How to reach the robot.
         control: Timing.
         safety: Limits and watchdogs.
+        compensation: With a model: how commands are found.
         yes: Do not ask before a robot moves.
         json: One JSON object on stdout.
     """
     screen = Out(json)
-    session = Request(
-        motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes
-    )
-    recording, played, _ = perform(screen, session)
+    asked = Request(
+        motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes,
+        compensation=compensation,
+    )  # fmt: skip
+    recording, played, _ = perform(screen, asked)
     if out:
         screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
     screen.result(recording.summary() | tracking(recording))
@@ -190,13 +195,12 @@ def _compensator(asked: Request, robot: RobotSpec) -> Any:
     """The compensator of a model, or None."""
     if asked.model is None:
         return None
-    try:
-        from gaponet.deploy.compensator import Compensator
-    except ImportError:
-        raise UsageError("--model: this version has no compensator yet; run without a model") from None
+    from gaponet.deploy.compensator import Compensator
     from gaponet.model.artifact import GapModel
 
-    return Compensator(robot, GapModel.load(asked.model), dt=1.0 / asked.control.rate, payload_side=asked.payload_side)
+    dt = 1.0 / asked.control.rate
+    model = GapModel.load(asked.model)
+    return Compensator(robot, model, asked.compensation, dt, payload_side=asked.payload_side)
 
 
 def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
