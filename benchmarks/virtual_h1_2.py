@@ -212,7 +212,18 @@ def payloads_left_out(unit: dict[str, list[By]]) -> str:
 | 0, 1, 2 kg | 3 kg | {at("without_3", "3")} | |
 | 0, 1, 2, 3 kg | 3 kg | {at("gaponet", "3")} | |
 
+{verdict(unit)}
+
 """
+
+
+def verdict(unit: dict[str, list[By]]) -> str:
+    """Whether being told the payload helps at a payload between those trained on: by more than two standard errors."""
+    (told, told_std), (blind, blind_std) = (spread(unit[name], "2") for name in ("without_2", "without_2_blind"))
+    noise = 2 * np.hypot(told_std / len(unit["without_2"]) ** 0.5, blind_std / len(unit["without_2_blind"]) ** 0.5)
+    if abs(told - blind) <= noise:
+        return "The model that is told the payload does no better at 2 kg than the one that is not, and no worse."
+    return f"The model that is told the payload does {'better' if told < blind else 'worse'} at 2 kg than the other."
 
 
 def page(r: dict[str, Any]) -> str:
