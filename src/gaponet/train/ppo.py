@@ -76,6 +76,10 @@ class DeltaActor(MLPModel):
         super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims=(1,), distribution_cfg=distribution_cfg)
         self.mlp = Correct(net)
 
+    def get_latent(self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
+        """The one observation group as it is; rsl_rl would copy it."""
+        return obs["actor"]
+
 
 def make_runner(env: DeltaEnv, net: DeltaNet, ppo: PPOConfig) -> OnPolicyRunner:
     """A silent runner that trains a copy of net, its sensor predictor excepted; call `update` for one iteration."""
