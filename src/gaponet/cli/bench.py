@@ -31,7 +31,7 @@ def bench(
         robot: Robot name or folder.
         model: Network that is trained.
         num_envs: Simulations side by side; default 512, 1024 with train.
-        rounds: Interleaved turns of each; the fastest counts; default 15, 3 with train.
+        rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
         json: One JSON object on stdout.
     """
     from gaponet.cli.aligned import aligned

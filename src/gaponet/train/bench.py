@@ -1,7 +1,8 @@
 """How much of the simulator's speed is left: bare Batch loop, environment, collection, PPO; interleaved in one run.
 
-All parts take turns, so that a machine that slows down slows all of them; of each the fastest turn counts, since other
-work on the machine only ever adds time.
+All parts take turns, so that a machine that slows down slows all of them. Of turns that are equally long the fastest
+counts, since other work on the machine only ever adds time (bench_sim); where a whole is compared with its parts, the
+median does: the parts' fastest turns add up to less than the whole's (bench_train).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -112,7 +114,7 @@ def bench_train(
         counts |= dict.fromkeys(learners, batch) | {"stable-baselines3, SubprocVecEnv": samples}
         turns |= {name: partial(m.learn, counts[name], reset_num_timesteps=False) for name, m in learners.items()}
     try:
-        seconds = take_turns(turns, rounds)
+        seconds = take_turns(turns, rounds, median)
     finally:
         if baseline:
             close()
@@ -135,15 +137,15 @@ def _for_envs(config: TrainConfig, num_envs: int) -> TrainConfig:
     return replace(config, ppo=replace(ppo, num_envs=num_envs, mini_batches=parts))
 
 
-def take_turns(turns: dict[str, Turn], rounds: int) -> dict[str, float]:
-    """Seconds of each one's fastest turn, in `rounds` rounds after one that does not count."""
+def take_turns(turns: dict[str, Turn], rounds: int, of: Callable[[list[float]], float] = min) -> dict[str, float]:
+    """Seconds of each one's fastest turn (or median, …), in `rounds` rounds after one that does not count."""
     seconds: dict[str, list[float]] = {name: [] for name in turns}
     for _ in range(rounds + 1):
         for name, turn in turns.items():
             start = time.perf_counter()
             turn()
             seconds[name].append(time.perf_counter() - start)
-    return {name: min(s[1:]) for name, s in seconds.items()}
+    return {name: of(s[1:]) for name, s in seconds.items()}
 
 
 def _speeds(done: dict[str, tuple[int, float]], base: str) -> Speeds:
