@@ -90,8 +90,9 @@ class SameNetwork(ActorCriticPolicy):
         self.action_net = nn.Identity()
 
     def _build_mlp_extractor(self) -> None:
-        n = self.action_space.shape[0]  # type: ignore[index]
-        self.mlp_extractor = _Networks(self.model, n, self.critic_hidden)  # type: ignore[assignment]
+        space: Any = self.action_space
+        networks: Any = _Networks(self.model, space.shape[0], self.critic_hidden)
+        self.mlp_extractor = networks
 
 
 def _ppo(
