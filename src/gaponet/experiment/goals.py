@@ -18,7 +18,7 @@ from gaponet.robot import RobotSpec
 Array = np.ndarray
 
 STOPS = 2  # goals on one trajectory, held one after the other
-REST = 0.5  # s at the start
+REST = 1.5  # s at the start: time for a compensator to blend in
 SPEED = 1.5  # rad/s of the fastest joint on the way, about that of the recipe's reaching motions
 SHORTEST = 1.0  # s of a way
 VOXEL = 0.05  # m: space is covered evenly, not joint space
