@@ -15,7 +15,7 @@ import numpy as np
 
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiment.goals import Plan, Planner
-from gaponet.experiment.play import Driven, Played, play, side_by_side
+from gaponet.experiment.play import Played, play, side_by_side
 from gaponet.experiment.tracking import compensations
 from gaponet.experiment.trained import Trained
 from gaponet.robot import RobotSpec
@@ -71,12 +71,14 @@ class Cost:
 
 @dataclass(frozen=True)
 class Example:
-    """One hand on one trajectory: its target's place and its true place by method, (T, 3) m; goals (stops, 3) m."""
+    """One hand on one trajectory: its target's place and its true place by method, (T, 3) m; goals (stops, 3) m,
+    held from row arrive to row leave."""
 
     payload: float
     dt: float
     goals: Array
     arrive: Array
+    leave: Array
     target: Array
     places: dict[str, Array]
 
@@ -127,7 +129,11 @@ def deliver(
             if i == shown and seed in (None, trained[0].seed):
                 places[method] = hand[:, 0]
     plan, payload = pairs[shown]
-    return found, costs, Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, asked[id(plan)][:, 0], places)
+    return (
+        found,
+        costs,
+        Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, asked[id(plan)][:, 0], places),
+    )
 
 
 def _delivered(
@@ -153,7 +159,9 @@ def _delivered(
     return out
 
 
-def _cost(plan: Plan, played: Played, row: int, method: str, seed: int | None, payload: float, robot: RobotSpec) -> Cost:
+def _cost(
+    plan: Plan, played: Played, row: int, method: str, seed: int | None, payload: float, robot: RobotSpec
+) -> Cost:
     op = robot.operated_index
     holds = np.concatenate([np.arange(a, b) for a, b in zip(plan.arrive, plan.leave, strict=True)])
     torque = played.tau[holds, row][:, op].astype(float)

@@ -44,8 +44,8 @@ def offsets(found: ListOf[Delivery]) -> Table:
         *(f"{a} by encoders, cm" for a in AXES), "within 1 cm by encoders, %",
     )  # fmt: skip
     caption = (
-        "Mean |hand − goal| by axis in the last second of a hold (X forward, Y left, Z up); ± is the spread of training "
-        "seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it is. Within "
+        "Mean |hand − goal| by axis in the last second of a hold (X forward, Y left, Z up); ± is the spread of "
+        "training seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it is. Within "
         "1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until the end."
     )
     return Table("offsets", columns, tuple(rows), caption)
@@ -72,9 +72,8 @@ def spent(costs: ListOf[Cost]) -> Table:
     for payload in sorted({c.payload for c in costs}):
         for m in methods(costs):
             some = [c for c in costs if c.payload == payload and c.method == m]
-            rows.append((
-                f"{payload:g} kg, {title(m)}", over_seeds(some, lambda c: c.torque), over_seeds(some, lambda c: c.warming)
-            ))  # fmt: skip
+            torque, warming = over_seeds(some, lambda c: c.torque), over_seeds(some, lambda c: c.warming)
+            rows.append((f"{payload:g} kg, {title(m)}", torque, warming))
     columns = ("payload per hand", "motor torque, N·m RMS", "windings warm by, K")
     return Table("cost", columns, tuple(rows), "Operated joints: torque while holding, warming over a trajectory.")
 

@@ -47,7 +47,6 @@ def example(shown: Example) -> Figure:
     """The hand's true place over time, axis by axis, goals with 1 cm on both sides."""
     fig = figure(10.2, 3.2)
     time = np.arange(len(shown.target)) * shown.dt
-    begin = [*(shown.arrive * shown.dt), time[-1]]
     for a, ax in enumerate(fig.subplots(1, 3, sharex=True)):
         for m, place in shown.places.items():
             if m not in LEFT_OUT:
@@ -55,7 +54,8 @@ def example(shown: Example) -> Figure:
         ax.plot(time, shown.target[:, a] * 1e2, color=COLOURS["target"], ls=(0, (4, 1.5)), lw=1.0, label="target")
         for k, goal in enumerate(shown.goals):
             low, high = (goal[a] - NEAR) * 1e2, (goal[a] + NEAR) * 1e2
-            ax.fill_between([begin[k], begin[k + 1]], low, high, color=COLOURS["target"], alpha=0.18, lw=0)
+            span = [shown.arrive[k] * shown.dt, shown.leave[k] * shown.dt]
+            ax.fill_between(span, low, high, color=COLOURS["target"], alpha=0.18, lw=0)
         ax.set_title(AXES[a])
         ax.set_xlabel("time, s")
     fig.axes[0].set_ylabel("hand, cm")

@@ -22,7 +22,7 @@ LEFT_OUT = ("identified feedforward",)  # of the bars; it stands in the tables
 def joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
     """Q_dis per joint, a row per payload, alignment beside compensation; standard error over motions."""
     parts, payloads = list(dict.fromkeys(s.part for s in scores)), sorted({s.payload for s in scores})
-    wide = 0.62 * len(robot.operated) + 0.9
+    wide = 0.52 * len(robot.operated) + 0.8
     fig = figure(max(6.0, wide * len(parts)), 1.55 * len(payloads) + 1.5)
     axes = fig.subplots(len(payloads), len(parts), sharex=True, sharey="col", squeeze=False)
     for c, part in enumerate(parts):
@@ -64,7 +64,7 @@ def _legend(fig: Figure, axes: Any) -> None:
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
-    columns = max(2, int(fig.get_figwidth() / 2.1))
+    columns = max(2, int(fig.get_figwidth() / 1.9))
     fig.legend(found.values(), found.keys(), loc="outside lower left", ncols=columns, columnspacing=1.1,
                handlelength=1.2)  # fmt: skip
 

@@ -32,7 +32,7 @@ class Driven:
 
     model: GapModel
     robot: RobotSpec
-    config: CompensatorConfig = CompensatorConfig(blend=0.0)
+    config: CompensatorConfig
 
 
 @dataclass(frozen=True)

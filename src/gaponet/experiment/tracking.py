@@ -130,9 +130,7 @@ def track(
     return scores, Example(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
 
 
-def compensations(
-    robot: RobotSpec, trained: ListOf[Trained]
-) -> Iterable[tuple[str, int | None, Driven | None]]:
+def compensations(robot: RobotSpec, trained: ListOf[Trained]) -> Iterable[tuple[str, int | None, Driven | None]]:
     """Ways to drive the robot: raw; by the simulators' own physics alone; and through each model."""
     yield "raw", None, None
     bare = replace(PLANNED, iterations=0)
@@ -173,7 +171,9 @@ def align(
     return scores
 
 
-def _recording(robot: RobotSpec, unit: str, motion: Unseen, payload: float, raw: Played, row: int, rest: int) -> Sequence:
+def _recording(
+    robot: RobotSpec, unit: str, motion: Unseen, payload: float, raw: Played, row: int, rest: int
+) -> Sequence:
     """What the robot itself measured while it played a motion raw."""
     meta = SequenceMeta(robot.name, unit, motion.name, payload, virtual=True, source="experiment tracking")
     span = slice(rest, rest + len(motion.ctrl))

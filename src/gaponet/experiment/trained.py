@@ -1,4 +1,4 @@
-"""The trained models that an experiment compares: run folders → method, seed, artifact and the simulator it corrects."""
+"""The trained models that an experiment compares: run folders → method, seed, artifact and simulator corrected."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
         if (folder / "model" / "card.json").is_file():
             runs.append(folder)
             continue
-        inside = sorted(p.parent.parent for p in [*folder.glob("*/model/card.json"), *folder.glob("cells/*/model/card.json")])
+        cards = [c for place in ("*", "cells/*") for c in folder.glob(f"{place}/model/card.json")]
+        inside = sorted(card.parent.parent for card in cards)
         runs += [run for run in inside if not _changed(run)]
     if not runs:
         names = ", ".join(map(str, folders))
