@@ -33,8 +33,8 @@ def offsets(found: ListOf[Delivery]) -> Table:
     for payload in sorted({d.payload for d in found}):
         for m in methods(found):
             some = [d for d in found if d.payload == payload and d.method == m]
-            true = [over_seeds(some, lambda d, a=a: d.offset[a], 1e2) for a in range(3)]
-            seen = [over_seeds(some, lambda d, a=a: d.measured[a], 1e2) for a in range(3)]
+            true = [_along(some, "offset", a) for a in range(3)]
+            seen = [_along(some, "measured", a) for a in range(3)]
             rows.append((
                 f"{payload:g} kg, {title(m)}", *true, over_seeds(some, lambda d: d.near, 1e2), _settle(some), *seen,
                 over_seeds(some, lambda d: d.measured_near, 1e2),
@@ -45,8 +45,8 @@ def offsets(found: ListOf[Delivery]) -> Table:
     )  # fmt: skip
     caption = (
         "Mean |hand − goal| by axis in the last second of a hold (X forward, Y left, Z up); ± is the spread of "
-        "training seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it is. Within "
-        "1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until the end."
+        "training seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it "
+        "is. Within 1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until the end."
     )
     return Table("offsets", columns, tuple(rows), caption)
 
@@ -60,7 +60,7 @@ def moving(found: ListOf[Delivery]) -> Table:
             values: list[Spread] = []
             for way in ("lift", "lower"):
                 part = [d for d in some if d.way == way]
-                values += [over_seeds(part, lambda d, a=a: d.moving[a], 1e2) for a in range(3)]
+                values += [_along(part, "moving", a) for a in range(3)]
             rows.append((f"{payload:g} kg, {title(m)}", *values))
     columns = ("payload per hand", *(f"{way}, {a}, cm" for way in ("lifting", "lowering") for a in AXES))
     return Table("moving", columns, tuple(rows), "Mean |hand − its target| on ways that rise or fall by 5 cm or more.")
@@ -76,6 +76,11 @@ def spent(costs: ListOf[Cost]) -> Table:
             rows.append((f"{payload:g} kg, {title(m)}", torque, warming))
     columns = ("payload per hand", "motor torque, N·m RMS", "windings warm by, K")
     return Table("cost", columns, tuple(rows), "Operated joints: torque while holding, warming over a trajectory.")
+
+
+def _along(some: ListOf[Delivery], field: str, a: int) -> Spread:
+    """One axis of a field, cm."""
+    return over_seeds(some, lambda d: getattr(d, field)[a], 1e2)
 
 
 def _settle(some: ListOf[Delivery]) -> Spread:

@@ -46,7 +46,7 @@ def colour(method: str) -> str:
     """A model's in every figure, darker from the identified simulator."""
     if method.startswith("identified+"):
         base = to_rgb(COLOURS.get(method.removeprefix("identified+"), "#777777"))
-        return to_hex([0.6 * c for c in base])
+        return to_hex((0.6 * base[0], 0.6 * base[1], 0.6 * base[2]))
     return ALONE_COLOURS.get(method) or COLOURS.get(method, "#777777")
 
 
