@@ -4,10 +4,11 @@ import json
 from dataclasses import replace
 
 import pytest
+from arm import commands, record
 from logs import arm_sequence, late, wave
 
 from gaponet.data.pair import split_by_motion
-from gaponet.data.split import make_split, read_split, require_distinct_samples, write_split
+from gaponet.data.split import PARTS, make_split, read_split, require_distinct_samples, split_entries, write_split
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 
@@ -124,3 +125,23 @@ def test_what_is_no_split_file_is_refused(dataset, tmp_path):
     for path in (tmp_path / "x.json", tmp_path / "nowhere.json"):
         with pytest.raises(DatasetError, match=r"not a split file .* make one with gaponet data split"):
             read_split(path, dataset)
+
+
+def test_a_rate_keeps_the_split_by_motion_and_a_smaller_share_lies_in_a_larger(arm, tmp_path):
+    data = Dataset.create(tmp_path / "rates", arm)
+    for dt in (0.02, 0.01):
+        for seed in range(8):
+            data.append(record(replace(arm, dt=dt), commands(20, seed, dt), f"motion{seed}"))
+    both, fast = split_entries(data), split_entries(data, rates=(100,))
+    for part in PARTS:
+        assert values(both[part], "motion") == values(fast[part], "motion")
+        assert {e.dt for e in fast[part]} == {0.01}
+    half, quarter = (split_entries(data, train_share=s) for s in (0.5, 0.25))
+    motions = [values(p["train"], "motion") for p in (quarter, half, both)]
+    assert motions[0] < motions[1] < motions[2]
+    assert half["test"] == both["test"]
+    assert half["val"] == both["val"]
+    with pytest.raises(UsageError, match=r"no recording at 200 Hz .* it holds 50, 100 Hz"):
+        split_entries(data, rates=(200,))
+    with pytest.raises(UsageError, match="train_share is 0"):
+        split_entries(data, train_share=0)

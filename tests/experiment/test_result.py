@@ -96,7 +96,7 @@ def test_facts_and_label_come_from_the_dataset(arm, tmp_path):
     for sequence in recordings(arm, 2, rows=90):
         data.append(sequence)
     found = facts(data, [0, 1], budget="1m")
-    assert found["hours"] == round(2 * 90 * 0.02 / 3600, 3)
+    assert found["recorded_hours"] == round(2 * 90 * 0.02 / 3600, 3)
     assert found["seeds"] == [0, 1]
     assert found["budget"] == "1m"
     assert found["units"] == ["a"]

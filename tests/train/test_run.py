@@ -190,6 +190,18 @@ def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
         split_entries(data, holdout_payloads=(3.0,))
 
 
+@pytest.mark.parametrize("sensors", ["predicted", "off"])
+def test_ppo_alone_has_statistics_of_its_inputs_and_sensors_that_answer(sensors, robot, tmp_path):
+    data = dataset(tmp_path / "data", robot, kp=0.5)
+    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=0), model=replace(SMALL.model, sensors=sensors))
+    trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
+    model = trainer.run()
+    assert trainer.net.features.standardise.std.min() < 0.9
+    assert (trainer.sensor_r2 is None) == (sensors == "off")
+    if sensors == "predicted":
+        assert model.card["sensor_r2"]["mean"] > 0.3
+
+
 @pytest.mark.parametrize(
     ("text", "seconds", "steps"), [("90s", 90, None), ("10m", 600, None), ("2e6", None, 2_000_000)]
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out, finite
+from gaponet.cli.out import Out
 from gaponet.cli.progress import bar, bars
 from gaponet.errors import ModelError, UsageError
 from gaponet.robot import RobotSpec, load_robot
@@ -18,7 +18,7 @@ from gaponet.train.config import TrainConfig
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
-    from gaponet.train.compare import Cell, Tell
+    from gaponet.train.compare import Cell
 
 
 def compare(
@@ -54,6 +54,7 @@ def compare(
         json: One JSON object on stdout.
     """
     from gaponet.eval.compare import group_table, heading, main_table, write
+    from gaponet.experiment.cells import train_and_evaluate
     from gaponet.train.compare import plan, run_cells
     from gaponet.train.variant import Variant, parse_variant
 
@@ -102,20 +103,6 @@ def compare(
         raise ModelError(
             f"{len(failed)} of {len(cells)} runs failed; the table is of the others. Run it again to retry"
         )
-
-
-def train_and_evaluate(cell: Cell, tell: Tell) -> None:
-    """The work of a cell's process."""
-    from gaponet.data.store import Dataset, write_text
-    from gaponet.eval.compare import evaluate_model
-    from gaponet.train.compare import RESULT, train_cell
-
-    facts = train_cell(cell, tell)
-    tell(1.0, "evaluation")
-    found = evaluate_model(cell.folder, Dataset(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
-    start = "identified" if cell.robot.nominal is not None else "nominal"
-    facts |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
-    write_text(cell.folder / RESULT, js.dumps(finite(facts | found), indent=1, ensure_ascii=False) + "\n")
 
 
 def _identified(data: Dataset, spec: RobotSpec, out: Path, holdout: tuple[str, ...]) -> RobotSpec:

@@ -25,6 +25,7 @@ COMMANDS = {
     "eval": "gaponet.cli.train:evaluate",
     "report": "gaponet.cli.train:report",
     "compare": "gaponet.cli.compare:compare",
+    "experiment": "gaponet.cli.experiment:experiment",
     "run": "gaponet.cli.run:run",
     "record": "gaponet.cli.record:record",
     "virtual": "gaponet.cli.virtual:virtual",

@@ -32,9 +32,21 @@ TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least o
 
 
 def split_entries(
-    dataset: Dataset, holdout_units: tuple[str, ...] = (), holdout_payloads: tuple[float, ...] = ()
+    dataset: Dataset,
+    holdout_units: tuple[str, ...] = (),
+    holdout_payloads: tuple[float, ...] = (),
+    rates: tuple[float, ...] = (),
+    train_share: float = 1.0,
 ) -> Parts:
-    """Entries per part: the fixed split by motion; what is held out appears in the test part only, with its motions."""
+    """Entries per part: the fixed split by motion, the same for all rates and shares.
+
+    Args:
+        dataset: What to divide.
+        holdout_units: Appear in the test part only, with its motions.
+        holdout_payloads: The same, kg.
+        rates: Only recordings at these, Hz; all by default.
+        train_share: Of the training motions, in the order of the hash of their names: a smaller share lies in a larger.
+    """
     units = {e.meta.unit_id for e in dataset.entries}
     payloads = {e.meta.payload_mass for e in dataset.entries}
     strangers = [u for u in holdout_units if u not in units]
@@ -44,20 +56,32 @@ def split_entries(
     if unknown:
         known = ", ".join(f"{p:g}" for p in sorted(payloads))
         raise UsageError(f"no recording with {unknown[0]:g} kg in {dataset.path}; it holds {known} kg")
+    held_rates = sorted({round(1 / e.dt, 2) for e in dataset.entries})
+    absent = [r for r in rates if not any(_same_rate(r, h) for h in held_rates)]
+    if absent:
+        known = ", ".join(f"{h:g}" for h in held_rates)
+        raise UsageError(f"no recording at {absent[0]:g} Hz in {dataset.path}; it holds {known} Hz")
+    if not 0 < train_share <= 1:
+        raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
     away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
     split = split_by_motion([e.meta.motion for e in dataset.entries])
+    motions = {"train": split.train[: max(1, round(train_share * len(split.train)))], "val": split.val,
+               "test": split.test}  # fmt: skip
+    entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
     parts = {
-        part: [
-            e for e in dataset.entries
-            if e.meta.motion in getattr(split, part) and (part == "test" or not away(e.meta))
-        ]
-        for part in ("train", "val", "test")
-    }  # fmt: skip
+        part: [e for e in entries_at if e.meta.motion in motions[part] and (part == "test" or not away(e.meta))]
+        for part in PARTS
+    }
     for part, entries in parts.items():
         if not entries:
-            held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)])
+            held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
             raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {held}")
     return parts
+
+
+def _same_rate(a: float, b: float) -> bool:
+    """Rates of recordings are as measured."""
+    return abs(a - b) < 0.02 * a
 
 
 def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Parts:

@@ -16,7 +16,7 @@ import math
 import shlex
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -76,6 +76,10 @@ class Table:
         """Rows as people read them."""
         return [[text(cell, self.digits) for cell in row] for row in self.rows]
 
+    def records(self) -> list[list[Any]]:
+        """Rows as JSON: a spread is an object."""
+        return [[asdict(c) if isinstance(c, Spread) else c for c in row] for row in self.rows]
+
 
 @dataclass(frozen=True)
 class Result:
@@ -109,6 +113,25 @@ def text(cell: Cell, digits: int = 2) -> str:
     return f"{cell:.{digits}f}" if math.isfinite(cell) else ""
 
 
+def compared(name: str, value: Spread, base: Spread, to: str, unit: str = "") -> str:
+    """Whether a value differs from another by more than seeds do, in words."""
+    change, margin = value.mean - base.mean, noise(value, base)
+    known = "" if margin == margin else " (one seed)"
+    if abs(change) <= margin:
+        return f"{name} {value.mean:.2f}{unit}, no different from {to} within the spread of seeds"
+    way = "more" if change > 0 else "less"
+    return f"{name} {value.mean:.2f}{unit}, {100 * abs(change) / abs(base.mean):.0f} % {way} than {to}{known}"
+
+
+def noise(a: Spread, b: Spread) -> float:
+    """Two standard errors of a difference of means; where one has a single value, with the other's std; else NaN."""
+    std = [s for s in (a.std, b.std) if s == s]
+    if not std:
+        return math.nan
+    first, second = (s if s == s else std[0] for s in (a.std, b.std))
+    return 2 * math.sqrt(first**2 / max(a.count, 1) + second**2 / max(b.count, 1))
+
+
 def label(dataset: Dataset) -> str:
     """Whose recordings these are."""
     virtual = [e.meta.virtual for e in dataset.entries]
@@ -126,7 +149,7 @@ def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str,
         "command": command_line(sys.argv[1:]),
         "date": date.today().isoformat(),
         "dataset": f"{dataset.path.name} ({dataset_hash(entries)})",
-        "hours": round(sum(e.rows * e.dt for e in entries) / 3600, 3),
+        "recorded_hours": round(sum(e.rows * e.dt for e in entries) / 3600, 3),
         "units": sorted({e.meta.unit_id for e in entries}),
         **({"seeds": seeds} if seeds else {}),
         **more,
@@ -191,8 +214,7 @@ def fact_rows(found: Mapping[str, Any]) -> list[list[str]]:
 
 
 def _table_record(table: Table) -> dict[str, Any]:
-    cells = [[vars(c) if isinstance(c, Spread) else c for c in row] for row in table.rows]
-    return {"name": table.name, "caption": table.caption, "columns": list(table.columns), "rows": cells,
+    return {"name": table.name, "caption": table.caption, "columns": list(table.columns), "rows": table.records(),
             "texts": table.texts()}  # fmt: skip
 
 

@@ -95,6 +95,10 @@ class TrainConfig:
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
     holdout_payloads: tuple[float, ...] = ()
     """Payloads never trained on, kg; their test motions stay in the test part."""
+    rates: tuple[float, ...] = ()
+    """Only recordings at these control rates, Hz, in all parts; all by default."""
+    train_share: float = 1.0
+    """Share of the training motions that is used; validation and test motions stay the same."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
     threads: int = 0

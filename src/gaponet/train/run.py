@@ -45,7 +45,7 @@ from gaponet.train.gain import choose_gain
 from gaponet.train.inverse import inverse_labels
 from gaponet.train.loggers import Loggers
 from gaponet.train.ppo import make_runner, update
-from gaponet.train.sensor_fit import Report, points_of, report_of
+from gaponet.train.sensor_fit import STATES, Report, points_of, report_of
 from gaponet.train.warm_start import WarmStart, fit_sensors, recipe
 
 Array = np.ndarray
@@ -101,7 +101,7 @@ class Trainer:
             budget,
             show,
         )
-        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads)
+        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
@@ -133,6 +133,8 @@ class Trainer:
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
             if recipe(self.config).rounds > self.rounds_done:
                 self._warm_start()
+            elif not recipe(self.config).rounds and self.runner_state is None:
+                self._cold_start()
             self._ppo()
             self._shrink()
         except KeyboardInterrupt:
@@ -166,6 +168,21 @@ class Trainer:
             self.rounds_done, self.warm_state = warm.done, warm_state(warm, rounds)
             self.steps += config.num_envs * config.steps
             self._consider()
+
+    def _cold_start(self) -> None:
+        """PPO alone also needs the statistics of its inputs, and sensors that answer."""
+        self.stage = "sensors"
+        self._tick()
+        env = self._env(self.config.warm_start.num_envs, 10**9, self.config.seed)
+        if self.net.predictor is not None:
+            self.sensor_r2 = fit_sensors(self.net, env, self.robot, self.config.seed, self.config.threads)
+        else:
+            seen = [env.get_observations()["actor"]]
+            while sum(map(len, seen)) < STATES:
+                env.reset()
+                seen.append(env.get_observations()["actor"])
+            self.net.fit_inputs(torch.cat(seen))
+        self.trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
         ppo = self.config.ppo

@@ -1,0 +1,38 @@
+"""What every experiment may be told, as data: the docstrings are the command-line help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
+
+# Small rounds: on the virtual H1-2, validation has stopped falling after three to six of them.
+TRAINING = TrainConfig(warm_start=WarmStartConfig(rounds=4, num_envs=128, steps=300, gradient_steps=200))
+BUDGET, SEEDS = "153600", 3  # control steps: 4 rounds
+# With --quick: teaches next to nothing, in seconds.
+QUICK_WARM_START = WarmStartConfig(rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256)
+QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)
+QUICK_BUDGET, QUICK_SEEDS = "2560", 1
+
+
+@dataclass(frozen=True)
+class Options:
+    """Of all experiments that train."""
+
+    seeds: int | None = None
+    """How many, counted from --seed; 3, with --quick 1."""
+    budget: str | None = None
+    """Of each training: time such as 90s or 10m, or control steps; 153600, with --quick 2560."""
+    workers: int = 0
+    """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
+    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    """A rehearsal in minutes: a slice of the dataset, a budget that teaches nothing, numbers that mean nothing."""
+    robot: str | None = None
+    """Robot name or folder, if not the package's robot of the dataset; all models correct it."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """One JSON object on stdout."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TRAINING
+    """Of all models; rows of a table change one thing in it."""
