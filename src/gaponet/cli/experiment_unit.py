@@ -95,7 +95,7 @@ def delivery(
     goals: int = 100,
     hold: float = 3.0,
     front: float = 0.1,
-    seed: int = 0,
+    goal_seed: int = 0,
     played: Annotated[Played, tyro.conf.arg(name="")] = Played(),
     options: Shared = Options(),  # noqa: B008
 ) -> None:
@@ -111,7 +111,7 @@ def delivery(
         goals: Per payload, over the space that the hands reach and can hold the heaviest payload in.
         hold: At each goal, s.
         front: Goals lie at least so far in front of the robot's base, m.
-        seed: Of the goals.
+        goal_seed: Of the goals.
         played: The unit.
         options: Shared.
     """
@@ -128,7 +128,7 @@ def delivery(
     who, physics, payloads = _unit(robot, trained, played, options.quick)
     with bar("goals") as update:
         update(0, 1, "")
-        planner = Planner(robot, max(payloads), seed, hold, front)
+        planner = Planner(robot, max(payloads), goal_seed, hold, front)
         plans = planner.plans(QUICK_PLANS if options.quick else -(-goals // (STOPS * len(planner.arms))))
         update(1, 1, "")
     with bar("delivery") as update:

@@ -46,7 +46,8 @@ def offsets(found: ListOf[Delivery]) -> Table:
     caption = (
         "Mean |hand − goal| by axis in the last second of a hold (X forward, Y left, Z up); ± is the spread of "
         "training seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it "
-        "is. Within 1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until the end."
+        "is. Within 1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until "
+        "the end."
     )
     return Table("offsets", columns, tuple(rows), caption)
 
