@@ -154,7 +154,7 @@ class Planner:
             return None
         ctrl = through(points, moves, holds, self.robot.dt)
         rows = [round(x / self.robot.dt) for x in (REST, *moves, self.hold)]
-        start = rows[0] - 1 + np.cumsum([0, *(m + rows[-1] for m in rows[1:-2])])
+        start = rows[0] + np.cumsum([0, *(m + rows[-1] for m in rows[1:-2])])
         arrive = start + np.array(rows[1:-1])
         before = [self.places(self.ready), *goals[:-1]]
         rise = np.array([g[:, 2] - b[:, 2] for g, b in zip(goals, before, strict=True)])
