@@ -25,8 +25,9 @@ def test_the_default_is_one_model_in_every_row_that_it_stands_in(make_study):
 
 def test_the_paper_s_rows_are_all_there(make_study):
     words = {r.word for r in rows(make_study(rates=(50, 100)))[0]}
-    for change in ("payload_input=off", "rates=100", "rates=100:history=8", "history=2", "history=6", "history=8",
-                   "delta_hold=3", "delta_hold=5", "sensor_hold=3", "sensor_hold=5", "sensor_target=absolute"):  # fmt: skip
+    held = [f"{what}_hold={k}" for what in ("delta", "sensor") for k in (3, 5)]
+    changes = ["payload_input=off", "rates=100", "rates=100:history=8", "history=2", "history=6", "history=8"]
+    for change in [*changes, *held, "sensor_target=absolute"]:
         assert f"{DEFAULT}:{change}" in words
 
 

@@ -31,8 +31,9 @@ def test_a_unit_is_known_in_the_folds_that_left_out_another(make_study):
     texts = made.tables[0].texts()
     assert texts[1] == ["b", "10.00", "8.00", "6.00 ± 1.41", "2.00", "0.60 ± 0.14"]
     assert texts[2][3] == "5.00 ± 1.41"  # 4 and 6: over units
-    assert made.sentences == ("mlp leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when "
-                              "trained on.",)  # fmt: skip
+    assert made.sentences == (
+        "mlp leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when trained on.",
+    )
 
 
 def test_a_model_that_is_worse_than_nominal_is_called_so_and_two_are_compared_unit_by_unit(make_study):

@@ -10,6 +10,7 @@ from cells import note_threads, wait_for_the_end
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
+from gaponet.model.baselines import delay_offset
 from gaponet.train.compare import SETUP, plan, run_cells, train_cell
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
 from gaponet.train.variant import parse_variant
@@ -93,3 +94,15 @@ def test_a_cell_kept_from_another_set_up_is_refused(data, arm, tmp_path):
 def test_a_model_named_twice_is_refused(data, arm, tmp_path):
     with pytest.raises(UsageError, match="'mlp' is there twice"):
         cells(data, arm, tmp_path / "out", ("mlp", "gaponet", "mlp"))
+
+
+def test_what_is_the_same_for_all_cells_is_fitted_once(data, arm, tmp_path, monkeypatch):
+    fits = []
+    whole = delay_offset.fit
+    monkeypatch.setattr(delay_offset, "fit", lambda *args: fits.append(1) or whole(*args))
+    first, second, part = cells(data, arm, tmp_path / "out", ("mlp", "mlp:history=2", "mlp:train_share=0.5"))
+    for cell in (first, second, part):
+        train_cell(cell, lambda share, note: None)
+    assert len(fits) == 2
+    kept = [(c.folder / "delay_offset.json").read_text() for c in (first, second)]
+    assert kept[0] == kept[1]

@@ -21,6 +21,7 @@ from gaponet.experiment.options import (
     QUICK_BUDGET,
     QUICK_PPO,
     QUICK_SEEDS,
+    QUICK_SENSORS,
     QUICK_WARM_START,
     SEEDS,
     TRAINING,
@@ -80,8 +81,9 @@ class Study:
             config = replace(config, rates=rates[:1])
         if quick:
             out = out / "rehearsal"
-            config = replace(config, warm_start=QUICK_WARM_START, ppo=QUICK_PPO)
-            data = take(data, rehearsal(data), out / "slice")
+            model = replace(config.model, sensor_hidden=QUICK_SENSORS)
+            config = replace(config, model=model, warm_start=QUICK_WARM_START, ppo=QUICK_PPO)
+            data = take(data, robot, rehearsal(data), out / "slice")
         return cls(
             data, robot, out, config, options.budget or (QUICK_BUDGET if quick else BUDGET),
             options.seeds if options.seeds is not None else QUICK_SEEDS if quick else SEEDS,

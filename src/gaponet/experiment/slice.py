@@ -1,18 +1,16 @@
-"""A small part of a dataset as a dataset of its own, for rehearsals: files are linked, not copied."""
+"""A small part of a dataset as a dataset of its own, for rehearsals."""
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 from collections.abc import Iterable
-from dataclasses import asdict
 from pathlib import Path
 
 from gaponet.data.pair import hash_order
-from gaponet.data.store import Dataset, Entry, write_text
+from gaponet.data.store import Dataset, Entry
+from gaponet.robot import RobotSpec
 
-MOTIONS, PAYLOADS, UNITS = 8, 3, 3  # a split by motion has 5 + 1 + 2 of 8
+MOTIONS, PAYLOADS, UNITS = 6, 3, 2  # a split by motion has 3 + 1 + 2 of 6
+SECONDS = 4.0
 
 
 def rehearsal(dataset: Dataset) -> list[Entry]:
@@ -28,18 +26,14 @@ def rehearsal(dataset: Dataset) -> list[Entry]:
     ]  # fmt: skip
 
 
-def take(dataset: Dataset, entries: Iterable[Entry], out: Path) -> Dataset:
-    """Those sequences as a dataset at out; the same call again finds it as it is."""
-    entries = list(entries)
-    (out / "sequences").mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(dataset.path / "dataset.json", out / "dataset.json")
+def take(dataset: Dataset, robot: RobotSpec, entries: Iterable[Entry], out: Path, seconds: float = SECONDS) -> Dataset:
+    """The first seconds of those sequences as a dataset at out; the same call again finds it as it is."""
+    part = Dataset.create(out, robot)
     for entry in entries:
-        file = out / "sequences" / f"{entry.id}.parquet"
-        if not file.exists():
-            _link(dataset.path / "sequences" / file.name, file)
-    lines = [json.dumps(asdict(e), ensure_ascii=False, allow_nan=False) + "\n" for e in entries]
-    write_text(out / "sequences.jsonl", "".join(lines))
-    return Dataset(out)
+        start = dataset.read(entry).rows(slice(0, round(seconds / entry.dt)))
+        if part.find(start.content_hash()) is None:
+            part.append(start)
+    return part
 
 
 def _few(values: list[float], most: int) -> list[float]:
@@ -47,10 +41,3 @@ def _few(values: list[float], most: int) -> list[float]:
     if len(values) <= most:
         return values
     return [values[round(i * (len(values) - 1) / (most - 1))] for i in range(most)]
-
-
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # another disk
-        shutil.copyfile(source, target)

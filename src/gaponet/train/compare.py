@@ -25,6 +25,7 @@ from typing import Any, NoReturn
 
 from gaponet.data.store import Dataset, dataset_hash, write_text
 from gaponet.errors import GAPONetError, UsageError
+from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.train.budget import Budget
@@ -137,7 +138,9 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
             tell(s.fraction, f"{s.stage}{held}, {s.throughput:,.0f} steps/s")
 
         budget = Budget.parse(cell.budget)
-        Trainer(data, cell.robot, cell.folder, config, budget, resume, cell.holdout_units, show).run()
+        trainer = Trainer(data, cell.robot, cell.folder, config, budget, resume, cell.holdout_units, show)
+        trainer.baseline = _fitted_beside(cell.folder)
+        trainer.run()
         card = _card(cell.folder)
         if card["interrupted"]:
             raise KeyboardInterrupt
@@ -148,6 +151,20 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
         "weights": GapModel.load(cell.folder).weights_hash(),
         **{k: card[k] for k in ("steps", "seconds", "val_mpjae", "gain", "sensor_r2", "parity_rad")},
     }
+
+
+def _fitted_beside(folder: Path) -> DelayOffset | None:
+    """Delay and offset as another cell has fitted them to the same recordings and simulator; a fit takes a while."""
+
+    def same(other: Path) -> bool:
+        split = [(f / "split.json").read_text(encoding="utf-8") for f in (folder, other)]
+        setup = [json.loads((f / SETUP).read_text(encoding="utf-8"))["simulator"] for f in (folder, other)]
+        return split[0] == split[1] and setup[0] == setup[1]
+
+    for other in sorted(folder.parent.glob("*/delay_offset.json")):
+        if same(other.parent):
+            return DelayOffset(**json.loads(other.read_text(encoding="utf-8")))
+    return None
 
 
 def _card(folder: Path) -> dict[str, Any]:

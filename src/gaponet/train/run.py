@@ -116,6 +116,7 @@ class Trainer:
         self.runner_state: State | None = None
         self.env_state: State | None = None  # of PPO's environments
         self.warm_state: State | None = None
+        self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
         if resume:
@@ -126,7 +127,8 @@ class Trainer:
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model."""
         self.nominal = self.validate(None)
-        self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
+        if self.baseline is None:
+            self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
             if not np.isfinite(self.best):
@@ -343,6 +345,7 @@ class Trainer:
 
     def _card(self) -> dict[str, Any]:
         seen = self.train_set
+        assert self.baseline is not None
         return make_card(
             self.config.model,
             self.robot,

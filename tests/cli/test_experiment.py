@@ -1,0 +1,56 @@
+"""gaponet experiment as a user types it."""
+
+import json
+
+import pytest
+from arm import recordings, write_arm
+
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+
+TRAIN = """--seeds 1 --budget 640 --warm-start.rounds 1 --warm-start.num-envs 16 --warm-start.steps 40
+--warm-start.gradient-steps 20""".split()  # noqa: SIM905
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("experiment")
+    dataset = Dataset.create(folder / "data", write_arm(folder / "arm"))
+    for sequence in recordings(dataset_robot(folder), 8, rows=60, kp=0.5, delay=2):
+        dataset.append(sequence)
+    return folder
+
+
+def dataset_robot(folder):
+    return write_arm(folder / "arm")
+
+
+def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, capsys):
+    words = ["experiment", "data", str(place / "data"), str(place / "out"), "--robot", str(place / "arm"), "--models",
+             "mlp", "--shares", "0.5", "1", *TRAIN, "--json"]  # fmt: skip
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    found = json.loads(captured.out)
+    assert "2 trainings (2 settings), 0 there already" in captured.err
+    rows = found["tables"]["data"]["rows"]
+    assert [row[0] for row in rows] == ["2", "5"]  # of eight motions 2 are for test and 1 for validation
+    assert rows[0][1] < rows[1][1]
+    assert rows[1][2]["mean"] > rows[1][4]["mean"] > 0  # nominal, mlp
+    assert found["virtual"].startswith("VIRTUAL arm")
+    assert str(place) not in found["facts"]["command"]
+    for name in ("data.md", "data.csv", "data.svg", "data.png", "report.html", "cells/mlp-0/cell.json"):
+        assert (place / "out" / name).is_file(), name
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert "2 there already" in captured.err
+    assert json.loads(captured.out)["tables"] == found["tables"]
+
+
+def test_what_cannot_be_asked_of_a_dataset_is_one_line(place, capsys):
+    where = [str(place / "data"), str(place / "out"), "--robot", str(place / "arm")]
+    assert main(["experiment", "unit", *where]) == 2
+    assert "leaving one out needs recordings of two or more" in capsys.readouterr().err
+    assert main(["experiment", "payload", *where]) == 2
+    assert "needs 3" in capsys.readouterr().err
+    assert main(["experiment", "ablation", *where, "--seeds", "0"]) == 2
+    assert "--seeds is at least 1" in capsys.readouterr().err
