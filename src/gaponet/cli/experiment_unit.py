@@ -66,7 +66,7 @@ def tracking(
     from gaponet.experiment.unseen import from_files, generated, require_unseen
 
     began = time.monotonic()
-    data, robot, trained = _models(dataset, out, runs, played, options)
+    data, robot, trained, out = _models(dataset, out, runs, played, options)
     if not any(e.meta.virtual for e in data.entries):
         _show(_recorded(data, robot, trained, began), out, options)
         return
@@ -85,7 +85,7 @@ def tracking(
     more: dict[str, Any] = {"unit_trained_on": True} if known else {}
     more |= {"motions": len(made), "compensator": _compensator("tracking")}
     told = _facts(data, trained, who, played, payloads, began, more)
-    _show(result(robot, scores, example, made, _label(data), told), out, options)
+    _show(result(robot, scores, example, made, _label(data, options.quick and not runs), told), out, options)
 
 
 def delivery(
@@ -122,7 +122,7 @@ def delivery(
     began = time.monotonic()
     if hold < 1.5:
         raise UsageError(f"--hold {hold:g}: offsets are those of the last second; hold for 1.5 s or more")
-    data, robot, trained = _models(dataset, out, runs, played, options)
+    data, robot, trained, out = _models(dataset, out, runs, played, options)
     if not any(e.meta.virtual for e in data.entries):
         raise UsageError(f"{dataset}: holds recordings of real robots; delivery plays a virtual unit, give its dataset")
     who, physics, payloads = _unit(robot, trained, played, options.quick)
@@ -138,30 +138,34 @@ def delivery(
     more = {"goals_per_payload": len(plans) * STOPS * len(planner.arms), "hold_s": hold,
             "compensator": _compensator("delivery")}  # fmt: skip
     told = _facts(data, trained, who, played, payloads, began, more)
-    _show(result(found, costs, example, _label(data), told), out, options)
+    _show(result(found, costs, example, _label(data, options.quick and not runs), told), out, options)
 
 
 def _models(
     dataset: Path, out: Path, runs: tuple[Path, ...], played: Played, options: Options
-) -> tuple[Dataset, RobotSpec, list[Trained]]:
-    """Dataset, nominal robot and models: those given, else trained now or found in OUT/cells."""
+) -> tuple[Dataset, RobotSpec, list[Trained], Path]:
+    """Dataset, nominal robot, models (those given, else trained now or found in OUT/cells), folder of the results."""
     from gaponet.experiment.trained import load_trained
 
     data, robot = open_dataset(dataset, options.robot)
     data.require_robot(robot)
     if not runs:
-        data, runs = _train(data, robot, out, played, options)
+        data, runs, out = _train(data, robot, out, played, options)
     robot = robot.nominal or robot
     trained = load_trained(runs, robot)
     if options.quick:
         trained = [t for t in trained if t.seed == trained[0].seed]
-    return data, robot, trained
+    return data, robot, trained, out
 
 
 def _train(
     data: Dataset, robot: RobotSpec, out: Path, played: Played, options: Options
-) -> tuple[Dataset, tuple[Path, ...]]:
-    """GAPONet and an MLP of its size, resumable, without the unit that will be played."""
+) -> tuple[Dataset, tuple[Path, ...], Path]:
+    """GAPONet and an MLP of its size, resumable, without the unit that will be played; a rehearsal's folder is its own.
+
+    Returns:
+        Dataset trained on, runs, folder of the results.
+    """
     from gaponet.cli.progress import bars
     from gaponet.experiment.cells import Study, train_all
 
@@ -175,7 +179,7 @@ def _train(
         failed = train_all(cells, study, show)
     if failed:
         raise UsageError(f"{failed[0]}; run it again to retry")
-    return study.data, tuple(c.folder for c in cells)
+    return study.data, tuple(c.folder for c in cells), study.out
 
 
 def _unit(robot: RobotSpec, trained: list[Trained], played: Played, quick: bool) -> tuple[str, Any, tuple[float, ...]]:
@@ -234,10 +238,12 @@ def _compensator(name: str) -> str:
     return ", ".join(f"{k} {v}" for k, v in asdict(config).items())
 
 
-def _label(data: Dataset) -> str:
+def _label(data: Dataset, trained_here: bool) -> str:
+    """Whose numbers; those of a rehearsal's models mean nothing."""
     from gaponet.experiment.result import label
 
-    return label(data)
+    note = " REHEARSAL: hardly any training, on a slice of the dataset; these numbers mean nothing."
+    return label(data) + (note if trained_here else "")
 
 
 def _show(found: Result, out: Path, options: Options) -> None:
