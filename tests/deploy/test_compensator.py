@@ -244,7 +244,7 @@ def test_feeding_the_dynamics_forward_brings_a_moving_arm_nearer(robot, model):
 
 def test_an_identified_robot_with_late_servos_and_zero_errors_reaches_its_target(robot):
     servos = {"kp": 16.0, "delay": 0.015, "offset": 0.03}
-    identified = robot.with_servos({joint: servos for joint in robot.joint_names})
+    identified = robot.with_servos(dict.fromkeys(robot.joint_names, servos))
     perfect = GapModel(Path("exact"), make_card(CONFIG, identified, dt=[0.02]), CONFIG, Nothing())
     compensator = Compensator(identified, perfect, NOW, payload_step=0.4)
     arm, target = BatchSim(identified, [(0.4, "both", 0.02)], 1), np.array([0.3, -0.2])
