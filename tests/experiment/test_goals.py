@@ -21,8 +21,8 @@ def test_targets_bring_the_hand_to_its_goals_and_keep_it_there(robot):
             held = places[plan.arrive[k] : plan.leave[k]]
             assert len(held) == 50  # 1 s
             assert np.abs(held - plan.goals[k]).max() < PRECISION
-            moved = np.abs(np.diff(places[plan.start[k] : plan.arrive[k] + 1], axis=0)).max()
-            assert 1e-4 < moved < 0.05
+            moved = np.abs(np.diff(places[plan.start[k] : plan.arrive[k]], axis=0)).max()
+            assert 1e-3 < moved < 0.05
         assert plan.leave[-1] == len(plan.ctrl)
         assert plan.rise[0, 0] == pytest.approx(plan.goals[0, 0, 2] - places[0, 0, 2], abs=1e-9)
 

@@ -22,6 +22,7 @@ REST = 1.5  # s at the start: time for a compensator to blend in
 SPEED = 1.5  # rad/s of the fastest joint on the way, about that of the recipe's reaching motions
 SHORTEST = 1.0  # s of a way
 VOXEL = 0.05  # m: space is covered evenly, not joint space
+APART = 0.1  # m: least way of a hand to its goal
 POSTURES = 3000  # drawn to find out what is reached
 PRECISION = 1e-3  # m of the inverse kinematics
 
@@ -135,11 +136,13 @@ class Planner:
         return places[kept]
 
     def _plan(self) -> Plan | None:
-        """One trajectory, or None where a goal drawn cannot be held or the way to it meets the body."""
+        """One trajectory, or None where a goal drawn is too near, cannot be held, or the way to it meets the body."""
         postures, goals = [self.ready], []
         for _ in range(STOPS):
             goal = np.array([places[self.rng.integers(len(places))] for places in self.reached])
             q = postures[-1]
+            if np.linalg.norm(goal - self.places(q), axis=1).min() < APART:
+                return None
             for ik, place in zip(self.ik, goal, strict=True):
                 q = ik.solve(q, place)
             if np.abs(self.places(q) - goal).max() > PRECISION or not self.limits.still(q):
