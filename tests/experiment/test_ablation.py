@@ -57,10 +57,10 @@ def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study):
     data = {DEFAULT: found(0.001, 0.003), "gaponet:payload_input=off": found(0.0041, 0.0039)}
     made = result(study, lines, data, dict.fromkeys(data, 0.01), ["One failed."])
     texts = made.tables[0].texts()
-    assert texts[0] == ["payload input", "in (default)", "2.00 ± 1.41", "0.20 ± 0.14", "2.00 ± 1.41", "10", "1.00",
+    assert texts[0] == ["payload input: in (default)", "2.00 ± 1.41", "0.20 ± 0.14", "2.00 ± 1.41", "10", "1.00",
                         "0.016 to 0.019"]  # fmt: skip
-    assert texts[1][1:4] == ["out", "4.00 ± 0.14", "0.40 ± 0.01"]
-    assert texts[3] == ["branch", "stacked", "", "", "", "", "", ""]  # nothing came of it, and it is not invented
+    assert texts[1][:3] == ["payload input: out", "4.00 ± 0.14", "0.40 ± 0.01"]
+    assert texts[3] == ["branch: stacked", "", "", "", "", "", ""]  # nothing came of it, and it is not invented
     assert made.sentences[-1] == "One failed."
 
 

@@ -116,7 +116,7 @@ def result(
         missing: What is to be said about lines that are not there.
     """
     new = any("new" in f for part in found.values() for f in part)
-    columns = ["choice", "setting", "MPJAE, mrad", "of nominal", "Q_dis, mrad·s"]
+    columns = ["choice", "MPJAE, mrad", "of nominal", "Q_dis, mrad·s"]
     columns += [*(["new unit, mrad"] * new), "weights", "minutes", "paper"]
     table: list[tuple[TableCell, ...]] = []
     ratio: dict[str, Spread] = {}
@@ -125,7 +125,7 @@ def result(
         if cells:
             ratio[row.word] = spread(cells, "known", "mpjae", scale=1 / nominal[row.word])
         table.append((
-            row.factor, row.setting + (" (default)" if row.word == DEFAULT else ""),
+            f"{row.factor}: {row.setting}{' (default)' if row.word == DEFAULT else ''}",
             spread(cells, "known", "mpjae"), ratio.get(row.word), spread(cells, "known", "q_dis"),
             *([spread(cells, "new", "mpjae")] * new), cells[0]["parameters"] if cells else None,
             Spread.of([f["seconds"] for f in cells], 1 / 60).mean if cells else None,
@@ -144,7 +144,7 @@ def result(
         label(study.data),
         study.facts(found),
         (Table("table2", tuple(columns), tuple(table), caption),),
-        {"ablation": dots(shown, "MPJAE of nominal", f"What each choice is worth, {study.who}")},
+        {"ablation": dots(shown, "MPJAE of nominal", f"What each choice is worth\n{study.who}")},
         (*_sentences(lines, ratio), *missing),
     )
 

@@ -95,7 +95,7 @@ def result(
     methods = {"nominal simulator": (colours["nominal"], x, list(nominal.values())),
                "delay + offset": (colours["delay_offset"], x, list(delayed.values()))}  # fmt: skip
     methods |= {title(w): (colours[w], x, list(error[w].values())) for w in words}
-    panel = (f"Error against recordings trained on, {study.who}", methods)
+    panel = (f"Error against recordings trained on\n{study.who}", methods)
     figure = lines([panel], ("minutes trained on", "MPJAE, mrad"), [(v, f"{v:.3g}") for v in x], log=True)
     return Result(
         "data", f"How much must be recorded, {study.who}", label(study.data), study.facts(found),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
 from gaponet.data.store import Dataset
@@ -10,7 +11,7 @@ from gaponet.eval.colours import COLOURS
 from gaponet.experiment.cells import Found, Show, Study, baselines, outcomes, spread, train_all
 from gaponet.experiment.draw import lines
 from gaponet.experiment.result import Cell as TableCell
-from gaponet.experiment.result import Result, Table, compared, label
+from gaponet.experiment.result import Result, Spread, Table, compared, label
 from gaponet.train.compare import Cell
 
 ALL, BLIND = "gaponet", ":payload_input=off"
@@ -70,7 +71,6 @@ def result(
 ) -> Result:
     """Table, figure and sentences; base as of evaluate_baselines."""
     by = sorted(base["nominal"]["known"]["by_payload"], key=float)
-    at = lambda cells, mass: spread(cells, "known", "by_payload", mass, "mpjae")  # noqa: E731
     titles = {ALL: "GAPONet trained on all payloads", ALL + BLIND: "GAPONet trained on all payloads, mass not told"}
     for q in asked:
         told, blind = q.words
@@ -79,8 +79,10 @@ def result(
     rows: list[tuple[TableCell, ...]] = [
         ("nominal simulator", *(at([base["nominal"]], m) for m in by)),
         ("delay + offset", *(at([base["delay_offset"]], m) for m in by)),
-        *((title, *(at(found[word], m) for m in by)) for word, title in titles.items() if word in found),
     ]
+    for word, title in titles.items():
+        if word in found:
+            rows.append((title, *(at(found[word], m) for m in by)))
     columns = ("MPJAE, mrad", *(f"{float(m):g} kg" for m in by))
     caption = (
         "Held-out motions, whole-motion free run, mean ± std over seeds; delay + offset is fitted on all payloads."
@@ -93,7 +95,7 @@ def result(
         for word, title, colour in named:
             if word in found:
                 methods[title] = (colour, masses, [at(found[word], m) for m in by])
-        panels.append((f"{q.payload:g} kg left out, {q.name} the others ({study.who})", methods))
+        panels.append((f"{q.payload:g} kg left out, {q.name} the others\n{study.who}", methods))
     figure = lines(panels, ("payload per hand, kg", "MPJAE, mrad"), [(m, f"{m:g}") for m in masses],
                    marked=[q.payload for q in asked])  # fmt: skip
     return Result(
@@ -103,11 +105,16 @@ def result(
     )  # fmt: skip
 
 
+def at(runs: ListOf[Found], mass: str) -> Spread:
+    """Error at a payload over seeds, mrad."""
+    return spread(runs, "known", "by_payload", mass, "mpjae")
+
+
 def _sentences(asked: tuple[Question, ...], found: dict[str, list[Found]], base: Found) -> list[str]:
     out = []
     for q in asked:
         mass = next(m for m in base["nominal"]["known"]["by_payload"] if float(m) == q.payload)
-        error = {w: spread(f, "known", "by_payload", mass, "mpjae") for w, f in found.items()}
+        error = {w: at(f, mass) for w, f in found.items()}
         nominal = base["nominal"]["known"]["by_payload"][mass]["mpjae"] * 1e3
         told, blind = q.words
         if told not in error:

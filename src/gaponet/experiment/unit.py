@@ -81,7 +81,7 @@ def result(study: Study, words: ListOf[str], found: Folds, base: dict[str, Found
         "unit", f"A unit never trained on, {study.who}", label(study.data),
         study.facts({u: [f for part in of.values() for f in part] for u, of in found.items()}),
         (Table("unit", tuple(columns), tuple(rows), caption),),
-        {"unit": bars(units, methods, "MPJAE, mrad", f"Leave one unit out, {study.who}")},
+        {"unit": bars(units, methods, "MPJAE, mrad", f"Leave one unit out\n{study.who}")},
         (*_sentences(words, never, known, nominal), *failed),
     )  # fmt: skip
 
