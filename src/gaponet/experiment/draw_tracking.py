@@ -71,8 +71,9 @@ def _legend(fig: Figure, axes: Any) -> None:
 
 @styled
 def example(shown: Example, robot: RobotSpec, tag: str) -> Figure:
-    """Targets and joints by method, and the error below: the three joints with the largest raw error."""
-    raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0)
+    """Targets and joints by method, and the error below: the three joints with the largest raw error of those that move."""
+    moves = np.ptp(shown.target, axis=0) > 0.1
+    raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
     columns = sorted(np.argsort(-raw)[:3].tolist())
     fig = figure(3.5 * len(columns), 4.2)
     axes = fig.subplots(2, len(columns), sharex=True, squeeze=False, height_ratios=[1.6, 1])

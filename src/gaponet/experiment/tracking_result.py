@@ -60,7 +60,15 @@ def result(
     told = [s for part in parts for s in sentences(scores, part, sets[0])]
     who = "never trained on" if tag == "VIRTUAL robot" and not facts.get("unit_trained_on") else ""
     name = f"Zero-shot tracking of motions never trained on{', unit ' + who if who else ''} ({tag})"
-    return Result("tracking", name, virtual, facts, tuple(tables), figures, tuple(told))
+    return Result(
+        "tracking" if tag == "VIRTUAL robot" else "tracking-real",
+        name,
+        virtual,
+        facts,
+        tuple(tables),
+        figures,
+        tuple(told),
+    )
 
 
 def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
