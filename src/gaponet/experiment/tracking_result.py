@@ -59,7 +59,8 @@ def result(
         figures["example"] = draw.example(example, robot, tag)
     told = [s for part in parts for s in sentences(scores, part, sets[0])]
     who = "never trained on" if tag == "VIRTUAL robot" and not facts.get("unit_trained_on") else ""
-    name = f"Zero-shot tracking of motions never trained on{', unit ' + who if who else ''} ({tag})"
+    headline = f"Zero-shot tracking of motions never trained on{', unit ' + who if who else ''} ({tag})"
+    name = "tracking" if tag == "VIRTUAL robot" else "tracking-real"
     return Result(
         "tracking" if tag == "VIRTUAL robot" else "tracking-real",
         name,
