@@ -71,7 +71,7 @@ def _legend(fig: Figure, axes: Any) -> None:
 
 @styled
 def example(shown: Example, robot: RobotSpec, tag: str) -> Figure:
-    """Targets and joints by method, and the error below: the three joints with the largest raw error of those that move."""
+    """Targets and joints by method, and the error below: of joints that move the three with the largest raw error."""
     moves = np.ptp(shown.target, axis=0) > 0.1
     raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
     columns = sorted(np.argsort(-raw)[:3].tolist())

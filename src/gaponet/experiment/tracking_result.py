@@ -61,15 +61,7 @@ def result(
     who = "never trained on" if tag == "VIRTUAL robot" and not facts.get("unit_trained_on") else ""
     headline = f"Zero-shot tracking of motions never trained on{', unit ' + who if who else ''} ({tag})"
     name = "tracking" if tag == "VIRTUAL robot" else "tracking-real"
-    return Result(
-        "tracking" if tag == "VIRTUAL robot" else "tracking-real",
-        name,
-        virtual,
-        facts,
-        tuple(tables),
-        figures,
-        tuple(told),
-    )
+    return Result(name, headline, virtual, facts, tuple(tables), figures, tuple(told))
 
 
 def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
