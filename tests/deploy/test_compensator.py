@@ -30,6 +30,13 @@ class Exact:
         return Bound(x, delta, lambda: np.copyto(delta, self(x)))
 
 
+class Nothing(Exact):
+    """An operator with nothing to correct."""
+
+    def __call__(self, x):
+        return np.zeros((len(x), 2), np.float32)
+
+
 class WeakArm:
     """The robot: weak servos, commands `late` periods under way and sometimes lost, a payload that may change."""
 
@@ -223,3 +230,26 @@ def test_other_arrays_and_robots_are_refused(robot, model):
         Compensator(robot, model).reset(np.zeros(3), 0.0)
     with pytest.raises(UsageError, match="gain must be"):
         CompensatorConfig(gain=0.0)
+
+
+def test_feeding_the_dynamics_forward_brings_a_moving_arm_nearer(robot, model):
+    targets = commands(150, 1)
+    missed = {}
+    for dynamics in (False, True):
+        compensator = Compensator(robot, model, replace(NOW, dynamics=dynamics))
+        q, _ = play(WeakArm(robot, 0.2), targets, compensator, 0.2)
+        missed[dynamics] = error(q, targets)
+    assert missed[True] < 0.6 * missed[False]
+
+
+def test_an_identified_robot_with_late_servos_and_zero_errors_reaches_its_target(robot):
+    servos = {"kp": 16.0, "delay": 0.015, "offset": 0.03}
+    identified = robot.with_servos(dict.fromkeys(robot.joint_names, servos))
+    perfect = GapModel(Path("exact"), make_card(CONFIG, identified, dt=[0.02]), CONFIG, Nothing())
+    compensator = Compensator(identified, perfect, NOW, payload_step=0.4)
+    arm, target = BatchSim(identified, [(0.4, "both", 0.02)], 1), np.array([0.3, -0.2])
+    arm.reset(slice(None), target[None], np.zeros((1, 2)), past=np.tile(target, (1, 1, 1)))
+    compensator.reset(target, 0.4)
+    for _ in range(150):
+        arm.step(compensator.step(target, arm.qpos[0].copy())[None])
+    np.testing.assert_allclose(arm.qpos[0], target, atol=0.05 / 16)  # within the friction band

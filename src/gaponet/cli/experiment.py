@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.markup import escape
 
+from gaponet.cli.experiment_unit import delivery, tracking
 from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bars
@@ -125,6 +126,8 @@ Action = (
     | Annotated[None, tyro.conf.subcommand("payload", constructor=payload)]
     | Annotated[None, tyro.conf.subcommand("unit", constructor=unit)]
     | Annotated[None, tyro.conf.subcommand("data", constructor=data)]
+    | Annotated[None, tyro.conf.subcommand("tracking", constructor=tracking)]
+    | Annotated[None, tyro.conf.subcommand("delivery", constructor=delivery)]
 )
 
 

@@ -1,0 +1,108 @@
+"""Ask one VIRTUAL unit for targets, as they are or through a compensator, many motions and payloads side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.model.artifact import GapModel
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import idle_joints
+from gaponet.virtual.physics import Physics
+from gaponet.virtual.unit import VirtualRobot
+
+Array = np.ndarray
+
+WARMTH = 12.0  # K above ambient at the start: a robot that has been working (virtual/play.py)
+
+
+@dataclass(frozen=True)
+class Driven:
+    """How targets reach the robot.
+
+    Attributes:
+        model: What the compensator asks; None to send targets as they are.
+        robot: The simulator that the model corrects.
+        config: Of the compensator; iterations 0 leaves the model out.
+    """
+
+    model: GapModel
+    robot: RobotSpec
+    config: CompensatorConfig
+
+
+@dataclass(frozen=True)
+class Played:
+    """What happened; row t is the state at t·dt and the command of [t·dt, (t+1)·dt); (T, N, n), all joints.
+
+    Attributes:
+        qpos, qvel: What the encoders say, rad, rad/s.
+        true: Where the joints are, rad: nobody's sensor says it.
+        sent: Commands, rad.
+        tau: Motor torque as the current sensors say, N·m.
+        temperature: Windings, °C.
+    """
+
+    qpos: Array
+    qvel: Array
+    true: Array
+    sent: Array
+    tau: Array
+    temperature: Array
+
+
+def side_by_side(ctrl: ListOf[Array]) -> Array:
+    """Targets of unequal length as one (T, N, n), each held at its end."""
+    longest = max(len(c) for c in ctrl)
+    return np.stack([np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1)
+
+
+def play(
+    robot: RobotSpec,
+    unit: Physics,
+    targets: Array,
+    mass: Array,
+    seeds: list[int],
+    driven: Driven | None = None,
+    lengths: Array | None = None,
+    progress: Callable[[int], None] = lambda steps: None,
+    nthread: int = 1,
+) -> Played:
+    """Start at rest under the first target, then follow.
+
+    Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others.
+
+    Args:
+        robot: The nominal type.
+        unit: Its hidden physics.
+        targets: (T, N, n) rad at the robot's control period.
+        mass: Payload in each hand, (N,) kg, told to the compensator.
+        seeds: Of each row's noise and rest position, (N,).
+        driven: By what; None for the targets as they are.
+        lengths: Rows of each that count, (N,), falling; those that are through stand still.
+        progress: Called after each period with the control steps done in it.
+        nthread: Threads, 0 for all cores.
+    """
+    count = len(mass)
+    locked = idle_joints(robot, robot.operated)
+    robots = VirtualRobot(
+        robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked, nthread=nthread
+    )
+    robots.reset(targets[0], seeds, WARMTH)
+    compensator = None
+    if driven is not None:
+        compensator = Compensator(driven.robot, driven.model, driven.config, num_envs=count, nthread=nthread)
+        compensator.reset(targets[0], mass)
+    out = np.empty((6, *targets.shape), np.float32)
+    running = np.full(len(targets), count) if lengths is None else (lengths > np.arange(len(targets))[:, None]).sum(1)
+    for t, target in enumerate(targets):
+        reading = robots.read()
+        sent = target if compensator is None else compensator.step(target, reading.qpos, reading.qvel)
+        out[:, t] = reading.qpos, reading.qvel, robots.true_qpos(), sent, reading.tau, reading.temperature
+        robots.step(sent, np.arange(running[t]))
+        progress(int(running[t]))
+    return Played(*out)
