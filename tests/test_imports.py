@@ -40,6 +40,15 @@ def test_imports_go_one_way():
                 assert rank(name.split(".")[1]) <= rank(parts[0]), f"{file} imports {name}"
 
 
+def test_nothing_below_the_command_line_imports_it_not_even_in_a_function():
+    for file in SOURCE.rglob("*.py"):
+        if file.relative_to(SOURCE).parts[0] == "cli":
+            continue
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        found = [n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and n.module]
+        assert not [m for m in found if m.startswith("gaponet.cli")], file
+
+
 def test_torch_is_imported_only_where_networks_live():
     allowed = {f"model/{name}.py" for name in ("deeponet", "export", "fuse", "layers", "points", "torchscript")}
     allowed |= {f"model/baselines/{name}.py" for name in ("fno", "mlp", "tokens", "transformer")}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Iterable
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+
+from gaponet.data.json_file import finite
 
 
 class Out:
@@ -37,16 +38,3 @@ class Out:
         if self.as_json:
             json.dump(finite(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
-
-
-def finite(value: Any) -> Any:
-    """The same value with NaN and infinities as None and numpy scalars as Python's, so that it is valid JSON."""
-    if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(v) for v in value]
-    if hasattr(value, "tolist"):
-        return finite(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

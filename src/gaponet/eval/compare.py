@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, write_text
 from gaponet.eval.evaluate import choose
@@ -204,10 +205,9 @@ def heading(result: Result) -> str:
 
 def write(result: Result, out: Path) -> list[Path]:
     """compare.json, .csv, .md, .svg and .png; returns the files."""
-    from gaponet.cli.out import finite
     from gaponet.eval.draw_dataset import save
 
-    write_text(out / "compare.json", json.dumps(finite(result), indent=1, ensure_ascii=False) + "\n")
+    write_json(out / "compare.json", result)
     with (out / "compare.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)

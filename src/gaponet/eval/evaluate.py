@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.data.json_file import write_json
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset, Entry, write_text
+from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.gap import Run, runs, summary
 from gaponet.model import calibration
@@ -128,7 +129,6 @@ def read_split(run: Path) -> dict[str, dict[str, str]]:
 
 def save(evaluation: Evaluation, run: Path) -> None:
     """metrics.json and trajectories.npz in the run folder: the newest evaluation, all that the report needs."""
-    from gaponet.cli.out import finite
 
     reals = evaluation.runs["nominal"]
     picked = sorted({round(i) for i in np.linspace(0, len(reals) - 1, min(SHOWN, len(reals)))})
@@ -149,7 +149,7 @@ def save(evaluation: Evaluation, run: Path) -> None:
     temporary = run / ".trajectories.npz"
     np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})
     temporary.replace(run / "trajectories.npz")
-    write_text(run / "metrics.json", json.dumps(finite(result), indent=1, ensure_ascii=False) + "\n")
+    write_json(run / "metrics.json", result)
 
 
 def corrected_robot(run: Path, nominal: RobotSpec) -> RobotSpec:

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gaponet.data.store import Dataset, write_text
+from gaponet.data.json_file import write_json
+from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.eval.compare import evaluate_baselines, evaluate_model
 from gaponet.eval.draw_dataset import who
@@ -134,14 +135,13 @@ def rates_of(data: Dataset) -> tuple[float, ...]:
 
 def train_and_evaluate(cell: Cell, tell: Tell) -> None:
     """The work of a cell's process."""
-    from gaponet.cli.out import finite
 
     told = train_cell(cell, tell)
     tell(1.0, "evaluation")
     found = evaluate_model(cell.folder, Dataset(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
     start = "identified" if cell.robot.nominal is not None else "nominal"
     told |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
-    write_text(cell.folder / RESULT, json.dumps(finite(told | found), indent=1, ensure_ascii=False) + "\n")
+    write_json(cell.folder / RESULT, told | found)
 
 
 def train_all(cells: ListOf[Cell], study: Study, show: Show) -> list[str]:
@@ -175,11 +175,9 @@ def baselines(cell: Cell, study: Study) -> Found:
     parts = [*sorted(split["test"].values()), fitted, model_hash(nominal), *cell.holdout_units]
     file = study.out / "baselines" / f"{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.json"
     if not file.is_file():
-        from gaponet.cli.out import finite
-
         found = evaluate_baselines(cell.folder, study.data, nominal, None, cell.holdout_units)
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_text(file, json.dumps(finite(found), indent=1, ensure_ascii=False) + "\n")
+        write_json(file, found)
     return json.loads(file.read_text(encoding="utf-8"))
 
 

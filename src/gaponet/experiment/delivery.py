@@ -7,7 +7,6 @@ that the encoders tell.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
@@ -15,14 +14,13 @@ import numpy as np
 
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiment.goals import Plan, Planner
-from gaponet.experiment.play import Played, play, side_by_side
+from gaponet.experiment.play import Played, Progress, play, side_by_side, with_payloads
 from gaponet.experiment.tracking import compensations
 from gaponet.experiment.trained import Trained
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
-Progress = Callable[[str, float], None]
 
 LAST = 1.0  # s at the end of a hold in which offsets are averaged
 NEAR = 0.01  # m: delivered
@@ -103,7 +101,7 @@ def deliver(
         trained: Models.
         progress: Of each method.
     """
-    pairs = [(plan, p) for plan in sorted(plans, key=lambda p: -len(p.ctrl)) for p in payloads]
+    pairs = with_payloads(plans, payloads)
     lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), side_by_side([p.ctrl for p, _ in pairs])
     mass, total = np.array([p for _, p in pairs]), int(lengths.sum())
     asked = {id(plan): planner.places(plan.ctrl) for plan in plans}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,7 +18,19 @@ from gaponet.virtual.unit import VirtualRobot
 
 Array = np.ndarray
 
+Progress = Callable[[str, float], None]  # method, share of it done
+
 WARMTH = 12.0  # K above ambient at the start: a robot that has been working (virtual/play.py)
+
+
+class Commanded(Protocol):
+    """Something with targets, (T, n) rad."""
+
+    @property
+    def ctrl(self) -> Array: ...
+
+
+M = TypeVar("M", bound=Commanded)
 
 
 @dataclass(frozen=True)
@@ -53,6 +66,11 @@ class Played:
     sent: Array
     tau: Array
     temperature: Array
+
+
+def with_payloads(motions: ListOf[M], payloads: tuple[float, ...]) -> list[tuple[M, float]]:
+    """Each motion with each payload, kg, the longest motions first, as `play` wants them."""
+    return [(m, p) for m in sorted(motions, key=lambda m: -len(m.ctrl)) for p in payloads]
 
 
 def side_by_side(ctrl: ListOf[Array]) -> Array:

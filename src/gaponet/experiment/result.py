@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 import shlex
 import sys
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.data.json_file import write_json
 from gaponet.data.store import Dataset, dataset_hash, write_text
 from gaponet.errors import UsageError
 
@@ -171,7 +171,6 @@ def write(result: Result, folder: Path) -> list[Path]:
     Raises:
         UsageError: folder is a file.
     """
-    from gaponet.cli.out import finite
     from gaponet.eval.draw_dataset import save
     from gaponet.experiment.report import write_report
 
@@ -193,7 +192,7 @@ def write(result: Result, folder: Path) -> list[Path]:
         "facts": dict(result.facts), "sentences": list(result.sentences),
         "tables": [_table_record(t) for t in result.tables], "figures": figures,
     }  # fmt: skip
-    write_text(files[-1], json.dumps(finite(record), indent=1, ensure_ascii=False) + "\n")
+    write_json(files[-1], record)
     return [*files, write_report(folder)]
 
 

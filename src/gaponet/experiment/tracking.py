@@ -9,7 +9,7 @@ not, when a motion begins. e_t compares the target of a moment with the joint at
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.deploy.compensator import CompensatorConfig
-from gaponet.experiment.play import Driven, Played, play, side_by_side
+from gaponet.experiment.play import Driven, Played, Progress, play, side_by_side, with_payloads
 from gaponet.experiment.trained import Trained
 from gaponet.experiment.unseen import Unseen
 from gaponet.robot import RobotSpec
@@ -25,7 +25,6 @@ from gaponet.sim.replay import replay
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
-Progress = Callable[[str, float], None]  # method, share of it done
 
 REST = 2.0  # s under the first target before a motion begins: time for a compensator to blend in
 PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
@@ -67,19 +66,6 @@ class Example:
     qpos: dict[str, Array]
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Motions × payloads side by side, the longest first."""
-
-    motions: tuple[Unseen, ...]
-    payloads: tuple[float, ...]
-
-    @property
-    def pairs(self) -> list[tuple[Unseen, float]]:
-        """Of each row."""
-        return [(m, p) for m in sorted(self.motions, key=lambda m: -len(m.ctrl)) for p in self.payloads]
-
-
 def track(
     robot: RobotSpec,
     unit: Physics,
@@ -99,7 +85,7 @@ def track(
         trained: Models.
         progress: Of each method.
     """
-    pairs = Rows(tuple(motions), payloads).pairs
+    pairs = with_payloads(motions, payloads)
     rest = round(REST / robot.dt)
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
     lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)

@@ -15,8 +15,8 @@ from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import write_text
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
@@ -102,7 +102,7 @@ def save(calibration: Calibration, run: Path) -> Path:
     """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
     path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', calibration.unit_id)}.json"
     path.parent.mkdir(exist_ok=True)
-    write_text(path, json.dumps(asdict(calibration), indent=1) + "\n")
+    write_json(path, asdict(calibration))
     return path
 
 
