@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Shared = Annotated[Options, tyro.conf.arg(name="")]
 MODELS = ("gaponet", "mlp:mlp_match=on")
 QUICK_MOTIONS, QUICK_PLANS = 4, 5
+PARTS = "parts"  # of OUT: what each method did
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def tracking(
         update(2, 2, "")
     with bar("tracking") as update:
         scores, example = track(
-            robot, physics, who, made, payloads, trained, lambda method, share: update(share, 1.0, method)
+            robot, physics, who, made, payloads, trained, lambda method, share: update(share, 1.0, method), out / PARTS
         )
     more: dict[str, Any] = {"unit_trained_on": True} if known else {}
     more |= {"motions": len(made), "compensator": _compensator("tracking")}
@@ -133,7 +134,14 @@ def delivery(
         update(1, 1, "")
     with bar("delivery") as update:
         found, costs, example = deliver(
-            robot, physics, planner, plans, payloads, trained, lambda method, share: update(share, 1.0, method)
+            robot,
+            physics,
+            planner,
+            plans,
+            payloads,
+            trained,
+            lambda method, share: update(share, 1.0, method),
+            out / PARTS,
         )
     more = {"goals_per_payload": len(plans) * STOPS * len(planner.arms), "hold_s": hold,
             "compensator": _compensator("delivery")}  # fmt: skip
@@ -205,7 +213,9 @@ def _recorded(data: Dataset, robot: RobotSpec, trained: list[Trained], began: fl
     entries, unseen = choose(trained[0].run, data, ())
     sequences = data.sequences(entries)
     with bar("alignment") as update:
-        scores = align(sequences, ["recorded"] * len(entries), robot, trained, lambda m, share: update(share, 1.0, m))
+        scores = align(
+            lambda: sequences, ["recorded"] * len(entries), robot, trained, lambda m, share: update(share, 1.0, m)
+        )
     told = facts(
         data, sorted({t.seed for t in trained}), test_motions=len({e.meta.motion for e in entries}), unseen=unseen,
         runs=_weights(trained), minutes=round((time.monotonic() - began) / 60, 1),

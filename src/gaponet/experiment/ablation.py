@@ -18,6 +18,9 @@ from gaponet.train.variant import parse_variant
 DEFAULT = "gaponet"
 COLD = "warm_start.rounds=0:ppo.critic_warmup=0:ppo.learning_rate=1e-4:ppo.init_std=0.05"  # PPO's values of the paper
 
+WIDE = "branch_hidden=128,128:trunk_hidden=64,64:sensor_hidden=256,256"
+PAPER_SIZE = "coupling=full:branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"
+
 # Table 2(a) of the paper, smallest and largest error over its rows, unit not known here, nor any other of its numbers.
 # The paper's own model ("Ours") is the row without payload and with H = 4.
 PAPER = {"payload_input=on": (0.016, 0.019), "payload_input=off": (0.012, 0.015)}
@@ -32,6 +35,7 @@ FACTORS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("branch", tuple((s, f"branch={s}") for s in ("unstacked", "stacked"))),
     ("basis functions p", tuple((f"{p}", f"num_basis={p}") for p in (4, 16, 64))),
     ("probes m", tuple((f"{m}", f"num_probes={m}") for m in (10, 20, 40))),
+    ("network", (("narrow", ""), ("twice as wide", WIDE), ("the paper's, full coupling", PAPER_SIZE))),
     ("warm start", (("on", ""), ("off, PPO alone", COLD))),
     ("correction limit", tuple((f"{d:g} rad", f"delta_max={d:g}") for d in (0.1, 0.3, 0.6))),
 )

@@ -9,15 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiment.goals import Plan, Planner
-from gaponet.experiment.play import Played, Progress, play, side_by_side, with_payloads
+from gaponet.experiment.kept import Kept, revived
+from gaponet.experiment.play import Driven, Played, Progress, play, side_by_side, with_payloads
 from gaponet.experiment.tracking import compensations
 from gaponet.experiment.trained import Trained
 from gaponet.robot import RobotSpec
+from gaponet.sim.model import model_hash
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
@@ -89,6 +93,7 @@ def deliver(
     payloads: tuple[float, ...],
     trained: ListOf[Trained],
     progress: Progress = lambda method, share: None,
+    folder: Path | None = None,
 ) -> tuple[list[Delivery], list[Cost], Example]:
     """Play every trajectory with every payload, by every method.
 
@@ -100,32 +105,46 @@ def deliver(
         payloads: kg per hand.
         trained: Models.
         progress: Of each method.
+        folder: Where each method's part is kept when it is done.
     """
     pairs = with_payloads(plans, payloads)
     lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), side_by_side([p.ctrl for p, _ in pairs])
     mass, total = np.array([p for _, p in pairs]), int(lengths.sum())
     asked = {id(plan): planner.places(plan.ctrl) for plan in plans}
     last, shown = round(LAST / robot.dt), len(pairs) // 2 // len(payloads) * len(payloads) + len(payloads) - 1
+    kept = Kept(folder, "delivery", model_hash(robot), unit, plans, payloads)
     found: list[Delivery] = []
     costs: list[Cost] = []
     places: dict[str, Array] = {}
-    for method, seed, driven in compensations(robot, trained):
-        done, name = 0, f"{method} {'' if seed is None else seed}".strip()
+    for method, seed, way in compensations(robot, trained):
+        driven = None if way is None else replace(way, config=replace(HOLD, iterations=way.config.iterations))
 
-        def tell(steps: int, name: str = name) -> None:
-            nonlocal done
-            done += steps
-            progress(name, done / total)
+        def work(method: str = method, seed: int | None = seed, driven: Driven | None = driven) -> Any:
+            done, name = 0, f"{method} {'' if seed is None else seed}".strip()
 
-        driven = None if driven is None else replace(driven, config=replace(HOLD, iterations=driven.config.iterations))
-        played = play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, tell)
-        for i, (plan, payload) in enumerate(pairs):
-            rows = slice(0, len(plan.ctrl))
-            hand, told = planner.places(played.true[rows, i]), planner.places(played.qpos[rows, i])
-            found += _delivered(plan, hand, told, asked[id(plan)], method, seed, payload, last, robot.dt)
-            costs.append(_cost(plan, played, i, method, seed, payload, robot))
-            if i == shown and seed in (None, trained[0].seed):
-                places[method] = hand[:, 0]
+            def tell(steps: int) -> None:
+                nonlocal done
+                done += steps
+                progress(name, done / total)
+
+            played = play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, tell)
+            delivered: list[Delivery] = []
+            cost: list[Cost] = []
+            place = np.empty((0, 3))
+            for i, (plan, payload) in enumerate(pairs):
+                rows = slice(0, len(plan.ctrl))
+                hand, told = planner.places(played.true[rows, i]), planner.places(played.qpos[rows, i])
+                delivered += _delivered(plan, hand, told, asked[id(plan)], method, seed, payload, last, robot.dt)
+                cost.append(_cost(plan, played, i, method, seed, payload, robot))
+                if i == shown:
+                    place = hand[:, 0]
+            return {"found": delivered, "costs": cost, "place": place}
+
+        part = kept(method, seed, driven and driven.facts, make=work)
+        found += [revived(Delivery, d) for d in part["found"]]
+        costs += [revived(Cost, c) for c in part["costs"]]
+        if seed in (None, trained[0].seed):
+            places[method] = np.array(part["place"])
     plan, payload = pairs[shown]
     return (
         found,

@@ -12,7 +12,7 @@ import numpy as np
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.model import idle_joints
+from gaponet.sim.model import idle_joints, model_hash
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.unit import VirtualRobot
 
@@ -46,6 +46,10 @@ class Driven:
     model: GapModel
     robot: RobotSpec
     config: CompensatorConfig
+
+    def facts(self) -> tuple[object, ...]:
+        """What decides how the robot is driven."""
+        return self.model.weights_hash(), model_hash(self.robot), self.config
 
 
 @dataclass(frozen=True)

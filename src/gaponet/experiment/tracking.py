@@ -9,18 +9,23 @@ not, when a motion begins. e_t compares the target of a moment with the joint at
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.deploy.compensator import CompensatorConfig
+from gaponet.experiment.kept import Kept, revived
 from gaponet.experiment.play import Driven, Played, Progress, play, side_by_side, with_payloads
 from gaponet.experiment.trained import Trained
 from gaponet.experiment.unseen import Unseen
 from gaponet.robot import RobotSpec
+from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.virtual.physics import Physics
 
@@ -74,6 +79,7 @@ def track(
     payloads: tuple[float, ...],
     trained: ListOf[Trained],
     progress: Progress = lambda method, share: None,
+    folder: Path | None = None,
 ) -> tuple[list[Score], Example]:
     """Play every motion with every payload on the unit, raw and compensated, and in every simulator.
 
@@ -84,6 +90,7 @@ def track(
         payloads: kg per hand.
         trained: Models.
         progress: Of each method.
+        folder: Where each method's part is kept when it is done.
     """
     pairs = with_payloads(motions, payloads)
     rest = round(REST / robot.dt)
@@ -91,6 +98,7 @@ def track(
     lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)
     mass = np.array([p for _, p in pairs])
     total = int(lengths.sum())
+    kept = Kept(folder, "tracking", model_hash(robot), unit, unit_id, [m for m, _ in pairs], payloads)
 
     def drive(method: str, driven: Driven | None) -> Played:
         done = 0
@@ -102,16 +110,30 @@ def track(
 
         return play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, tell)
 
-    raw = drive("raw", None)
-    recorded = [_recording(robot, unit_id, m, p, raw, i, rest) for i, (m, p) in enumerate(pairs)]
-    scores = align(recorded, [m.source for m, _ in pairs], robot, trained, progress)
-    shown = _shown(pairs, robot, targets, raw)
+    @cache
+    def raw() -> Played:
+        return drive("raw", None)
+
+    def recorded() -> list[Sequence]:
+        return [_recording(robot, unit_id, m, p, raw(), i, rest) for i, (m, p) in enumerate(pairs)]
+
+    scores = align(recorded, [m.source for m, _ in pairs], robot, trained, progress, kept)
+    shown = int(kept("shown", make=lambda: {"row": _shown(pairs, robot, targets, raw())})["row"])
     example: dict[str, Array] = {}
     for method, seed, driven in compensations(robot, trained):
-        played = raw if driven is None else drive(f"{method} {'' if seed is None else seed}".strip(), driven)
-        scores += _tracked(pairs, played, targets, lengths, rest, robot, method, seed)
+        name = f"{method} {'' if seed is None else seed}".strip()
+
+        def work(
+            method: str = method, seed: int | None = seed, driven: Driven | None = driven, name: str = name
+        ) -> Any:
+            played = raw() if driven is None else drive(name, driven)
+            found = _tracked(pairs, played, targets, lengths, rest, robot, method, seed)
+            return {"scores": found, "qpos": played.qpos[rest : lengths[shown], shown][:, robot.operated_index]}
+
+        part = kept("compensation", method, seed, driven and driven.facts, make=work)
+        scores += [revived(Score, s) for s in part["scores"]]
         if seed in (None, trained[0].seed):
-            example[method] = played.qpos[rest : lengths[shown], shown][:, robot.operated_index]
+            example[method] = np.array(part["qpos"])
     target = targets[rest : lengths[shown], shown][:, robot.operated_index]
     return scores, Example(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
 
@@ -128,32 +150,46 @@ def compensations(robot: RobotSpec, trained: ListOf[Trained]) -> Iterable[tuple[
 
 
 def align(
-    recorded: ListOf[Sequence],
+    recorded: Callable[[], ListOf[Sequence]],
     sources: ListOf[str],
     robot: RobotSpec,
     trained: ListOf[Trained],
     progress: Progress = lambda method, share: None,
+    kept: Kept = Kept(None),  # noqa: B008
 ) -> list[Score]:
     """Free runs of every simulator under the recordings' targets, from their first state.
 
     Args:
-        recorded: What the robot did.
+        recorded: What the robot did; asked for when there is something to do.
         sources: Of each motion.
         robot: The nominal simulator.
         trained: Models; the identified simulator comes from those that correct it.
         progress: Of each method.
+        kept: What is done already.
     """
     simulators: list[tuple[str, int | None, RobotSpec, Trained | None]] = [("nominal", None, robot, None)]
     simulators += [("identified", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]
     simulators += [(t.method, t.seed, t.robot, t) for t in trained]
-    scores = []
+    scores: list[Score] = []
     for method, seed, simulator, model in simulators:
-        corrector = None if model is None else model.model.corrector(simulator)
-        tell = lambda done, total, name=method: progress(f"{name} simulator", done / total)  # noqa: E731
-        twins = replay(recorded, simulator, corrector, nthread=1, progress=tell, lock_idle=True)
-        for s, twin, source in zip(recorded, twins, sources, strict=True):
-            error = (twin.qpos - s.qpos)[1:, robot.operated_index]
-            scores.append(_score("alignment", method, seed, source, s.meta.motion, s.meta.payload_mass, error, s.dt))
+
+        def work(
+            method: str = method, seed: int | None = seed, simulator: RobotSpec = simulator,
+            model: Trained | None = model,
+        ) -> Any:  # fmt: skip
+            corrector = None if model is None else model.model.corrector(simulator)
+            tell = lambda done, total: progress(f"{method} simulator", done / total)  # noqa: E731
+            done = recorded()
+            twins = replay(done, simulator, corrector, nthread=1, progress=tell, lock_idle=True)
+            return {"scores": [
+                _score("alignment", method, seed, source, s.meta.motion, s.meta.payload_mass,
+                       (twin.qpos - s.qpos)[1:, robot.operated_index], s.dt)
+                for s, twin, source in zip(done, twins, sources, strict=True)
+            ]}  # fmt: skip
+
+        weights = model and model.model.weights_hash
+        part = kept("alignment", method, seed, model_hash(simulator), weights, make=work)
+        scores += [revived(Score, s) for s in part["scores"]]
     return scores
 
 

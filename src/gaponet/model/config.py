@@ -64,12 +64,12 @@ class ModelConfig:
     """unstacked: one branch net emits all p features. stacked: p nets of the same hidden layers emit one each."""
     num_basis: int = 16
     """p, basis functions per joint."""
-    branch_hidden: tuple[int, ...] = (128, 128)
+    branch_hidden: tuple[int, ...] = (64, 64)
     """Hidden layers of the branch net; the paper's full coupling has 256 256 256."""
-    trunk_hidden: tuple[int, ...] = (64, 64)
+    trunk_hidden: tuple[int, ...] = (32, 32)
     """Hidden layers of the trunk net; the paper's full coupling has 128 128 128."""
-    sensor_hidden: tuple[int, ...] = (256, 256)
-    """Hidden layers of the sensor predictor."""
+    sensor_hidden: tuple[int, ...] = (128, 64)
+    """Hidden layers of the sensor predictor; 256 256 predict no better (docs/log.md)."""
     mlp_hidden: tuple[int, ...] = (512, 256, 128)
     """Hidden layers of the MLP baseline (ASAP's size)."""
     mlp_match: bool = False

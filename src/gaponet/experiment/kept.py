@@ -1,0 +1,65 @@
+"""Parts of an experiment, kept as they are done, so that one that was interrupted goes on where it was."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from gaponet import __version__
+from gaponet.data.json_file import finite, write_json
+
+T = TypeVar("T")
+
+
+class Kept:
+    """Answers of calls by everything that they depend on, a JSON file each; without a folder, nothing is kept."""
+
+    def __init__(self, folder: Path | None, *facts: Any) -> None:
+        """
+        Args:
+            folder: Where; made when there is something to keep.
+            facts: What all parts depend on: numbers, arrays, text, dataclasses of them.
+        """
+        self.folder, self.facts = folder, facts
+
+    def __call__(self, *facts: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """What make() gives, or gave before with the same facts, as JSON gives it back: lists, and None for NaN.
+
+        Args:
+            facts: What this part depends on besides; functions are called for theirs, when something is kept.
+            make: Does the work.
+        """
+        if self.folder is None:
+            return json.loads(json.dumps(finite(plain(make()))))
+        known = [f() if callable(f) else f for f in facts]
+        text = json.dumps(finite(plain([__version__, self.facts, known])), sort_keys=True)
+        file = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+        if not file.is_file():
+            found = plain(make())
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_json(file, found)
+        return json.loads(file.read_text(encoding="utf-8"))
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses, at any depth, as dicts."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return value
+
+
+def revived(kind: type[T], record: dict[str, Any]) -> T:
+    """A dataclass of numbers, text and arrays from what `plain` and JSON made of it."""
+    number = {f.name for f in dataclasses.fields(kind) if f.type in ("float", float)}  # type: ignore[arg-type]
+    values = {k: np.array(v) if isinstance(v, list) else v for k, v in record.items()}
+    return kind(**{k: np.nan if v is None and k in number else v for k, v in values.items()})
