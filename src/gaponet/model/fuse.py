@@ -11,7 +11,7 @@ from gaponet.model.deeponet import OperatorNet
 from gaponet.model.fused import CLAMP
 
 Array = np.ndarray
-Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out) or one for each joint (n, out)
+Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out)
 
 
 def fuse(net: nn.Module) -> dict[str, Array] | None:
@@ -73,21 +73,22 @@ def _full(net: OperatorNet) -> dict[str, Array]:
 def _joint(net: OperatorNet) -> dict[str, Array]:
     n, dim, config = net.n, net.features.dim, net.config
     depth, payload = 2 + 3 * config.history, int(config.payload_input)
-    width = depth + payload + 1
+    known = depth + payload + 1
+    width, names = known + n, known + np.arange(n)
     own = np.arange(depth) * n  # columns of joint 0; those of joint j are j further on
     columns = np.concatenate(
         [np.concatenate([own + j, np.full(payload, depth * n), [dim - n + j]]) for j in range(n)]
     ).astype(int)
-    weights = _features(net, columns)
+    weights = _named(_features(net, columns), n)
     branch, trunk = dense_layers(_sequential(net.branch)), dense_layers(net.trunk)
     predictor: Layers = []
     (w, b), sensed = branch[0], 0
     parts = []
     if net.predictor is not None:
         predictor = dense_layers(net.predictor.net)
-        first = np.zeros((len(columns), predictor[0][0].shape[1]))
+        first = np.zeros((n * width, predictor[0][0].shape[1]))
         at = np.arange(n)[:, None] * width + np.arange(depth)
-        first[at.ravel()] = predictor[0][0][columns[at.ravel()]]
+        first[at.ravel()] = predictor[0][0][columns.reshape(n, known)[:, :depth].ravel()]
         if payload:
             first[depth] = predictor[0][0][depth * n]  # its first copy
         predictor[0] = (first, predictor[0][1])
@@ -95,22 +96,34 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         order = (np.arange(sensed)[None, :] * n + np.arange(n)[:, None]).ravel()  # joint by joint
         predictor[-1] = (predictor[-1][0][:, order], predictor[-1][1][order])
         parts.append(w[n : n + sensed])
-    seen = w[n + sensed :] if net.sees_observation else np.zeros((depth + payload, w.shape[1]))
-    parts.append(_rows(seen, np.arange(depth + payload), width))
-    branch[0] = (np.concatenate(parts), w[:n] + b)
+    seen = _rows(w[:n], names, width)
+    if net.sees_observation:
+        seen += _rows(w[n + sensed :], np.arange(depth + payload), width)
+    branch[0] = (np.concatenate([*parts, seen]), b)
     w, b = trunk[0]
-    asked = np.array([width - 1] + [width - 2] * payload)
-    trunk[0] = (_rows(w[n:], asked, width), w[:n] + b)
+    asked = np.array([known - 1] + [known - 2] * payload)
+    trunk[0] = (_rows(w, np.concatenate([names, asked]), width), b)
     weights |= _name("predictor", predictor) | _name("branch", branch) | _name("trunk", _scaled(trunk, net))
     return weights | {"kind": np.array("joint"), "bias": _bias(net)}
 
 
+def _named(weights: dict[str, Array], n: int) -> dict[str, Array]:
+    """The same with each joint's name, a one-hot constant, behind its features."""
+    relative, offset = weights["relative"], weights["offset"].reshape(n, -1)
+    relative = relative.reshape(len(relative), n, -1)
+    relative = np.concatenate([relative, np.zeros((len(relative), n, n))], axis=2)
+    return weights | {
+        "relative": relative.reshape(len(relative), -1),
+        "offset": np.concatenate([offset, np.eye(n)], axis=1).ravel(),
+    }
+
+
 def _features(net: OperatorNet | DeltaMLP, columns: Array) -> dict[str, Array]:
-    """R, mean and 1/std of the features in the given order, which may name one twice."""
+    """R and offset of the features in the given order, which may name one twice."""
     features = net.features
-    relative = features.relative(torch.eye(features.dim)).numpy()
+    relative = features.relative(torch.eye(features.dim)).double().numpy()[:, columns]
     mean, std = (v.double().numpy()[columns] for v in (features.standardise.mean, features.standardise.std))
-    return {"relative": relative[:, columns], "mean": mean, "scale": 1.0 / std, "delta_max": np.array(_limit(net))}
+    return {"relative": relative / std, "offset": -mean / std, "delta_max": np.array(_limit(net))}
 
 
 def _sequential(net: nn.Module) -> nn.Sequential:
@@ -157,8 +170,7 @@ class FusedNet(nn.Module):
     """The fused form in torch, for the exporters: x (B, dim) → Δa (B, n). All shapes but B are constants."""
 
     relative: Tensor
-    mean: Tensor
-    scale: Tensor
+    offset: Tensor
     bias: Tensor
     total: Tensor
     delta_max: Tensor
@@ -177,29 +189,27 @@ class FusedNet(nn.Module):
         basis = weights[f"trunk.{len(self.trunk) - 1}.weight"].shape[1] // (1 if self.kind == "joint" else self.n)
         self.register_buffer("total", torch.eye(self.n).repeat_interleave(basis, dim=1))  # Σ over a joint's basis
 
-    def layers(self, part: str, x: Tensor, last_elu: bool = False) -> Tensor:
+    def layers(self, part: str, x: Tensor, sensed: Tensor | None = None, last_elu: bool = False) -> Tensor:
         """The same as fused.Dense."""
         indices = getattr(self, part)
         for i in indices:
             weight, bias = getattr(self, f"{part}_{i}_weight"), getattr(self, f"{part}_{i}_bias")
-            if bias.dim() == 2:
-                n, width = bias.shape
-                x = (nn.functional.linear(x, weight).reshape(-1, n, width) + bias).reshape(-1, width)
+            if i == 0 and sensed is not None:
+                seen = nn.functional.linear(x, weight[:, self.sensed :], bias)
+                x = torch.addmm(seen, sensed, weight[:, : self.sensed].T)
             else:
                 x = nn.functional.linear(x, weight, bias)
             x = nn.functional.elu(x) if last_elu or i < len(indices) - 1 else x
         return x
 
     def forward(self, x: Tensor) -> Tensor:
-        z = nn.functional.linear(x, self.relative, -self.mean)
-        z = (z * self.scale).clamp(-CLAMP, CLAMP)
+        z = nn.functional.linear(x, self.relative, self.offset).clamp(-CLAMP, CLAMP)
         rows = z.reshape(-1, self.width) if self.kind == "joint" else z
         y = self.layers("trunk", rows)
         if self.branch:
-            see = rows
+            sensed = None
             if self.predictor:
-                sensed = self.layers("predictor", z, last_elu=self.kind == "full")
-                see = torch.cat([sensed.reshape(-1, self.sensed) if self.kind == "joint" else sensed, rows], dim=1)
-            y = self.layers("branch", see) * y
+                sensed = self.layers("predictor", z, last_elu=self.kind == "full").reshape(-1, self.sensed)
+            y = self.layers("branch", rows, sensed) * y
             y = nn.functional.linear(y.reshape(-1, self.total.shape[1]), self.total, self.bias)
         return torch.tanh(y) * self.delta_max

@@ -1,13 +1,13 @@
 """The network in the form that runs, on plain numpy: the fewest and largest products that give the same answer.
 
-    z = clip((x R − mean) · scale, ±5)      R has entries 0 and ±1: positions relative to q_t, ordered for what follows
+    z = clip(x R + offset, ±5)              standardised, positions relative to q_t, ordered for what follows
     h = elu(elu(z P0) P1)                   sensor predictor; of its last layer only the mean is kept
     b = branch([sensors | z]),  t = trunk(z)
     Δa = Δ_max · tanh(Σ_basis b t + c)      the trunk's last layer carries gain / Δ_max
 
 With full coupling nothing lies between the predictor's last layer and the branch's first: they are one product. With
-one joint at a time z is joint by joint, [q | q̇ | past | payload | a] of each, so that a joint's part is a slice; its
-name, a one-hot input while training, is a bias of its own. model/export.py makes the weights from a trained network.
+one joint at a time z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that a joint's part is a
+slice; its name is one-hot. model/fuse.py makes the weights from a trained network.
 """
 
 from __future__ import annotations
@@ -30,9 +30,12 @@ def read_weights(path: Path) -> dict[str, Array]:
     """Arrays of a weights.npz; no pickle is ever loaded."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            weights = {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ModelError(f"{path}: not readable ({error}); write it again with gaponet export RUN") from None
+    if "offset" not in weights:
+        raise ModelError(f"{path}: written by an earlier gaponet; write it again with gaponet export RUN")
+    return weights
 
 
 class Elu:
@@ -52,19 +55,28 @@ class Elu:
 class Dense:
     """Layers x W + b with ELU between, into buffers made once for `rows` rows."""
 
-    def __init__(self, layers: Sequence[tuple[Array, Array]], rows: int, last_elu: bool = False) -> None:
+    def __init__(
+        self, layers: Sequence[tuple[Array, Array]], rows: int, last_elu: bool = False, sensed: int = 0
+    ) -> None:
+        """The first `sensed` inputs of the first layer are given apart."""
+        self.sensed = np.empty((0, 0), np.float32)
+        self.part = np.empty((0, 0), np.float32)
         self.layers = []
         for i, (weight, bias) in enumerate(layers):
+            if i == 0 and sensed:
+                self.sensed, weight = (np.ascontiguousarray(w) for w in (weight[:sensed], weight[sensed:]))
+                self.part = np.empty((rows, weight.shape[1]), np.float32)
             out = np.empty((rows, weight.shape[1]), np.float32)
             elu = Elu(out.shape) if last_elu or i < len(layers) - 1 else None
-            # A bias per joint: rows are joints of one simulation after another.
-            shaped = out.reshape(-1, *bias.shape) if bias.ndim == 2 else out
-            self.layers.append((weight, bias, out, shaped, elu))
+            self.layers.append((weight, bias, out, elu))
 
-    def __call__(self, x: Array) -> Array:
-        for weight, bias, out, shaped, elu in self.layers:
+    def __call__(self, x: Array, sensed: Array | None = None) -> Array:
+        for weight, bias, out, elu in self.layers:
             np.dot(x, weight, out=out)
-            np.add(shaped, bias, out=shaped)
+            np.add(out, bias, out=out)
+            if sensed is not None:
+                np.add(out, np.dot(sensed, self.sensed, out=self.part), out=out)
+                sensed = None
             if elu is not None:
                 elu(out)
             x = out
@@ -77,7 +89,7 @@ class FusedForward:
     def __init__(self, weights: dict[str, Array], batch: int) -> None:
         """
         Args:
-            weights: As model/export.fuse made them.
+            weights: As model/fuse.py made them.
             batch: Rows of x.
         """
         w = self.w = weights
@@ -88,25 +100,21 @@ class FusedForward:
         self.rows = self.z.reshape(rows, -1)
         self.predictor = Dense(_layers(w, "predictor"), batch, last_elu=self.kind == "full")
         branch = _layers(w, "branch")
-        sensed = branch[0][0].shape[0] - self.rows.shape[1] if branch else 0
-        self.see = np.empty((rows, sensed + self.rows.shape[1]), np.float32) if sensed else self.rows
-        self.sensed, self.seen = self.see[:, :sensed], self.see[:, sensed:]
-        self.branch = Dense(branch, rows)
+        self.sensed = branch[0][0].shape[0] - self.rows.shape[1] if branch else 0
+        self.branch = Dense(branch, rows, sensed=self.sensed)
         self.trunk = Dense(_layers(w, "trunk"), rows)
 
     def __call__(self, x: Array) -> Array:
         """x (batch, dim) float32 → Δa (batch, n), rad: a buffer that the next call overwrites."""
         w, z, delta = self.w, self.z, self.delta
         np.dot(x, w["relative"], out=z)
-        np.subtract(z, w["mean"], out=z)
-        np.multiply(z, w["scale"], out=z)
-        np.clip(z, -CLAMP, CLAMP, out=z)
+        np.add(z, w["offset"], out=z)
+        np.maximum(z, -CLAMP, out=z)
+        np.minimum(z, CLAMP, out=z)
         y = self.trunk(self.rows)
         if self.branch.layers:
-            if self.predictor.layers:
-                self.sensed[:] = self.predictor(z).reshape(self.sensed.shape)
-                self.seen[:] = self.rows
-            np.multiply(self.branch(self.see), y, out=y)
+            sensed = self.predictor(z).reshape(-1, self.sensed) if self.sensed else None
+            np.multiply(self.branch(self.rows, sensed), y, out=y)
             np.sum(y.reshape(*delta.shape, -1), axis=-1, out=delta)
             np.add(delta, w["bias"], out=delta)
         else:

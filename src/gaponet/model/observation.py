@@ -36,15 +36,28 @@ class Layout:
 class History:
     """Past frames of num_envs robots and the observation made from them, float32."""
 
-    def __init__(self, config: ModelConfig, num_envs: int, n: int) -> None:
-        """Empty history: reset every environment before observing."""
+    def __init__(self, config: ModelConfig, num_envs: int, n: int, x: Array | None = None) -> None:
+        """Empty history: reset every environment before observing.
+
+        Args:
+            config: Of the model.
+            num_envs: Robots.
+            n: Operated joints.
+            x: Where observations will be written, (num_envs, dim) float32, by observe(out=x) alone: frames are kept
+                there if they can be, so that they need not be copied.
+        """
         self.n = n
         self.payload_max = config.payload_max
         self.payload_input = config.payload_input
         self.depth = (config.history - 1) * config.stride + 1
         self.picked = np.arange(0, self.depth, config.stride)  # newest first
-        self.frames = np.zeros((num_envs, self.depth, 3 * n), np.float32)
         self.dim = config.observation_dim(n)
+        self.place = slice(2 * n, 2 * n + 3 * n * config.history)
+        self.inside = x is not None and config.stride == 1
+        held = (
+            x[:, self.place] if x is not None and self.inside else np.zeros((num_envs, 3 * n * self.depth), np.float32)
+        )
+        self.frames = held.reshape(num_envs, self.depth, 3 * n)  # of a slice of columns, too, this is a view
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, u: Array) -> None:
         """Fill histories from real frames before the start index, never with zeros.
@@ -57,12 +70,13 @@ class History:
 
     def push(self, qpos: Array, qvel: Array, u: Array) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
-        for k in range(self.depth - 1, 0, -1):  # one by one: as a whole it would go through a temporary copy
-            self.frames[:, k] = self.frames[:, k - 1]
-        n = self.n
-        self.frames[:, 0, :n] = qpos
-        self.frames[:, 0, n : 2 * n] = qvel
-        self.frames[:, 0, 2 * n :] = u
+        frames, n = self.frames, self.n
+        if self.depth > 1:
+            frames[:, 1:] = frames[:, :-1]
+        newest = frames[:, 0]
+        newest[:, :n] = qpos
+        newest[:, n : 2 * n] = qvel
+        newest[:, 2 * n :] = u
 
     def observe(self, qpos: Array, qvel: Array, payload_mass: Array | float, out: Array | None = None) -> Array:
         """The observation, (num_envs, dim), float32.
@@ -76,8 +90,9 @@ class History:
         out = np.empty((len(self.frames), self.dim), np.float32) if out is None else out
         out[:, :n] = qpos
         out[:, n : 2 * n] = qvel
-        past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]
-        out[:, 2 * n : 2 * n + 3 * n * len(self.picked)] = past.reshape(len(out), -1)
+        if not self.inside:
+            past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]
+            out[:, self.place] = past.reshape(len(out), -1)
         if self.payload_input:
             out[:, -1] = payload_mass / self.payload_max
         return out

@@ -30,9 +30,9 @@ class DeltaLoop:
             )
         self.low, self.high = np.array(qpos_range.T, float, order="C")
         self.n, self.num_envs = len(qpos_range), num_envs
-        self.history = History(config, num_envs, self.n)
         self.bound = network.bind(num_envs)
-        self.observation, self.action = np.split(self.bound.x, [self.history.dim], axis=1)
+        self.observation, self.action = np.split(self.bound.x, [config.observation_dim(self.n)], axis=1)
+        self.history = History(config, num_envs, self.n, self.observation)
         self.applied = np.zeros((num_envs, self.n))
         self.fresh = np.ones(num_envs, bool)
         self.any_fresh = True
@@ -55,9 +55,10 @@ class DeltaLoop:
         Returns:
             Δa of the shape of ctrl, rad, such that ctrl + Δa is within the joint limits.
         """
-        shape = (self.num_envs, self.n)
-        q, v, a = (x.reshape(shape) if x.size == self.applied.size else x for x in map(np.asarray, (qpos, qvel, ctrl)))
-        if not q.shape == v.shape == a.shape == shape:
+        q, v, a = np.asarray(qpos), np.asarray(qvel), np.asarray(ctrl)
+        if q.ndim == 1 and self.num_envs == 1:
+            q, v, a = q[None], v[None], a[None]
+        if not q.shape == v.shape == a.shape == self.applied.shape:
             raise UsageError(
                 f"delta: qpos {np.shape(qpos)}, qvel {np.shape(qvel)}, ctrl {np.shape(ctrl)}; give the {self.n} "
                 f"operated joints of {self.num_envs} robots each; for another number of robots, reset() first"
