@@ -50,6 +50,7 @@ def artifact(robot, tmp_path_factory):
         {"branch_history": False}, {"branch_history": False, "coupling": "full"},
         {"payload_input": False}, {"payload_input": False, "coupling": "full"},
         {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensor_hidden": (16,)},
+        {"branch_hidden": (16, 8), "trunk_hidden": (8,)},
     ],
 )  # fmt: skip
 def test_the_fused_form_is_the_network(how):
@@ -61,6 +62,18 @@ def test_the_fused_form_is_the_network(how):
         np.testing.assert_allclose(FusedNet(weights)(torch.from_numpy(x)).numpy(), expected, atol=1e-6)
     np.testing.assert_allclose(FusedForward(weights, 20)(x), expected, atol=1e-6)
     assert np.abs(expected).mean() > 1e-3
+
+
+def test_a_large_batch_is_its_rows(artifact):
+    for backend in ("onnxruntime", "numpy"):
+        network = GapModel.load(artifact, backend).infer
+        one, many = network.bind(1), network.bind(150)
+        many.x[:] = np.random.default_rng(0).normal(0, 0.3, many.x.shape)
+        many.run()
+        for row in (0, 63, 64, 149):
+            one.x[:] = many.x[row]
+            one.run()
+            np.testing.assert_allclose(one.delta[0], many.delta[row], atol=1e-6)
 
 
 def test_drawn_states_have_the_statistics_trained_on():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -13,6 +14,7 @@ from gaponet.errors import ModelError
 from gaponet.model.fused import FusedForward, read_weights
 
 Array = np.ndarray
+ROWS, ROWS_SHARED = 64, 256  # of a batch at once, by one thread and by several: what lies between layers stays in cache
 Backend = Literal["onnxruntime", "numpy"]
 
 
@@ -59,6 +61,7 @@ class OnnxNetwork:
             raise ModelError(
                 f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
             ) from None
+        self.rows = ROWS if threads == 1 else ROWS_SHARED
         self.value = ort.OrtValue.ortvalue_from_numpy  # on the CPU it shares the array's memory
 
     def __call__(self, x: Array) -> Array:
@@ -66,11 +69,22 @@ class OnnxNetwork:
 
     def bind(self, batch: int) -> Bound:
         x = np.zeros((batch, self.session.get_inputs()[0].shape[1]), np.float32)
-        delta = np.zeros((batch, self(x).shape[1]), np.float32)
-        binding, session = self.session.io_binding(), self.session
-        binding.bind_ortvalue_input("x", self.value(x))
-        binding.bind_ortvalue_output(self.output, self.value(delta))
-        return Bound(x, delta, lambda: session.run_with_iobinding(binding))
+        delta = np.zeros((batch, self(x[:1]).shape[1]), np.float32)
+        bindings = []
+        for start in range(0, batch, self.rows):
+            binding, rows = self.session.io_binding(), slice(start, start + self.rows)
+            binding.bind_ortvalue_input("x", self.value(x[rows]))
+            binding.bind_ortvalue_output(self.output, self.value(delta[rows]))
+            bindings.append(binding)
+        run = self.session.run_with_iobinding
+        if len(bindings) == 1:
+            return Bound(x, delta, partial(run, bindings[0]))
+
+        def run_all() -> None:
+            for binding in bindings:
+                run(binding)
+
+        return Bound(x, delta, run_all)
 
 
 class NumpyNetwork:
@@ -92,5 +106,4 @@ class NumpyNetwork:
 
     def bind(self, batch: int) -> Bound:
         forward = FusedForward(self.weights, batch)
-        x = np.zeros((batch, self.weights["relative"].shape[0]), np.float32)
-        return Bound(x, forward.delta, lambda: forward(x))
+        return Bound(forward.x, forward.delta, forward.run)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 from torch import Tensor, nn
 
 from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.deeponet import OperatorNet
-from gaponet.model.fused import CLAMP
+from gaponet.model.fused import CLAMP, JOINT_WISE, PARTS, Layers
 
 Array = np.ndarray
-Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out)
 
 
 def fuse(net: nn.Module) -> dict[str, Array] | None:
@@ -91,20 +91,37 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         first[at.ravel()] = predictor[0][0][columns.reshape(n, known)[:, :depth].ravel()]
         if payload:
             first[depth] = predictor[0][0][depth * n]  # its first copy
-        predictor[0] = (first, predictor[0][1])
+        first[known] = predictor[0][1]  # the name of joint 0 is 1 in its place: all first biases are weights of names
+        predictor[0] = (first, np.zeros_like(predictor[0][1]))
         sensed = 2 * config.num_probes
         order = (np.arange(sensed)[None, :] * n + np.arange(n)[:, None]).ravel()  # joint by joint
         predictor[-1] = (predictor[-1][0][:, order], predictor[-1][1][order])
         parts.append(w[n : n + sensed])
-    seen = _rows(w[:n], names, width)
+    seen = _rows(w[:n] + b, names, width)
     if net.sees_observation:
         seen += _rows(w[n + sensed :], np.arange(depth + payload), width)
-    branch[0] = (np.concatenate([*parts, seen]), b)
+    branch[0] = (np.concatenate([*parts, seen]), np.zeros_like(b))
     w, b = trunk[0]
     asked = np.array([known - 1] + [known - 2] * payload)
-    trunk[0] = (_rows(w, np.concatenate([names, asked]), width), b)
-    weights |= _name("predictor", predictor) | _name("branch", branch) | _name("trunk", _scaled(trunk, net))
-    return weights | {"kind": np.array("joint"), "bias": _bias(net)}
+    trunk[0] = (_rows(w[:n] + b, names, width) + _rows(w[n:], asked, width), np.zeros_like(b))
+    trunk = _scaled(trunk, net)
+    weights |= _name("predictor", predictor) | {"bias": _bias(net)}
+    if len(branch) != len(trunk):
+        return weights | _name("branch", branch) | _name("trunk", trunk) | {"kind": np.array("joint")}
+    p = config.num_basis
+    quarter = np.repeat([0.25, -0.25], p)[:, None]
+    return weights | _name("pair", _paired(branch, trunk, sensed)) | {"quarter": quarter, "kind": np.array("pair")}
+
+
+def _paired(branch: Layers, trunk: Layers, sensed: int) -> Layers:
+    """Both nets as one of the same depth, branch [sensed | rows] and trunk [rows], that ends in b + t and b − t."""
+    (w, _), (v, _) = branch[0], trunk[0]
+    v = np.concatenate([np.zeros((sensed, v.shape[1])), v])
+    middle = [block_diag(a, b) for (a, _), (b, _) in zip(branch[1:-1], trunk[1:-1], strict=True)]
+    (b, b0), (t, t0) = branch[-1], trunk[-1]
+    weights = [np.concatenate([w, v], axis=1), *middle, np.block([[b, b], [t, -t]])]
+    biases = [np.concatenate([x, y]) for (_, x), (_, y) in zip(branch[:-1], trunk[:-1], strict=True)]
+    return list(zip(weights, [*biases, np.concatenate([b0 + t0, b0 - t0])], strict=True))
 
 
 def _named(weights: dict[str, Array], n: int) -> dict[str, Array]:
@@ -178,19 +195,22 @@ class FusedNet(nn.Module):
     def __init__(self, weights: dict[str, Array]) -> None:
         super().__init__()
         self.kind, self.n = str(weights["kind"]), len(weights["bias"])
-        counts = {p: sum(k.startswith(p + ".") for k in weights) // 2 for p in ("predictor", "branch", "trunk")}
-        self.predictor, self.branch, self.trunk = (range(counts[p]) for p in ("predictor", "branch", "trunk"))
-        self.width = weights["relative"].shape[1] // (self.n if self.kind == "joint" else 1)  # of z as rows
-        self.sensed = weights["branch.0.weight"].shape[0] - self.width if self.branch else 0
+        counts = {p: sum(k.startswith(p + ".") for k in weights) // 2 for p in PARTS}
+        self.predictor, self.branch, self.trunk, self.pair = (range(counts[p]) for p in PARTS)
+        self.width = weights["relative"].shape[1] // (self.n if self.kind in JOINT_WISE else 1)  # of z as rows
+        first = weights.get("pair.0.weight", weights.get("branch.0.weight"))
+        self.sensed = 0 if first is None else first.shape[0] - self.width
         for name, value in weights.items():
-            if name != "kind":
+            if name not in ("kind", "quarter"):
                 value = value.T if name.endswith(".weight") or name == "relative" else value
                 self.register_buffer(name.replace(".", "_"), torch.from_numpy(np.ascontiguousarray(value)))
-        basis = weights[f"trunk.{len(self.trunk) - 1}.weight"].shape[1] // (1 if self.kind == "joint" else self.n)
-        self.register_buffer("total", torch.eye(self.n).repeat_interleave(basis, dim=1))  # Σ over a joint's basis
+        last = weights[f"pair.{len(self.pair) - 1}.weight" if self.pair else f"trunk.{len(self.trunk) - 1}.weight"]
+        basis = last.shape[1] // (1 if self.kind in JOINT_WISE else self.n)
+        each = torch.from_numpy(weights["quarter"]).T if self.pair else torch.ones(1, basis)
+        self.register_buffer("total", torch.kron(torch.eye(self.n), each))  # Σ over a joint's basis
 
     def layers(self, part: str, x: Tensor, sensed: Tensor | None = None, last_elu: bool = False) -> Tensor:
-        """The same as fused.Dense."""
+        """x W + b with ELU between; of [sensed | x], without putting them side by side."""
         indices = getattr(self, part)
         for i in indices:
             weight, bias = getattr(self, f"{part}_{i}_weight"), getattr(self, f"{part}_{i}_bias")
@@ -199,17 +219,23 @@ class FusedNet(nn.Module):
                 x = torch.addmm(seen, sensed, weight[:, : self.sensed].T)
             else:
                 x = nn.functional.linear(x, weight, bias)
-            x = nn.functional.elu(x) if last_elu or i < len(indices) - 1 else x
+            if last_elu or i < len(indices) - 1:
+                # onnxruntime's Elu takes 6 ns a number, as exp and maximum a fraction of it: worth it for many rows.
+                x = torch.maximum(x, x.clamp(max=0).exp() - 1) if part == "pair" else nn.functional.elu(x)
         return x
 
     def forward(self, x: Tensor) -> Tensor:
         z = nn.functional.linear(x, self.relative, self.offset).clamp(-CLAMP, CLAMP)
-        rows = z.reshape(-1, self.width) if self.kind == "joint" else z
-        y = self.layers("trunk", rows)
-        if self.branch:
-            sensed = None
-            if self.predictor:
-                sensed = self.layers("predictor", z, last_elu=self.kind == "full").reshape(-1, self.sensed)
-            y = self.layers("branch", rows, sensed) * y
-            y = nn.functional.linear(y.reshape(-1, self.total.shape[1]), self.total, self.bias)
+        rows = z.reshape(-1, self.width) if self.kind in JOINT_WISE else z
+        sensed = None
+        if self.predictor:
+            sensed = self.layers("predictor", z, last_elu=self.kind == "full").reshape(-1, self.sensed)
+        if self.pair:
+            y = self.layers("pair", rows, sensed)
+            y = nn.functional.linear((y * y).reshape(-1, self.total.shape[1]), self.total, self.bias)
+        else:
+            y = self.layers("trunk", rows)
+            if self.branch:
+                y = self.layers("branch", rows, sensed) * y
+                y = nn.functional.linear(y.reshape(-1, self.total.shape[1]), self.total, self.bias)
         return torch.tanh(y) * self.delta_max

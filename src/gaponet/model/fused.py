@@ -6,14 +6,16 @@
     Δa = Δ_max · tanh(Σ_basis b t + c)      the trunk's last layer carries gain / Δ_max
 
 With full coupling nothing lies between the predictor's last layer and the branch's first: they are one product. With
-one joint at a time z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that a joint's part is a
-slice; its name is one-hot. model/fuse.py makes the weights from a trained network.
+one joint at a time (kind joint) z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that a joint's
+part is a slice; its name is one-hot. Branch and trunk of the same depth are one net side by side (kind pair) that ends
+in b + t and b − t: Σ b t = ¼ Σ (b + t)² − (b − t)². model/fuse.py makes the weights from a trained network.
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +23,12 @@ import numpy as np
 from gaponet.errors import ModelError
 
 Array = np.ndarray
+Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out)
 
 FILE = "weights.npz"
 CLAMP = 5.0  # as in Features.forward
+PARTS = ("predictor", "branch", "trunk", "pair")
+JOINT_WISE = ("joint", "pair")  # kinds whose rows are joints of one simulation after another
 
 
 def read_weights(path: Path) -> dict[str, Array]:
@@ -38,53 +43,11 @@ def read_weights(path: Path) -> dict[str, Array]:
     return weights
 
 
-class Elu:
-    """elu(x) in place, with one buffer: max(x, e^min(x,0) − 1), since e^x − 1 ≥ x everywhere."""
-
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.low = np.empty(shape, np.float32)
-
-    def __call__(self, x: Array) -> None:
-        low = self.low
-        np.minimum(x, 0.0, out=low)
-        np.exp(low, out=low)
-        np.subtract(low, 1.0, out=low)
-        np.maximum(x, low, out=x)
-
-
-class Dense:
-    """Layers x W + b with ELU between, into buffers made once for `rows` rows."""
-
-    def __init__(
-        self, layers: Sequence[tuple[Array, Array]], rows: int, last_elu: bool = False, sensed: int = 0
-    ) -> None:
-        """The first `sensed` inputs of the first layer are given apart."""
-        self.sensed = np.empty((0, 0), np.float32)
-        self.part = np.empty((0, 0), np.float32)
-        self.layers = []
-        for i, (weight, bias) in enumerate(layers):
-            if i == 0 and sensed:
-                self.sensed, weight = (np.ascontiguousarray(w) for w in (weight[:sensed], weight[sensed:]))
-                self.part = np.empty((rows, weight.shape[1]), np.float32)
-            out = np.empty((rows, weight.shape[1]), np.float32)
-            elu = Elu(out.shape) if last_elu or i < len(layers) - 1 else None
-            self.layers.append((weight, bias, out, elu))
-
-    def __call__(self, x: Array, sensed: Array | None = None) -> Array:
-        for weight, bias, out, elu in self.layers:
-            np.dot(x, weight, out=out)
-            np.add(out, bias, out=out)
-            if sensed is not None:
-                np.add(out, np.dot(sensed, self.sensed, out=self.part), out=out)
-                sensed = None
-            if elu is not None:
-                elu(out)
-            x = out
-        return x
-
-
 class FusedForward:
-    """The forward of `batch` observations; all buffers are made here, a call allocates nothing."""
+    """The forward of `batch` observations, as a list of numpy calls on buffers made here; running it allocates nothing.
+
+    Write x, (batch, dim) float32, call run, read delta, (batch, n) rad.
+    """
 
     def __init__(self, weights: dict[str, Array], batch: int) -> None:
         """
@@ -92,37 +55,92 @@ class FusedForward:
             weights: As model/fuse.py made them.
             batch: Rows of x.
         """
-        w = self.w = weights
-        self.z = np.empty((batch, w["relative"].shape[1]), np.float32)
-        self.kind, n = str(w["kind"]), len(w["bias"])
-        rows = batch * n if self.kind == "joint" else batch
-        self.delta = np.empty((batch, n), np.float32)
-        self.rows = self.z.reshape(rows, -1)
-        self.predictor = Dense(_layers(w, "predictor"), batch, last_elu=self.kind == "full")
-        branch = _layers(w, "branch")
-        self.sensed = branch[0][0].shape[0] - self.rows.shape[1] if branch else 0
-        self.branch = Dense(branch, rows, sensed=self.sensed)
-        self.trunk = Dense(_layers(w, "trunk"), rows)
+        self.weights, self.steps = weights, list[Callable[[], object]]()
+        kind, n = str(weights["kind"]), len(weights["bias"])
+        self.one = np.ones((batch, weights["relative"].shape[0] + 1), np.float32)  # [x | 1]
+        self.x = self.one[:, :-1]
+        z = self._standardised()
+        rows = z.reshape(batch * n, -1) if kind in JOINT_WISE else z
+        predictor, branch, trunk, pair = (_layers(weights, part) for part in PARTS)
+        sensed = self._chain(z, predictor, kind == "full") if predictor else None
+        self.delta = _empty(batch, n)
+        if pair:
+            y = self._first(pair, rows, sensed)
+            self._do(np.multiply, y, y, out=y)
+            self._do(np.dot, y, weights["quarter"], out=self.delta.reshape(-1, 1))
+            self._do(np.add, self.delta, weights["bias"], out=self.delta)
+        elif branch:
+            y = self._chain(rows, trunk)
+            self._do(np.multiply, self._first(branch, rows, sensed), y, out=y)
+            self._do(np.add.reduce, y.reshape(batch, n, -1), 2, out=self.delta)
+            self._do(np.add, self.delta, weights["bias"], out=self.delta)
+        else:
+            self.delta = self._chain(rows, trunk)
+        self._do(np.tanh, self.delta, out=self.delta)
+        self._do(np.multiply, self.delta, weights["delta_max"], out=self.delta)
+
+    def run(self) -> None:
+        """x → delta."""
+        for step in self.steps:
+            step()
 
     def __call__(self, x: Array) -> Array:
-        """x (batch, dim) float32 → Δa (batch, n), rad: a buffer that the next call overwrites."""
-        w, z, delta = self.w, self.z, self.delta
-        np.dot(x, w["relative"], out=z)
-        np.add(z, w["offset"], out=z)
-        np.maximum(z, -CLAMP, out=z)
-        np.minimum(z, CLAMP, out=z)
-        y = self.trunk(self.rows)
-        if self.branch.layers:
-            sensed = self.predictor(z).reshape(-1, self.sensed) if self.sensed else None
-            np.multiply(self.branch(self.rows, sensed), y, out=y)
-            np.sum(y.reshape(*delta.shape, -1), axis=-1, out=delta)
-            np.add(delta, w["bias"], out=delta)
-        else:
-            np.copyto(delta, y)
-        np.tanh(delta, out=delta)
-        return np.multiply(delta, w["delta_max"], out=delta)
+        """x (batch, dim) → Δa (batch, n), rad: a buffer that the next call overwrites."""
+        np.copyto(self.x, x)
+        self.run()
+        return self.delta
+
+    def _do(self, function: Callable[..., object], *arguments: object, out: Array) -> None:
+        self.steps.append(partial(function, *arguments, out=out))
+
+    def _standardised(self) -> Array:
+        w = self.weights
+        z = _empty(len(self.x), w["relative"].shape[1])
+        self._do(np.dot, self.one, np.concatenate([w["relative"], w["offset"][None]]), out=z)
+        self._do(np.maximum, z, np.float32(-CLAMP), out=z)
+        self._do(np.minimum, z, np.float32(CLAMP), out=z)
+        return z
+
+    def _first(self, layers: Layers, rows: Array, sensed: Array | None) -> Array:
+        """A net of [sensed | rows], without putting them side by side."""
+        (weight, bias), *more = layers
+        out, count = _empty(len(rows), weight.shape[1]), weight.shape[0] - rows.shape[1]
+        self._do(np.dot, rows, np.ascontiguousarray(weight[count:]), out=out)
+        if sensed is not None:
+            part = np.empty_like(out)
+            self._do(np.dot, sensed.reshape(-1, count), np.ascontiguousarray(weight[:count]), out=part)
+            self._do(np.add, out, part, out=out)
+        if bias.any():
+            self._do(np.add, out, bias, out=out)
+        if more:
+            self._elu(out)
+        return self._chain(out, more)
+
+    def _chain(self, x: Array, layers: Layers, last_elu: bool = False) -> Array:
+        """x W + b with ELU between."""
+        for i, (weight, bias) in enumerate(layers):
+            out = _empty(len(x), weight.shape[1])
+            self._do(np.dot, x, weight, out=out)
+            if bias.any():
+                self._do(np.add, out, bias, out=out)
+            if last_elu or i < len(layers) - 1:
+                self._elu(out)
+            x = out
+        return x
+
+    def _elu(self, x: Array) -> None:
+        """In place: max(x, e^min(x,0) − 1), since e^x − 1 ≥ x everywhere."""
+        low = np.empty_like(x)
+        self._do(np.minimum, x, np.float32(0), out=low)
+        self._do(np.exp, low, out=low)
+        self._do(np.subtract, low, np.float32(1), out=low)
+        self._do(np.maximum, x, low, out=x)
 
 
-def _layers(weights: dict[str, Array], name: str) -> list[tuple[Array, Array]]:
+def _empty(*shape: int) -> Array:
+    return np.empty(shape, np.float32)
+
+
+def _layers(weights: dict[str, Array], name: str) -> Layers:
     count = sum(key.startswith(f"{name}.") and key.endswith(".weight") for key in weights)
     return [(weights[f"{name}.{i}.weight"], weights[f"{name}.{i}.bias"]) for i in range(count)]
