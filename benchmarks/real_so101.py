@@ -27,6 +27,8 @@ FILL = COLOURS | {"identified_gaponet": "#7d0a1d"}
 
 # Six rounds of the warm start from the nominal simulator, four from the identified one; PPO adds less than 2 % to it.
 ROUNDS = 4  # of the warm start from the identified simulator: later ones fit noise
+# Networks of the published numbers, twice as wide as today's default.
+WIDE = ("--model.branch-hidden", 128, 128, "--model.trunk-hidden", 64, 64, "--model.sensor-hidden", 256, 256)
 DOCS = Path(__file__).parents[1] / "docs" / "results"
 ENVIRONMENT = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}
 
@@ -66,7 +68,7 @@ def train(data: Path, fitted: Path, out: Path, seed: int, run: str, budgets: dic
         return
     kind, *start = run.split("_from_")
     robot = ["--robot", fitted, "--warm-start.rounds", ROUNDS] if start else []
-    gaponet("train", data, "--out", out, "--model", kind, "--seed", seed, "--budget", budgets[run], *robot)
+    gaponet("train", data, "--out", out, "--model", kind, "--seed", seed, "--budget", budgets[run], *WIDE, *robot)
 
 
 def spread(results: list[dict[str, Any]], *path: str) -> tuple[float, float]:

@@ -33,7 +33,7 @@ def ablation(
 ) -> None:
     """Table 2 of the paper and our own switches: what each choice of the operator is worth, one changed at a time.
 
-    The same command again goes on where it was. About an hour and a half on two cores; --quick in under five minutes.
+    The same command again goes on where it was. About an hour on two cores; --quick in under five minutes.
 
     Args:
         dataset: Dataset folder.
