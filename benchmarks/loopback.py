@@ -24,7 +24,12 @@ from gaponet.robot import load_robot
 
 
 def main(
-    minutes: float = 10.0, rate: float = 50.0, state_rate: float = 500.0, domain: int = 42, no_stop: bool = False
+    minutes: float = 10.0,
+    rate: float = 50.0,
+    state_rate: float = 500.0,
+    payload_mass: float = 1.0,
+    domain: int = 42,
+    no_stop: bool = False,
 ) -> None:
     """Swing both arms gently and count.
 
@@ -32,11 +37,12 @@ def main(
         minutes: Duration of the run.
         rate: Commands per second.
         state_rate: States per second.
+        payload_mass: kg per hand; with 3 the elbows are too hot after less than two minutes.
         domain: DDS domain.
         no_stop: Let a late loop and an old state pass, and count them.
     """
     robot = load_robot("h1_2")
-    command = [sys.executable, "-m", "gaponet.cli.main", "virtual", "serve", "--payload-mass", "3"]
+    command = [sys.executable, "-m", "gaponet.cli.main", "virtual", "serve", "--payload-mass", str(payload_mass)]
     command += ["--domain", str(domain), "--rate", str(state_rate)]
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
