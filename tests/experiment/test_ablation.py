@@ -7,7 +7,8 @@ from gaponet.experiment.options import Options
 
 
 def found(*mpjae, **more):
-    return [{"known": {"mpjae": v, "q_dis": v}, "parameters": 10, "seconds": 60.0} | more for v in mpjae]
+    same = {"parameters": 10, "seconds": 60.0} | more
+    return [{"seed": i, "known": {"mpjae": v, "q_dis": v}} | same for i, v in enumerate(mpjae)]
 
 
 def test_the_default_is_one_model_in_every_row_that_it_stands_in(make_study):
@@ -57,10 +58,10 @@ def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study):
     data = {DEFAULT: found(0.001, 0.003), "gaponet:payload_input=off": found(0.0041, 0.0039)}
     made = result(study, lines, data, dict.fromkeys(data, 0.01), ["One failed."])
     texts = made.tables[0].texts()
-    assert texts[0] == ["payload input: in (default)", "2.00 ± 1.41", "0.20 ± 0.14", "2.00 ± 1.41", "10", "1.00",
+    assert texts[0] == ["payload input: in (default)", "2.00 ± 1.41", "0.20 ± 0.14", "", "2.00 ± 1.41", "10", "1.00",
                         "0.016 to 0.019"]  # fmt: skip
-    assert texts[1][:3] == ["payload input: out", "4.00 ± 0.14", "0.40 ± 0.01"]
-    assert texts[3] == ["branch: stacked", "", "", "", "", "", ""]  # nothing came of it, and it is not invented
+    assert texts[1][:4] == ["payload input: out", "4.00 ± 0.14", "0.40 ± 0.01", "2.70 ± 1.98"]  # 4.1 / 1, 3.9 / 3
+    assert texts[3] == ["branch: stacked", "", "", "", "", "", "", ""]  # nothing came of it, and it is not invented
     assert made.sentences[-1] == "One failed."
 
 
@@ -87,7 +88,17 @@ def test_one_seed_is_called_one_seed(make_study):
     lines = [r for r in rows(study)[0] if r.factor == "branch"]
     data = {DEFAULT: found(0.002), "gaponet:branch=stacked": found(0.003)}
     sentences = result(study, lines, data, dict.fromkeys(data, 0.01), []).sentences
-    assert "branch: stacked 0.30, 50 % more than the default (one seed)." in sentences
+    assert "branch: stacked 50 % more than the default (one seed)." in sentences
+
+
+def test_what_a_seed_does_to_both_is_no_difference_and_hides_none(make_study):
+    study = make_study()
+    lines = [r for r in rows(study)[0] if r.factor in ("branch", "payload input")]
+    data = {DEFAULT: found(0.002, 0.003, 0.004), "gaponet:branch=stacked": found(0.0021, 0.0031, 0.0042),
+            "gaponet:payload_input=off": found(0.0022, 0.0028, 0.004)}  # fmt: skip
+    sentences = result(study, lines, data, dict.fromkeys(data, 0.01), []).sentences
+    assert "branch: stacked 4 % more than the default (seeds ± 1 %)." in sentences
+    assert "payload input: out no different from the default (+1 %, seeds ± 8 %)." in sentences
 
 
 def test_a_rehearsal_lies_beside_the_real_thing_and_is_called_one(make_study, tmp_path):

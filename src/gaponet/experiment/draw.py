@@ -19,7 +19,10 @@ GAP = 0.7  # between groups, rows
 
 @styled
 def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
-    """One dot per setting, groups apart, the default hollow and as a line through all groups."""
+    """One dot per setting, groups apart, the default hollow and as a line through all groups.
+
+    What lies far beyond all others is an arrow at the edge with its number.
+    """
     y = 0.0
     where: list[float] = []
     names: list[str] = []
@@ -31,7 +34,13 @@ def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
         last = group
     fig = figure(6.0, 0.19 * (y + 1) + 1.0)
     ax = fig.subplots()
+    limit = _limit([value.mean for _, _, value, _ in rows])
     for place, (_, _, value, default) in zip(where, rows, strict=True):
+        if value.mean > limit:
+            ax.annotate(f"{value.mean:.2f} ", (limit, place), (-8, 0), textcoords="offset points", va="center",
+                        ha="right", color=COLOURS["gaponet"])  # fmt: skip
+            ax.plot(limit, place, marker=">", ms=5, color=COLOURS["gaponet"], clip_on=False)
+            continue
         error = value.std if value.std == value.std else 0.0
         ax.errorbar(
             value.mean, place, xerr=error or None, fmt="o", ms=4.5, color=COLOURS["gaponet"], elinewidth=1,
@@ -48,9 +57,18 @@ def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
         first = next(i for i, r in enumerate(rows) if r[0] == group)
         ax.annotate(group, (-0.33, where[first]), xycoords=("axes fraction", "data"), va="center", ha="right",
                     fontweight="bold", annotation_clip=False)  # fmt: skip
+    if limit < np.inf:
+        ax.set_xlim(right=limit)
     ax.set_xlabel(axis)
     ax.set_title(title)
     return fig
+
+
+def _limit(values: ListOf[float]) -> float:
+    """Where the axis ends, so that a few outliers do not press all others together; infinite where there are none."""
+    low, high = float(np.min(values)), float(np.quantile(values, 0.8))
+    usual = [v for v in values if v <= high + 3 * (high - low)]
+    return max(usual) + 0.35 * (max(usual) - low) if len(usual) < len(values) else np.inf
 
 
 @styled

@@ -50,6 +50,11 @@ class Spread:
         std = float(found.std(ddof=1)) if len(found) > 1 else math.nan
         return cls(float(found.mean()) if len(found) else math.nan, std, len(found))
 
+    @property
+    def error(self) -> float:
+        """Standard error of the mean; NaN for a single value."""
+        return self.std / math.sqrt(self.count) if self.count else math.nan
+
 
 Cell = str | int | float | Spread | None
 
@@ -121,6 +126,15 @@ def compared(name: str, value: Spread, base: Spread, to: str, unit: str = "") ->
         return f"{name} {value.mean:.2f}{unit}, no different from {to} within the spread of seeds"
     way = "more" if change > 0 else "less"
     return f"{name} {value.mean:.2f}{unit}, {100 * abs(change) / abs(base.mean):.0f} % {way} than {to}{known}"
+
+
+def compared_by_seed(name: str, ratio: Spread, to: str) -> str:
+    """Whether a ratio of two values, seed by seed, differs from one by more than two standard errors, in words."""
+    change = ratio.mean - 1
+    if abs(change) <= 2 * ratio.error:
+        return f"{name} no different from {to} ({100 * change:+.0f} %, seeds ± {100 * ratio.std:.0f} %)"
+    known = f"seeds ± {100 * ratio.std:.0f} %" if ratio.count > 1 else "one seed"
+    return f"{name} {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} than {to} ({known})"
 
 
 def noise(a: Spread, b: Spread) -> float:
