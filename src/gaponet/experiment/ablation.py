@@ -145,14 +145,23 @@ def result(
         "not known here; blank where no number of it is. Oracle and learned sensors ask the simulator: bounds, of no "
         "use on a robot."
     )
-    shown = [(r.factor, r.setting, ratio[r.word], r.word == DEFAULT) for r in lines if r.word in ratio]
+    one = Spread.of([1.0])
+    shown = [
+        (r.factor, r.setting, one if r.word == DEFAULT else _paired(seeds, r.word, DEFAULT), r.word == DEFAULT)
+        for r in lines
+        if r.word in ratio and DEFAULT in ratio
+    ]
     return Result(
         "ablation",
         f"Ablation of the operator, {study.who}",
         label(study.data),
         study.facts(found),
         (Table("table2", tuple(columns), tuple(table), caption),),
-        {"ablation": dots(shown, "MPJAE of nominal", f"What each choice is worth\n{study.who}")},
+        {
+            "ablation": dots(
+                shown, "MPJAE of the default's with the same seed", f"What each choice is worth\n{study.who}"
+            )
+        },
         (*_sentences(lines, ratio, seeds), *missing),
     )
 
