@@ -12,6 +12,8 @@ from rich.table import Table
 
 from gaponet.data.json_file import finite
 
+LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
+
 
 class Out:
     """People read stdout; with json they read stderr, and stdout carries one object."""
@@ -25,12 +27,18 @@ class Out:
         self.console.print(text, soft_wrap=True)
 
     def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
-        """A table for people; the first column is text, the others are right-aligned."""
+        """A table for people; the first column is text, the others are right-aligned numbers, which are never cut."""
+        lines = list(rows)
         table = Table(title=title, title_justify="left", title_style="bold")
         for i, column in enumerate(columns):
-            table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
-        for row in rows:
-            table.add_row(*row)
+            cells = [str(line[i]) for line in lines]
+            if i == 0:
+                table.add_column(column, overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL)
+            else:
+                words = [len(word) for cell in cells for word in cell.split()]
+                table.add_column(column, overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER))
+        for line in lines:
+            table.add_row(*line)
         self.console.print(table)
 
     def result(self, value: dict[str, Any]) -> None:
