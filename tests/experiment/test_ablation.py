@@ -50,6 +50,7 @@ def test_settings_that_ask_the_simulator_have_fewer_seeds(make_study):
         seeds.setdefault(cell.variant.name, []).append(cell.seed)
     assert seeds.pop("gaponet:sensors=oracle") == seeds.pop("gaponet:sensors=learned") == [0]
     assert set(map(tuple, seeds.values())) == {(0, 1, 2)}
+    assert {c.variant.name for c in cells(study, rows(study)[0], bound_seeds=0)} == set(seeds)
 
 
 def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study):

@@ -33,13 +33,14 @@ def ablation(
 ) -> None:
     """Table 2 of the paper and our own switches: what each choice of the operator is worth, one changed at a time.
 
-    The same command again goes on where it was. About an hour on two cores; --quick in under five minutes.
+    The same command again goes on where it was. About an hour and a half on two cores; --quick in under five minutes.
 
     Args:
         dataset: Dataset folder.
         out: Folder of the results; its report.html shows all experiments in it.
         holdout_units: Units never trained on; shown in a column of their own.
-        bound_seeds: Seeds of oracle and learned sensors; the simulator itself answers there, which takes far longer.
+        bound_seeds: Seeds of oracle and learned sensors, for which the simulator itself is asked: twenty times as long.
+            0 leaves them out.
         options: Shared.
     """
     import gaponet.experiment.ablation as table2

@@ -88,17 +88,19 @@ def cells(study: Study, lines: list[Row], bound_seeds: int = 1) -> list[Cell]:
     Args:
         study: What is run.
         lines: Of rows().
-        bound_seeds: Seeds of settings in which the simulator itself answers; they take many times as long.
+        bound_seeds: Seeds of settings in which the simulator itself answers; they take many times as long. 0: none.
     """
     words = list(dict.fromkeys([DEFAULT, *(r.word for r in lines)]))
     bound = [w for w in words if study.variant(w).config.model.asks_simulator]
     made = study.cells([w for w in words if w not in bound])
-    return made + (study.cells(bound, min(bound_seeds, study.seeds)) if bound else [])
+    return made + (study.cells(bound, min(bound_seeds, study.seeds)) if bound and bound_seeds else [])
 
 
 def run(study: Study, bound_seeds: int, show: Show) -> Result:
     """Train what is missing and make the table."""
     lines, missing = rows(study)
+    if not bound_seeds:
+        missing.append("Oracle and learned sensors were left out (--bound-seeds 0).")
     trained = cells(study, lines, bound_seeds)
     missing += train_all(trained, study, show)
     found = outcomes(trained)

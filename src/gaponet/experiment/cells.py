@@ -42,7 +42,7 @@ Show = Callable[[Running, int], None]
 
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4
-ASKED = 0.2  # times more for each probe where the simulator itself answers
+ASKED = 1.0  # times more for each probe where the simulator itself answers
 
 
 @dataclass(frozen=True)
