@@ -40,12 +40,13 @@ def ablation(
         out: Folder of the results; its report.html shows all experiments in it.
         holdout_units: Units never trained on; shown in a column of their own.
         bound_seeds: Seeds of oracle and learned sensors, for which the simulator itself is asked: twenty times as long.
-            0 leaves them out.
+            0, or --quick, leaves them out.
         options: Shared.
     """
     import gaponet.experiment.ablation as table2
 
     study = _study(dataset, out, options, holdout_units)
+    bound_seeds = 0 if options.quick else bound_seeds
     cells = table2.cells(study, table2.rows(study)[0], bound_seeds)
     _carry_out(study, cells, lambda show: table2.run(study, bound_seeds, show), options)
 

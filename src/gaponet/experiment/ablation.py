@@ -100,7 +100,7 @@ def run(study: Study, bound_seeds: int, show: Show) -> Result:
     """Train what is missing and make the table."""
     lines, missing = rows(study)
     if not bound_seeds:
-        missing.append("Oracle and learned sensors were left out (--bound-seeds 0).")
+        missing.append("Oracle and learned sensors were left out (--bound-seeds 0, --quick).")
     trained = cells(study, lines, bound_seeds)
     missing += train_all(trained, study, show)
     found = outcomes(trained)

@@ -42,6 +42,7 @@ Show = Callable[[Running, int], None]
 
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4
+REHEARSAL = 0.1  # of FIXED_S, on a slice
 ASKED = 1.0  # times more for each probe where the simulator itself answers
 
 
@@ -75,7 +76,8 @@ class Study:
         """As told.
 
         At the slowest rate where the dataset holds several and none was asked for, so that rates are compared where
-        they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal.
+        they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal; units held out that are not in
+        the slice are held out all the same.
         """
         config, quick, rates = options.config, options.quick, rates_of(data)
         if len(rates) > 1 and not config.rates:
@@ -85,6 +87,8 @@ class Study:
             model = replace(config.model, sensor_hidden=QUICK_SENSORS)
             config = replace(config, model=model, warm_start=QUICK_WARM_START, ppo=QUICK_PPO)
             data = take(data, robot, rehearsal(data), out / "slice")
+            kept = {e.meta.unit_id for e in data.entries}
+            holdout_units = tuple(u for u in holdout_units if u in kept and len(kept) > 1)
         return cls(
             data, robot, out, config, options.budget or (QUICK_BUDGET if quick else BUDGET),
             options.seeds if options.seeds is not None else QUICK_SEEDS if quick else SEEDS,
@@ -201,7 +205,7 @@ def expected_s(cells: ListOf[Cell], study: Study) -> float:
     """Wall time of what is not there yet, s: from cells of this experiment that are done, else from the H1-2's."""
     done = [c for c in cells if c.done]
     taken = [json.loads((c.folder / RESULT).read_text(encoding="utf-8"))["seconds"] for c in done]
-    factor = sum(taken) / sum(_cost(c) for c in done) if done else 1.0
+    factor = sum(taken) / sum(_cost(c) for c in done) if done else REHEARSAL if study.rehearsal else 1.0
     todo = [_cost(c) * factor for c in cells if not c.done]
     return max(sum(todo) / study.processes, max(todo, default=0.0))
 

@@ -10,7 +10,7 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.robot import RobotSpec
 
 MOTIONS, PAYLOADS, UNITS = 6, 3, 2  # a split by motion has 3 + 1 + 2 of 6
-SECONDS = 4.0
+SECONDS = 2.0
 
 
 def rehearsal(dataset: Dataset) -> list[Entry]:
