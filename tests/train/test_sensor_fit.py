@@ -29,7 +29,7 @@ def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path)
     config = ModelConfig(history=2, num_probes=4, sensor_hidden=(64, 64))
     env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
-    report = fit_inputs(net, env, env.get_observations()["actor"], seed=0)
+    report = fit_inputs(net, env, env.get_observations()["actor"], 2048, seed=0)
     assert report["mean"] > 0.7
     assert list(report["by_joint"]) == ["shoulder", "elbow"]
     assert np.mean(list(report["by_joint"].values())) == pytest.approx(report["mean"])

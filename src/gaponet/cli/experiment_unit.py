@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -80,9 +80,8 @@ def tracking(
         made = require_unseen(made, data, robot, trained)
         update(2, 2, "")
     with bar("tracking") as update:
-        scores, example = track(
-            robot, physics, who, made, payloads, trained, lambda method, share: update(share, 1.0, method), out / PARTS
-        )
+        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
+        scores, example = track(robot, physics, who, made, payloads, trained, tell, out / PARTS)
     more: dict[str, Any] = {"unit_trained_on": True} if known else {}
     more |= {"motions": len(made), "compensator": _compensator("tracking")}
     told = _facts(data, trained, who, played, payloads, began, more)
@@ -133,16 +132,8 @@ def delivery(
         plans = planner.plans(QUICK_PLANS if options.quick else -(-goals // (STOPS * len(planner.arms))))
         update(1, 1, "")
     with bar("delivery") as update:
-        found, costs, example = deliver(
-            robot,
-            physics,
-            planner,
-            plans,
-            payloads,
-            trained,
-            lambda method, share: update(share, 1.0, method),
-            out / PARTS,
-        )
+        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
+        found, costs, example = deliver(robot, physics, planner, plans, payloads, trained, tell, out / PARTS)
     more = {"goals_per_payload": len(plans) * STOPS * len(planner.arms), "hold_s": hold,
             "compensator": _compensator("delivery")}  # fmt: skip
     told = _facts(data, trained, who, played, payloads, began, more)
@@ -179,9 +170,7 @@ def _train(
 
     units = sorted({e.meta.unit_id for e in data.entries})
     holdout = (played.unit or units[-1],) if len(units) > 1 and (not played.unit or played.unit in units) else ()
-    study = Study.of(data, robot, out, options)
-    present = {e.meta.unit_id for e in study.data.entries}
-    study = replace(study, holdout_units=holdout if len(present) > 1 and set(holdout) <= present else ())
+    study = Study.of(data, robot, out, options, holdout)
     cells = study.cells(MODELS)
     with bars("trainings", sum(not c.done for c in cells)) as show:
         failed = train_all(cells, study, show)
@@ -213,9 +202,8 @@ def _recorded(data: Dataset, robot: RobotSpec, trained: list[Trained], began: fl
     entries, unseen = choose(trained[0].run, data, ())
     sequences = data.sequences(entries)
     with bar("alignment") as update:
-        scores = align(
-            lambda: sequences, ["recorded"] * len(entries), robot, trained, lambda m, share: update(share, 1.0, m)
-        )
+        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
+        scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, tell)
     told = facts(
         data, sorted({t.seed for t in trained}), test_motions=len({e.meta.motion for e in entries}), unseen=unseen,
         runs=_weights(trained), minutes=round((time.monotonic() - began) / 60, 1),

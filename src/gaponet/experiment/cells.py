@@ -42,7 +42,7 @@ Show = Callable[[Running, int], None]
 
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4
-REHEARSAL = 0.1  # of FIXED_S, on a slice
+REHEARSAL = 0.25  # of FIXED_S, on a slice
 ASKED = 1.0  # times more for each probe where the simulator itself answers
 
 

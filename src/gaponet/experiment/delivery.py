@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiment.goals import Plan, Planner
 from gaponet.experiment.kept import Kept, revived
-from gaponet.experiment.play import Driven, Played, Progress, play, side_by_side, with_payloads
+from gaponet.experiment.play import Driven, Played, Progress, of_seed, play, side_by_side, with_payloads
 from gaponet.experiment.tracking import compensations
 from gaponet.experiment.trained import Trained
 from gaponet.robot import RobotSpec
@@ -109,7 +110,7 @@ def deliver(
     """
     pairs = with_payloads(plans, payloads)
     lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), side_by_side([p.ctrl for p, _ in pairs])
-    mass, total = np.array([p for _, p in pairs]), int(lengths.sum())
+    mass = np.array([p for _, p in pairs])
     asked = {id(plan): planner.places(plan.ctrl) for plan in plans}
     last, shown = round(LAST / robot.dt), len(pairs) // 2 // len(payloads) * len(payloads) + len(payloads) - 1
     kept = Kept(folder, "delivery", model_hash(robot), unit, plans, payloads)
@@ -120,21 +121,15 @@ def deliver(
         driven = None if way is None else replace(way, config=replace(HOLD, iterations=way.config.iterations))
 
         def work(method: str = method, seed: int | None = seed, driven: Driven | None = driven) -> Any:
-            done, name = 0, f"{method} {'' if seed is None else seed}".strip()
-
-            def tell(steps: int) -> None:
-                nonlocal done
-                done += steps
-                progress(name, done / total)
-
-            played = play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, tell)
+            told = partial(progress, of_seed(method, seed))
+            played = play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, told)
             delivered: list[Delivery] = []
             cost: list[Cost] = []
             place = np.empty((0, 3))
             for i, (plan, payload) in enumerate(pairs):
                 rows = slice(0, len(plan.ctrl))
-                hand, told = planner.places(played.true[rows, i]), planner.places(played.qpos[rows, i])
-                delivered += _delivered(plan, hand, told, asked[id(plan)], method, seed, payload, last, robot.dt)
+                hand, seen = planner.places(played.true[rows, i]), planner.places(played.qpos[rows, i])
+                delivered += _delivered(plan, hand, seen, asked[id(plan)], method, seed, payload, last, robot.dt)
                 cost.append(_cost(plan, played, i, method, seed, payload, robot))
                 if i == shown:
                     place = hand[:, 0]
@@ -146,11 +141,8 @@ def deliver(
         if seed in (None, trained[0].seed):
             places[method] = np.array(part["place"])
     plan, payload = pairs[shown]
-    return (
-        found,
-        costs,
-        Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, asked[id(plan)][:, 0], places),
-    )
+    target = asked[id(plan)][:, 0]
+    return found, costs, Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, target, places)
 
 
 def _delivered(

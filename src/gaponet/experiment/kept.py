@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -38,13 +39,21 @@ class Kept:
         if self.folder is None:
             return json.loads(json.dumps(finite(plain(make()))))
         known = [f() if callable(f) else f for f in facts]
-        text = json.dumps(finite(plain([__version__, self.facts, known])), sort_keys=True)
-        file = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+        file = self.folder / f"{_digest([self._common, known])[:16]}.json"
         if not file.is_file():
             found = plain(make())
             self.folder.mkdir(parents=True, exist_ok=True)
             write_json(file, found)
         return json.loads(file.read_text(encoding="utf-8"))
+
+    @cached_property
+    def _common(self) -> str:
+        """Of what all parts depend on, which may be long: every motion, say."""
+        return _digest([__version__, self.facts])
+
+
+def _digest(facts: Any) -> str:
+    return hashlib.sha256(json.dumps(finite(plain(facts)), sort_keys=True).encode()).hexdigest()
 
 
 def plain(value: Any) -> Any:

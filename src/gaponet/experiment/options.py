@@ -13,7 +13,9 @@ from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
 TRAINING = TrainConfig(warm_start=WarmStartConfig(rounds=2, num_envs=128, steps=300, gradient_steps=200))
 BUDGET, SEEDS = "76800", 3  # control steps: 2 rounds
 # With --quick: teaches next to nothing, in seconds.
-QUICK_WARM_START = WarmStartConfig(rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256)
+QUICK_WARM_START = WarmStartConfig(
+    rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256, sensor_states=256
+)
 QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)
 QUICK_SENSORS = (32,)  # hidden layers of the predictor, whose fit is most of a short training
 QUICK_BUDGET, QUICK_SEEDS = "2560", 1

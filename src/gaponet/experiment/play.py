@@ -18,7 +18,7 @@ from gaponet.virtual.unit import VirtualRobot
 
 Array = np.ndarray
 
-Progress = Callable[[str, float], None]  # method, share of it done
+Progress = Callable[[str, float], None]  # method and seed, share of it done
 
 WARMTH = 12.0  # K above ambient at the start: a robot that has been working (virtual/play.py)
 
@@ -72,6 +72,11 @@ class Played:
     temperature: Array
 
 
+def of_seed(method: str, seed: int | None) -> str:
+    """A method as progress names it."""
+    return method if seed is None else f"{method} {seed}"
+
+
 def with_payloads(motions: ListOf[M], payloads: tuple[float, ...]) -> list[tuple[M, float]]:
     """Each motion with each payload, kg, the longest motions first, as `play` wants them."""
     return [(m, p) for m in sorted(motions, key=lambda m: -len(m.ctrl)) for p in payloads]
@@ -91,7 +96,7 @@ def play(
     seeds: list[int],
     driven: Driven | None = None,
     lengths: Array | None = None,
-    progress: Callable[[int], None] = lambda steps: None,
+    progress: Callable[[float], None] = lambda share: None,
     nthread: int = 1,
 ) -> Played:
     """Start at rest under the first target, then follow.
@@ -106,7 +111,7 @@ def play(
         seeds: Of each row's noise and rest position, (N,).
         driven: By what; None for the targets as they are.
         lengths: Rows of each that count, (N,), falling; those that are through stand still.
-        progress: Called after each period with the control steps done in it.
+        progress: Called after each period with the share of all control steps that is done.
         nthread: Threads, 0 for all cores.
     """
     count = len(mass)
@@ -121,10 +126,11 @@ def play(
         compensator.reset(targets[0], mass)
     out = np.empty((6, *targets.shape), np.float32)
     running = np.full(len(targets), count) if lengths is None else (lengths > np.arange(len(targets))[:, None]).sum(1)
+    done = running.cumsum() / running.sum()
     for t, target in enumerate(targets):
         reading = robots.read()
         sent = target if compensator is None else compensator.step(target, reading.qpos, reading.qvel)
         out[:, t] = reading.qpos, reading.qvel, robots.true_qpos(), sent, reading.tau, reading.temperature
         robots.step(sent, np.arange(running[t]))
-        progress(int(running[t]))
+        progress(float(done[t]))
     return Played(*out)

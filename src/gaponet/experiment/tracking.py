@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiment.kept import Kept, revived
-from gaponet.experiment.play import Driven, Played, Progress, play, side_by_side, with_payloads
+from gaponet.experiment.play import Driven, Played, Progress, of_seed, play, side_by_side, with_payloads
 from gaponet.experiment.trained import Trained
 from gaponet.experiment.unseen import Unseen
 from gaponet.robot import RobotSpec
@@ -97,18 +97,10 @@ def track(
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
     lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)
     mass = np.array([p for _, p in pairs])
-    total = int(lengths.sum())
-    kept = Kept(folder, "tracking", model_hash(robot), unit, unit_id, [m for m, _ in pairs], payloads)
+    kept = Kept(folder, "tracking", model_hash(robot), unit, unit_id, list(motions), payloads)
 
-    def drive(method: str, driven: Driven | None) -> Played:
-        done = 0
-
-        def tell(steps: int) -> None:
-            nonlocal done
-            done += steps
-            progress(method, done / total)
-
-        return play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, tell)
+    def drive(name: str, driven: Driven | None) -> Played:
+        return play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, partial(progress, name))
 
     @cache
     def raw() -> Played:
@@ -121,12 +113,9 @@ def track(
     shown = int(kept("shown", make=lambda: {"row": _shown(pairs, robot, targets, raw())})["row"])
     example: dict[str, Array] = {}
     for method, seed, driven in compensations(robot, trained):
-        name = f"{method} {'' if seed is None else seed}".strip()
 
-        def work(
-            method: str = method, seed: int | None = seed, driven: Driven | None = driven, name: str = name
-        ) -> Any:
-            played = raw() if driven is None else drive(name, driven)
+        def work(method: str = method, seed: int | None = seed, driven: Driven | None = driven) -> Any:
+            played = raw() if driven is None else drive(of_seed(method, seed), driven)
             found = _tracked(pairs, played, targets, lengths, rest, robot, method, seed)
             return {"scores": found, "qpos": played.qpos[rest : lengths[shown], shown][:, robot.operated_index]}
 

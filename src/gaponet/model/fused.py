@@ -5,10 +5,10 @@
     b = branch([sensors | z]),  t = trunk(z)
     Δa = Δ_max · tanh(Σ_basis b t + c)      the trunk's last layer carries gain / Δ_max
 
-With full coupling nothing lies between the predictor's last layer and the branch's first: they are one product. With
-one joint at a time (kind joint) z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that a joint's
-part is a slice; its name is one-hot. Branch and trunk of the same depth are one net side by side (kind pair) that ends
-in b + t and b − t: Σ b t = ¼ Σ (b + t)² − (b − t)². model/fuse.py makes the weights from a trained network.
+With full coupling (kind full) nothing lies between the predictor's last layer and the branch's first: they are one
+product. With one joint at a time (kind joint) z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that
+a joint's part is a slice; its name is one-hot. Branch and trunk of the same depth are one net side by side (kind pair)
+that ends in b + t and b − t: Σ b t = ¼ Σ (b + t)² − (b − t)². model/fuse.py makes the weights from a trained network.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ class FusedForward:
         z = self._standardised()
         rows = z.reshape(batch * n, -1) if kind in JOINT_WISE else z
         predictor, branch, trunk, pair = (_layers(weights, part) for part in PARTS)
-        sensed = self._chain(z, predictor, kind == "full") if predictor else None
+        sensed = self._chain(z, predictor, last_elu=kind == "full") if predictor else None
         self.delta = _empty(batch, n)
         if pair:
-            y = self._first(pair, rows, sensed)
+            y = self._chain(rows, pair, sensed)
             self._do(np.multiply, y, y, out=y)
             self._do(np.dot, y, weights["quarter"], out=self.delta.reshape(-1, 1))
             self._do(np.add, self.delta, weights["bias"], out=self.delta)
         elif branch:
             y = self._chain(rows, trunk)
-            self._do(np.multiply, self._first(branch, rows, sensed), y, out=y)
+            self._do(np.multiply, self._chain(rows, branch, sensed), y, out=y)
             self._do(np.add.reduce, y.reshape(batch, n, -1), 2, out=self.delta)
             self._do(np.add, self.delta, weights["bias"], out=self.delta)
         else:
@@ -101,26 +101,15 @@ class FusedForward:
         self._do(np.minimum, z, np.float32(CLAMP), out=z)
         return z
 
-    def _first(self, layers: Layers, rows: Array, sensed: Array | None) -> Array:
-        """A net of [sensed | rows], without putting them side by side."""
-        (weight, bias), *more = layers
-        out, count = _empty(len(rows), weight.shape[1]), weight.shape[0] - rows.shape[1]
-        self._do(np.dot, rows, np.ascontiguousarray(weight[count:]), out=out)
-        if sensed is not None:
-            part = np.empty_like(out)
-            self._do(np.dot, sensed.reshape(-1, count), np.ascontiguousarray(weight[:count]), out=part)
-            self._do(np.add, out, part, out=out)
-        if bias.any():
-            self._do(np.add, out, bias, out=out)
-        if more:
-            self._elu(out)
-        return self._chain(out, more)
-
-    def _chain(self, x: Array, layers: Layers, last_elu: bool = False) -> Array:
-        """x W + b with ELU between."""
+    def _chain(self, x: Array, layers: Layers, sensed: Array | None = None, last_elu: bool = False) -> Array:
+        """x W + b with ELU between; of [sensed | x], without putting them side by side."""
         for i, (weight, bias) in enumerate(layers):
-            out = _empty(len(x), weight.shape[1])
-            self._do(np.dot, x, weight, out=out)
+            out, count = _empty(len(x), weight.shape[1]), weight.shape[0] - x.shape[1]
+            self._do(np.dot, x, weight[count:], out=out)
+            if i == 0 and sensed is not None:
+                part = np.empty_like(out)
+                self._do(np.dot, sensed.reshape(-1, count), weight[:count], out=part)
+                self._do(np.add, out, part, out=out)
             if bias.any():
                 self._do(np.add, out, bias, out=out)
             if last_elu or i < len(layers) - 1:

@@ -42,6 +42,8 @@ class WarmStartConfig:
     """AdamW step size, decayed to a tenth over the rounds."""
     weight_decay: float = 0.01
     """AdamW weight decay."""
+    sensor_states: int = 2048
+    """States at which the simulator is asked, once for each probe, to fit the sensor predictor."""
     sensor_refresh: float | None = None
     """Ask after each round how well the sensor predictor explains the states that the policy visits, and fit it again
     when its R² has fallen by more than this since the fit; None never asks."""

@@ -178,7 +178,9 @@ class Trainer:
         self._tick()
         env = self._env(self.config.warm_start.num_envs, 10**9, self.config.seed)
         x = env.get_observations()["actor"]
-        self.sensor_r2 = fit_inputs(self.net, env, x, self.config.seed, self.config.threads)
+        self.sensor_r2 = fit_inputs(
+            self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.config.threads
+        )
         self.trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:

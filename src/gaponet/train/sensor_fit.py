@@ -21,7 +21,6 @@ from gaponet.sim.batch import Condition
 
 Array = np.ndarray
 
-STATES = 2048
 STEPS = 600
 BATCH = 256
 POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states is moved off the recorded ones by these

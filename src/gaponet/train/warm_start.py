@@ -17,7 +17,7 @@ import torch
 from gaponet.model.layers import DeltaNet
 from gaponet.train.config import TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
-from gaponet.train.sensor_fit import STATES, Asked, Report, explained, fit_predictor, points_of, sensor_labels
+from gaponet.train.sensor_fit import Asked, Report, explained, fit_predictor, points_of, sensor_labels
 
 Array = np.ndarray
 
@@ -58,7 +58,8 @@ class WarmStart:
         """Before the first round: statistics of inputs, and on them the sensor predictor, where labels lead along."""
         self.collect(follow_labels=True)
         self.pool_y.clear()
-        self.report = fit_inputs(self.net, self.env, self.pool_x.pop(), self.seed, self.nthread)
+        states = self.config.sensor_states
+        self.report = fit_inputs(self.net, self.env, self.pool_x.pop(), states, self.seed, self.nthread)
 
     def collect(self, follow_labels: bool) -> None:
         """Roll out for config.steps, motions restarting where they end."""
@@ -114,10 +115,10 @@ class WarmStart:
         if allowed is None or report is None or not self.visited:
             return
         joints = self.env.robot.operated
-        found = explained(self.net, self._ask_visited(STATES // 4, move=False), joints)["mean"]
+        found = explained(self.net, self._ask_visited(self.config.sensor_states // 4, move=False), joints)["mean"]
         self.report = report | {"visited": found}
         if found < report["fitted"] - allowed:
-            asked = self._ask_visited(STATES, move=True)
+            asked = self._ask_visited(self.config.sensor_states, move=True)
             new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
             self.report = new | {"refits": report["refits"] + 1}
 
@@ -165,31 +166,41 @@ def held_labels(labels: Array, hold: int) -> Array:
     return np.mean([labels[i : rows + i] for i in range(hold)], axis=0, dtype=labels.dtype)
 
 
-def fit_inputs(net: DeltaNet, env: DeltaEnv, x: torch.Tensor, seed: int, nthread: int = 0) -> Report | None:
+def fit_inputs(
+    net: DeltaNet, env: DeltaEnv, x: torch.Tensor, states: int, seed: int, nthread: int = 0
+) -> Report | None:
     """Before all training: statistics of the inputs from samples x, (N, dim), and on them the sensor predictor.
+
+    Args:
+        net: With no statistics yet.
+        env: Whose simulator is asked.
+        x: Samples of the inputs.
+        states: How many the simulator is asked at.
+        seed: Of the choice of states.
+        nthread: Threads of the simulator, 0 for all cores.
 
     Returns:
         Its R² on held-out states; None for a network without one.
     """
     net.fit_inputs(x)
-    return fit_sensors(net, env, seed, nthread) if net.predictor is not None else None
+    return fit_sensors(net, env, states, seed, nthread) if net.predictor is not None else None
 
 
-def fit_sensors(net: DeltaNet, env: DeltaEnv, seed: int, nthread: int = 0) -> Report:
+def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
     """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
     qs: list[Array] = []
     vs: list[Array] = []
     groups: list[Array] = []
-    while sum(map(len, xs)) < STATES:
+    while sum(map(len, xs)) < states:
         env.reset()
         xs.append(env.get_observations()["actor"].numpy())
         qs.append(env.sim.qpos.copy())
         vs.append(env.sim.qvel.copy())
         groups.append(env.group)
     x, q, v, group = (np.concatenate(part) for part in (xs, qs, vs, groups))
-    pick = np.sort(rng.permutation(len(x))[:STATES])
+    pick = np.sort(rng.permutation(len(x))[:states])
     shuffled = rng.permutation(pick)
     asked = sensor_labels(
         net,
