@@ -43,6 +43,20 @@ def test_a_test_motion_is_unseen_and_its_nearest_is_told(arm, used):
     assert motion.nearest[1] == pytest.approx(min(away), rel=1e-4)
 
 
+def test_motions_that_begin_alike_are_told_apart_by_the_whole_of_them(arm, tmp_path, used):
+    whole, models = used
+    cut = Dataset.create(tmp_path / "cut", arm)
+    entries = [cut.append(whole.read(e).rows(slice(0, 30))) for e in whole.entries]
+    split = {"train": {"m0": entries[0].hash}, "val": {"m1": entries[1].hash}, "test": {}}
+    (models[0].run / "split.json").write_text(json.dumps(split))
+    ctrl = commands(100, 0)
+    ctrl[30:] += 0.1
+    with pytest.raises(UsageError, match="'m0'"):
+        require_unseen([Unseen("new", "generated", ctrl)], cut, arm, models)
+    (motion,) = require_unseen([Unseen("new", "generated", ctrl)], cut, arm, models, whole)
+    assert motion.nearest[1] == pytest.approx(0.1 * np.sqrt(0.7), rel=1e-3)
+
+
 def test_motions_are_made_anew_and_read_from_files(arm, tmp_path):
     made = generated(arm, 3, 0.2)
     assert len({m.name for m in made}) == 3

@@ -150,9 +150,11 @@ def _carry_out(study: Study, cells: list[Cell], run: Callable[[Show], Result], o
 
     screen, todo = Out(options.json), sum(not c.done for c in cells)
     words = len({c.variant.name for c in cells})
+    minutes = expected_s(cells, study) / 60
+    rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
     screen.say(
-        f"{len(cells)} trainings ({words} settings), {len(cells) - todo} there already; the others take about "
-        f"{expected_s(cells, study) / 60:.0f} minutes, {study.processes} at a time"
+        f"{len(cells)} trainings ({words} settings), {len(cells) - todo} there already"
+        + (f"; the others take {rest}, {study.processes} at a time" if todo else "")
     )
     with bars("trainings", todo) as show:
         result = run(show)

@@ -77,7 +77,7 @@ def tracking(
         made = generated(robot, QUICK_MOTIONS if options.quick else count, max(payloads))
         update(1, 2, "")
         made += from_files(robot, motions, max(payloads))[: QUICK_MOTIONS if options.quick else None] if motions else []
-        made = require_unseen(made, data, robot, trained)
+        made = require_unseen(made, data, robot, trained, open_dataset(dataset, options.robot)[0])
         update(2, 2, "")
     with bar("tracking") as update:
         tell = lambda method, share: update(share, 1.0, method)  # noqa: E731

@@ -81,16 +81,28 @@ def _unseen(name: str, source: str, library: Library, robot: RobotSpec) -> Unsee
 
 
 def require_unseen(
-    motions: ListOf[Unseen], dataset: Dataset, robot: RobotSpec, trained: ListOf[Trained]
+    motions: ListOf[Unseen],
+    dataset: Dataset,
+    robot: RobotSpec,
+    trained: ListOf[Trained],
+    whole: Dataset | None = None,
 ) -> list[Unseen]:
     """The motions, each with its nearest motion of training or validation, over the time that both last.
+
+    Args:
+        motions: Of the experiment.
+        dataset: That the models were trained on.
+        robot: Nominal.
+        trained: Models.
+        whole: What the recordings of dataset were cut from, if they were: many motions begin in the same rest.
 
     Raises:
         UsageError: One of them was trained on, by name or by its targets.
     """
     used = trained_on(dataset, trained)
-    op = robot.operated_index
-    targets = {name: _at(dataset, e, robot.dt)[:, op] for name, e in used.items()}
+    op, whole = robot.operated_index, whole or dataset
+    first = {e.meta.motion: e for e in reversed(whole.entries)}
+    targets = {name: _at(whole, first[name], robot.dt)[:, op] for name in used}
     out = []
     for motion in motions:
         away = {name: _rms(motion.ctrl[:, op], c) for name, c in targets.items()}
@@ -105,10 +117,10 @@ def require_unseen(
     return out
 
 
-def trained_on(dataset: Dataset, trained: ListOf[Trained]) -> dict[str, Entry]:
-    """One recording of every motion that any of the runs was trained or chosen on, by name."""
+def trained_on(dataset: Dataset, trained: ListOf[Trained]) -> set[str]:
+    """Names of the motions that any of the runs was trained or chosen on."""
     hashes = {h for t in trained for part in ("train", "val") for h in read_split(t.run)[part].values()}
-    found = {e.meta.motion: e for e in dataset.entries if e.hash in hashes}
+    found = {e.meta.motion for e in dataset.entries if e.hash in hashes}
     if not found:
         raise UsageError(f"{dataset.path}: holds nothing that these runs were trained on; give the dataset of the runs")
     return found
