@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import signal
 import time
@@ -85,6 +86,21 @@ def test_a_run_goes_through_all_phases_and_follows_the_motion(arm):
     assert np.abs(log.channels["ctrl"].values - log.channels["qpos"].values).max() < 0.2
     assert recording.virtual
     assert recording.missed == 0
+
+
+def test_nothing_is_collected_while_it_runs_and_nothing_piles_up_for_it(arm):
+    passes: list[bool] = []
+
+    class Watching(Tampered):
+        def read(self):
+            passes.append(gc.isenabled())
+            return super().read()
+
+    driver = Watching(arm, SimulatedClock())
+    recording = run(arm, driver)
+    assert not any(passes)
+    assert gc.isenabled()
+    assert gc.collect() < len(recording.rows) / 2, "cycles, which only a collection frees"
 
 
 def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):

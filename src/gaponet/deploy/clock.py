@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 SPIN = 0.0003  # s: the last part of a wait is spent awake, since a sleep ends up to this much late on a quiet Linux
@@ -33,6 +36,20 @@ class MonotonicClock:
         while (now := time.monotonic()) < deadline:
             pass
         return now
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """No garbage collection inside: one pass over all objects stands still for 13 ms or more, and for longer the longer
+    a recording is. What a period leaves behind is freed all the same, by reference counts."""
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 class SimulatedClock:

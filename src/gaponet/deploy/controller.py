@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from gaponet.deploy.clock import Clock, MonotonicClock
+from gaponet.deploy.clock import Clock, MonotonicClock, uncollected
 from gaponet.deploy.driver import Driver, DriverError, State
 from gaponet.deploy.guard import Guard
 from gaponet.deploy.publisher import sole_publisher
@@ -172,6 +172,7 @@ class Controller:
         if self.phase is not Phase.IDLE or self.recording.events:
             raise UsageError("a controller runs once; make a new one")
         with ExitStack() as stack:
+            stack.enter_context(uncollected())  # left last: the guard would take a collection for silence
             lock = stack.enter_context(sole_publisher(self.driver.address))
             stack.callback(self.driver.close)
             self.driver.connect()

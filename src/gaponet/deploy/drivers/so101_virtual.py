@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.deploy.clock import uncollected
 from gaponet.deploy.drivers import feetech as reg
 from gaponet.deploy.drivers.so101 import SPEAK, STALL_CURRENT, STEP, STEPS
 from gaponet.deploy.drivers.virtual import LiveUnit
@@ -59,6 +60,10 @@ class VirtualSO101:
 
     def run(self, seconds: float = np.inf) -> None:
         """Live and answer in real time."""
+        with uncollected():
+            self._serve(seconds)
+
+    def _serve(self, seconds: float) -> None:
         began = time.monotonic()
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:

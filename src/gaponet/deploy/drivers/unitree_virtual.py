@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from gaponet.deploy.clock import MonotonicClock
+from gaponet.deploy.clock import MonotonicClock, uncollected
 from gaponet.deploy.drivers import hg
 from gaponet.deploy.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
 from gaponet.deploy.drivers.virtual import LiveUnit
@@ -94,6 +94,10 @@ class VirtualH12:
 
     def run(self, seconds: float = np.inf) -> None:
         """Live in real time, until interrupted."""
+        with uncollected():
+            self._live(seconds)
+
+    def _live(self, seconds: float) -> None:
         start, k = self.clock.now(), 0
         while (passed := k / self.rate) < seconds:
             now = self.clock.wait_until(start + passed)
