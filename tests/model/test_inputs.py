@@ -10,6 +10,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.inputs import Inputs
 from gaponet.model.observation import Layout
+from gaponet.model.sensor import ProbeOracle
 from gaponet.sim.replay import replay
 from gaponet.train.config import RewardConfig
 from gaponet.train.env import DeltaEnv
@@ -132,6 +133,25 @@ def test_training_and_free_run_give_the_network_the_same_numbers(change, tmp_pat
             env.advance(np.full((1, 2), 0.01, np.float32))
     assert len(trained) == 13 // config.delta_hold
     np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
+
+
+def test_the_simulator_is_asked_only_while_a_motion_lasts(tmp_path, monkeypatch):
+    robot = write_arm(tmp_path)
+    config = ModelConfig(sensors="oracle", num_probes=3)
+    short, long = recordings(robot, 2, rows=8)[0], recordings(robot, 2, rows=14)[1]
+    asked: list = []
+    answer = ProbeOracle.__call__
+
+    def noted(self, qpos, qvel, offsets=None, ids=None):
+        asked.append(len(ids))
+        return answer(self, qpos, qvel, offsets, ids)
+
+    monkeypatch.setattr(ProbeOracle, "__call__", noted)
+    together = replay([short, long], robot, DeltaCorrector(lambda x: x[:, -2:] * 0.01, config, robot), nthread=1)
+    assert asked == [2] * 7 + [1] * 6
+    for sequence, twin in zip((short, long), together, strict=True):
+        alone = replay([sequence], robot, DeltaCorrector(lambda x: x[:, -2:] * 0.01, config, robot), nthread=1)[0]
+        np.testing.assert_allclose(twin.qpos, alone.qpos, atol=1e-9)
 
 
 def test_a_correction_is_held(tmp_path):

@@ -26,14 +26,24 @@ class DeltaCorrector:
         self.range = robot.qpos_range[self.op]
 
     def reset(self, start: ListOf[Sequence]) -> None:
-        """One simulation per sequence, at its first row: that frame repeated, with its command, is the history."""
+        """One simulation per sequence, at its first row: that frame repeated, with its command, is the history.
+
+        A model that asks the simulator asks one in which idle limbs are clamped, and only while a sequence lasts.
+        """
+        locked: tuple[str, ...] = ()
+        if self.config.asks_simulator:
+            from gaponet.sim.replay import idle_limbs
+
+            locked = idle_limbs(start, self.robot)
         self.begin(
             np.stack([s.qpos[0] for s in start]),
             np.stack([s.qvel[0] for s in start]),
             np.stack([s.ctrl[0] for s in start]),
             np.array([s.meta.payload_mass for s in start], np.float32),
             [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in start],
+            locked,
         )
+        self.last = np.array([len(s) - 1 for s in start])
 
     def begin(
         self,
@@ -42,6 +52,7 @@ class DeltaCorrector:
         ctrl: Array,
         payload_mass: Array,
         simulated: list[Condition] | None = None,
+        locked: tuple[str, ...] = (),
     ) -> None:
         """Start from a state, all joints: (k, n_all) each, payload (k,) kg.
 
@@ -49,6 +60,7 @@ class DeltaCorrector:
             qpos, qvel, ctrl: State and command.
             payload_mass: What the model is told.
             simulated: Payload, side and period of each, where these are simulations whose whole state is given.
+            locked: Joints clamped in the simulator asked.
 
         Raises:
             ModelError: The model asks the simulator, and this is none.
@@ -63,7 +75,8 @@ class DeltaCorrector:
                 )
             from gaponet.model.sensor import ProbeOracle
 
-            oracle = ProbeOracle(self.robot, self.config, simulated)
+            oracle = ProbeOracle(self.robot, self.config, simulated, locked=locked, whole=True)
+        self.last = np.full(len(qpos), np.iinfo(np.int64).max)  # row at which a simulation ends
         self.inputs = Inputs(self.config, len(qpos), op, oracle, self.points)
         frames = [np.repeat(x[:, None], self.inputs.history.depth, axis=1) for x in (qpos, qvel, ctrl)]
         self.inputs.reset(slice(None), *frames)
@@ -74,6 +87,7 @@ class DeltaCorrector:
         op = self.op
         a = target[:, op]
         if self.periods % self.config.delta_hold == 0:
+            self.inputs.rest(self.periods >= self.last)
             self.delta = self.infer(self.inputs.x(qpos, qvel, a, self.payload))
         self.periods += 1
         out = np.array(target, float)

@@ -63,6 +63,10 @@ class Inputs:
         self.history.push(qpos[:, op], qvel[:, op], target[:, op])
         self.age += 1
 
+    def rest(self, ended: Array) -> None:
+        """Their sensors are not due; (num_envs,) bool."""
+        self.age[ended] = 0
+
     def x(self, qpos: Array, qvel: Array, action: Array, payload_mass: Array) -> Array:
         """What the network is given, (num_envs, dim), float32.
 

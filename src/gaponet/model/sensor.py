@@ -38,13 +38,16 @@ class ProbeOracle:
         conditions: list[Condition],
         nthread: int = 0,
         locked: tuple[str, ...] = (),
+        whole: bool = False,
     ) -> None:
-        """One state slot per entry of `conditions`; states are of the joints that are not locked."""
+        """One state slot per entry of `conditions`; states are of the joints that are not locked, or, where whole, of
+        all."""
         self.offsets = probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
         self.sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
+        self.free = robot.index(self.sim.joint_names) if whole else slice(None)
         self.target = np.zeros((self.sim.num_envs, self.sim.n))
         self.absolute = config.sensor_target == "absolute"
         self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
@@ -53,7 +56,7 @@ class ProbeOracle:
         """Sensor values.
 
         Args:
-            qpos, qvel: States of all the robot's joints that are not locked, (k, n_free), one per slot.
+            qpos, qvel: States of the joints, (k, n_free) or (k, n_all), one per slot.
             offsets: Where to ask, relative to q, (k, m, n) rad; default the fixed probes.
             ids: Only these slots, (k,) sorted; default all.
 
@@ -63,7 +66,7 @@ class ProbeOracle:
         m, op = len(self.offsets), self.operated
         slots = np.arange(len(self.dt)) if ids is None else ids
         rows = (slots[:, None] * m + np.arange(m)).ravel()
-        q, v = np.repeat(qpos, m, axis=0), np.repeat(qvel, m, axis=0)
+        q, v = (np.repeat(x[:, self.free], m, axis=0) for x in (qpos, qvel))
         target = q.copy()
         target[:, op] += np.tile(self.offsets, (len(qpos), 1)) if offsets is None else offsets.reshape(-1, len(op))
         self.sim.reset(rows, q, v, past=target[:, None])
