@@ -79,7 +79,8 @@ def lines(
     log: bool = False,
     marked: ListOf[float | None] = (),
 ) -> Figure:
-    """Values over an amount, with error bars, one line per method.
+    """Values over an amount, with error bars, one line per method; those with error bars are drawn a little apart where
+    x is not logarithmic, so that equal ones are all seen.
 
     Args:
         panels: (title, {label: (colour, x, values)}), beside each other on one scale.
@@ -97,11 +98,16 @@ def lines(
             ax.axvspan(place - half, place + half, color="#000000", alpha=0.06, lw=0)
             ax.annotate("not in training", (place, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
                         textcoords="offset points", ha="center", va="bottom", fontsize=8, color="#555555")  # fmt: skip
+        apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
+        drawn = 0  # of those with error bars
+        spreading = sum(any(v.std > 0 for v in values) for _, _, values in methods.values())
         for label, (colour, x, values) in methods.items():
             std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+            shift = (drawn - (spreading - 1) / 2) * apart if std.any() else 0.0
+            drawn += bool(std.any())
             ax.errorbar(
-                x, [v.mean for v in values], yerr=std if std.any() else None, fmt="o-", ms=3.5, color=colour,
-                elinewidth=0.9, capsize=2, label=label,
+                np.add(x, shift), [v.mean for v in values], yerr=std if std.any() else None, fmt="o-", ms=3.5,
+                color=colour, elinewidth=0.9, capsize=2, label=label,
             )  # fmt: skip
         if log:
             ax.set_xscale("log")
