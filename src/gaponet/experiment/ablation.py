@@ -144,8 +144,8 @@ def result(
         "MPJAE: mean over joints and held-out motions of the whole-motion free run, mean ± std over seeds; of nominal: "
         "on the same motions at the same rate; of default: the ratio of both with the same seed, which does not "
         "contain what a seed does to both. All with the same training budget. paper: range of its Table 2(a), unit "
-        "not known here; blank where no number of it is. Oracle and learned sensors ask the simulator: bounds, of no "
-        "use on a robot."
+        "not known here; blank where no number of it is. Oracle and learned sensors ask the simulator itself, which "
+        "no robot can."
     )
     one = Spread.of([1.0])
     shown = [

@@ -48,7 +48,7 @@ class ModelConfig:
     sensors: Literal["predicted", "oracle", "learned", "off"] = "predicted"
     """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only. oracle: the
     simulator itself is asked at every state. learned: it is asked at targets that a network chooses. The last two need
-    the simulator's whole state and m more simulations: bounds to compare with, of no use on a robot."""
+    the simulator's whole state and m more simulations: to compare with, of no use on a robot."""
     sensor_target: Literal["delta", "absolute"] = "delta"
     """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
     sensor_hold: int = 1

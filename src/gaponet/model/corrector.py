@@ -70,8 +70,8 @@ class DeltaCorrector:
         if self.config.asks_simulator:
             if simulated is None:
                 raise ModelError(
-                    f"this model's sensors are the simulator's own answers (sensors = {self.config.sensors}): a "
-                    "bound to compare with, of no use outside a simulator; train with --model.sensors predicted"
+                    f"this model's sensors are the simulator's own answers (sensors = {self.config.sensors}): "
+                    "to compare with, of no use outside a simulator; train with --model.sensors predicted"
                 )
             from gaponet.model.sensor import ProbeOracle
 
