@@ -18,6 +18,8 @@ table { border-collapse: collapse; margin: .6rem 0 }
 th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #eee }
 th { background: #fafafa }
 th:first-child, td:first-child, .facts td { text-align: left; vertical-align: top }
+td + td { white-space: nowrap }
+.facts td + td { white-space: normal }
 .facts td:first-child { color: #666; white-space: nowrap }
 tr.best td { font-weight: 600 }
 .tag { display: inline-block; padding: .1rem .6rem; border-radius: 1rem; color: #fff; font: 600 .85rem system-ui }

@@ -55,8 +55,9 @@ def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
     ax.grid(axis="y", visible=False)
     for group in dict.fromkeys(r[0] for r in rows):
         first = next(i for i, r in enumerate(rows) if r[0] == group)
-        ax.annotate(group, (-0.33, where[first]), xycoords=("axes fraction", "data"), va="center", ha="right",
-                    fontweight="bold", annotation_clip=False)  # fmt: skip
+        # From the left, since a browser's font may be wider than ours and what is left of the figure is cut off.
+        ax.annotate(group, (0, where[first]), (-170, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
+                    va="center", ha="left", fontweight="bold", annotation_clip=False)  # fmt: skip
     if limit < np.inf:
         ax.set_xlim(right=limit)
     ax.set_xlabel(axis)
