@@ -39,7 +39,7 @@ def ablation(
         dataset: Dataset folder.
         out: Folder of the results; its report.html shows all experiments in it.
         holdout_units: Units never trained on; shown in a column of their own.
-        bound_seeds: Seeds of oracle and learned sensors, for which the simulator itself is asked: twenty times as long.
+        bound_seeds: Seeds of oracle and learned sensors, for which the simulator itself is asked: ten times as long.
             0, or --quick, leaves them out.
         options: Shared.
     """

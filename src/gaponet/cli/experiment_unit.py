@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from gaponet.experiment.options import Options
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
+    from gaponet.experiment.play import Progress
     from gaponet.experiment.result import Result
     from gaponet.experiment.trained import Trained
     from gaponet.robot import RobotSpec
@@ -80,8 +82,7 @@ def tracking(
         made = require_unseen(made, data, robot, trained, open_dataset(dataset, options.robot)[0])
         update(2, 2, "")
     with bar("tracking") as update:
-        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
-        scores, example = track(robot, physics, who, made, payloads, trained, tell, out / PARTS)
+        scores, example = track(robot, physics, who, made, payloads, trained, _by_method(update), out / PARTS)
     more: dict[str, Any] = {"unit_trained_on": True} if known else {}
     more |= {"motions": len(made), "compensator": _compensator("tracking")}
     told = _facts(data, trained, who, played, payloads, began, more)
@@ -132,8 +133,9 @@ def delivery(
         plans = planner.plans(QUICK_PLANS if options.quick else -(-goals // (STOPS * len(planner.arms))))
         update(1, 1, "")
     with bar("delivery") as update:
-        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
-        found, costs, example = deliver(robot, physics, planner, plans, payloads, trained, tell, out / PARTS)
+        found, costs, example = deliver(
+            robot, physics, planner, plans, payloads, trained, _by_method(update), out / PARTS
+        )
     more = {"goals_per_payload": len(plans) * STOPS * len(planner.arms), "hold_s": hold,
             "compensator": _compensator("delivery")}  # fmt: skip
     told = _facts(data, trained, who, played, payloads, began, more)
@@ -202,8 +204,7 @@ def _recorded(data: Dataset, robot: RobotSpec, trained: list[Trained], began: fl
     entries, unseen = choose(trained[0].run, data, ())
     sequences = data.sequences(entries)
     with bar("alignment") as update:
-        tell = lambda method, share: update(share, 1.0, method)  # noqa: E731
-        scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, tell)
+        scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, _by_method(update))
     told = facts(
         data, sorted({t.seed for t in trained}), test_motions=len({e.meta.motion for e in entries}), unseen=unseen,
         runs=_weights(trained), minutes=round((time.monotonic() - began) / 60, 1),
@@ -226,6 +227,11 @@ def _facts(
 
 def _weights(trained: list[Trained]) -> list[str]:
     return [f"{t.method} seed {t.seed} ({t.model.weights_hash()})" for t in trained]
+
+
+def _by_method(update: Callable[[float, float, str], None]) -> Progress:
+    """A progress bar's update as what is told of each method."""
+    return lambda method, share: update(share, 1.0, method)
 
 
 def _compensator(name: str) -> str:

@@ -43,7 +43,7 @@ Show = Callable[[Running, int], None]
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4
 REHEARSAL = 0.25  # of FIXED_S, on a slice
-ASKED = 1.0  # times more for each probe where the simulator itself answers
+ASKED = 0.5  # times more for each probe where the simulator itself answers
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class Study:
         """As told.
 
         At the slowest rate where the dataset holds several and none was asked for, so that rates are compared where
-        they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal; units held out that are not in
-        the slice are held out all the same.
+        they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal; of the units held out it
+        knows those that are in the slice.
         """
         config, quick, rates = options.config, options.quick, rates_of(data)
         if len(rates) > 1 and not config.rates:

@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.train.config import TrainConfig, WarmStartConfig
 from gaponet.train.env import DeltaEnv
@@ -188,6 +189,8 @@ def fit_inputs(
 
 def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
     """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
+    if states < 8:
+        raise UsageError(f"--warm-start.sensor-states {states}: too few to fit a predictor on; give 8 or more")
     rng = np.random.default_rng(seed)
     xs: list[Array] = []
     qs: list[Array] = []
