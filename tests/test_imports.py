@@ -10,10 +10,10 @@ import gaponet
 SOURCE = Path(gaponet.__file__).parent
 # A module may import from its own rank or a lower one.
 RANKS = [
-    {"errors", "packaged", "robot", "robot_folder"}, {"data"}, {"gap"}, {"sim"}, {"motion"}, {"virtual", "collect"},
-    {"model"}, {"train", "deploy"}, {"eval"}, {"experiment"}, {"cli"},
+    {"errors", "packaged", "robot", "robot_folder", "structure"}, {"data"}, {"gap"}, {"sim"}, {"motion"},
+    {"virtual", "collect"}, {"model"}, {"train", "deploy"}, {"eval"}, {"experiment"}, {"cli"},
 ]  # fmt: skip
-HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl")
+HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 
 
 def rank(module: str) -> int:

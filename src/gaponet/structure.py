@@ -1,0 +1,109 @@
+"""What a file says becomes a value of a stated type here, or one line that names the file and the field.
+
+A structure is a dataclass or a TypedDict; ranges and sizes stand in its annotations (annotated_types: Ge, Interval,
+Len). pydantic checks it, strictly: no text for a number, no NaN or infinity unless the annotation says so, no unknown
+field unless the caller keeps those. Nothing outside this module asks pydantic, which is imported when a file is read.
+"""
+
+from __future__ import annotations
+
+import functools
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from gaponet.errors import GAPONetError
+
+T = TypeVar("T")
+LARGEST = 64 << 20  # bytes of a document that is read at once; ours have kilobytes
+
+
+def validated(
+    kind: type[T], data: Any, where: str | Path, error: type[GAPONetError], hint: str = "", more: bool = False
+) -> T:
+    """Plain data (dict, list, text, numbers) as a value of type `kind`.
+
+    Args:
+        kind: Dataclass, TypedDict, or anything else that pydantic knows, such as dict[str, float].
+        data: As parsed from JSON or TOML.
+        where: File, for the error.
+        error: What is raised.
+        hint: What to do about it, for the error.
+        more: Keep fields that a TypedDict does not name, instead of refusing them.
+
+    Raises:
+        error: With file, field, what is wrong with it, and the hint.
+    """
+    from pydantic_core import PydanticSerializationError, to_json
+
+    try:
+        text = to_json(data, inf_nan_mode="constants")
+    except (PydanticSerializationError, ValueError) as found:  # half a surrogate pair, lists without end
+        raise error(_line(where, str(found), hint)) from None
+    return parse_json(kind, text, where, error, hint, more)
+
+
+def parse_json(
+    kind: type[T], text: bytes | str, where: str | Path, error: type[GAPONetError], hint: str = "", more: bool = False
+) -> T:
+    """JSON text as a value of type `kind`; arguments and error as of `validated`."""
+    from pydantic import ValidationError
+
+    try:
+        value = _checker(cast("Any", kind)).validate_json(text, extra="allow" if more else "forbid")
+    except ValidationError as found:
+        raise error(_line(where, _first(found), hint)) from None
+    except GAPONetError as found:  # a dataclass's own rule
+        raise error(_line(where, str(found), hint)) from None
+    if value is None:
+        raise error(_line(where, "holds nothing (null)", hint))
+    return value
+
+
+def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
+    """A JSON file as a value of type `kind`; arguments and error as of `validated`."""
+    return parse_json(kind, _content(path, error, hint), path, error, hint, more)
+
+
+def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
+    """A TOML file as a value of type `kind`; arguments and error as of `validated`."""
+    try:
+        table = tomllib.loads(_content(path, error, hint).decode())
+    except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
+        raise error(_line(path, f"not valid TOML: {found}", hint)) from None
+    return validated(kind, table, path, error, hint, more)
+
+
+def _content(path: Path, error: type[GAPONetError], hint: str) -> bytes:
+    if not path.is_file():
+        raise error(_line(path, "is missing, or not a file", hint))
+    if path.stat().st_size > LARGEST:
+        raise error(_line(path, f"has more than {LARGEST >> 20} MiB", hint))
+    return path.read_bytes()
+
+
+@functools.cache
+def _checker(kind: Any) -> Any:
+    from pydantic import ConfigDict, TypeAdapter
+
+    # pydantic takes no configuration for a dataclass itself, but hands that of a union on to its members.
+    return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
+
+
+def _first(found: Any) -> str:
+    """The first complaint: field, reason, what was there; and how many more there are."""
+    errors = found.errors(include_url=False)
+    kind, given, field = errors[0]["type"], errors[0]["input"], ".".join(map(str, errors[0]["loc"]))
+    reason = errors[0]["msg"].removeprefix("Input ").rstrip(".")
+    if kind == "missing":
+        reason = "is missing"
+    elif kind in ("unexpected_keyword_argument", "extra_forbidden"):
+        reason = "is not a known field"
+    elif kind != "json_invalid" and not isinstance(given, (dict, list)):
+        reason += f", not {given!r:.60}"
+    rest = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return f"{field}{': ' if field else ''}{reason}{rest}"
+
+
+def _line(where: str | Path, reason: str, hint: str) -> str:
+    return f"{where}: {reason}" + (f"; {hint}" if hint else "")
