@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot import RobotSpec
 
 SERVO_NAMES = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 PERIOD_US = 20060.0  # the public SO-101 logs' own
 
 
@@ -54,6 +56,44 @@ def write_so101(folder: Path, rows: int = 60, lag: int = 2) -> Path:
     ctrl = wave(rows, 6)
     ctrl[:, 5] = 0.5 + ctrl[:, 5]
     return write_sage(folder, ctrl, late(ctrl, lag))
+
+
+def stock(
+    folder: Path,
+    values: list[np.ndarray] | None = None,
+    rows: tuple[int, ...] = (40, 50),
+    names: tuple[str, ...] = SO101,
+    **changes: object,
+) -> Path:
+    """A set as lerobot 0.4 writes it for an SO-101: degrees, gripper 0..100, no metadata of ours."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    values = [np.full((n, 6), 10.0) + np.arange(n)[:, None] / 10 for n in rows] if values is None else values
+    feature = {"dtype": "float32", "shape": [6], "names": [f"{n}.pos" for n in names]}
+    video = {"dtype": "video", "shape": [48, 64, 3], "names": None}
+    info = {"codebase_version": "v3.0", "fps": 30, "robot_type": "so101_follower",
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "features": {"action": feature, "observation.state": feature, "observation.images.top": video}}  # fmt: skip
+    for place in ("meta/episodes/chunk-000", "data/chunk-000"):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info | changes))
+    pq.write_table(pa.table({"task_index": [0], "__index_level_0__": ["Pick up!"]}), folder / "meta" / "tasks.parquet")
+    starts = np.cumsum([0, *map(len, values)])
+    pq.write_table(pa.Table.from_pylist([
+        {"episode_index": i, "tasks": ["Pick up!"], "length": len(v), "data/chunk_index": 0, "data/file_index": 0,
+         "dataset_from_index": int(starts[i]), "dataset_to_index": int(starts[i + 1]), "stats/action/min": [0.0]}
+        for i, v in enumerate(values)
+    ]), folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet")  # fmt: skip
+    frame = np.concatenate([np.arange(len(v)) for v in values])
+    flat = np.concatenate(values).astype(np.float32)
+    pq.write_table(pa.table({
+        "action": pa.FixedSizeListArray.from_arrays(pa.array(flat.ravel()), 6),
+        "observation.state": pa.array((flat - 1).tolist(), pa.list_(pa.float32())),
+        "timestamp": (frame / 30).astype(np.float32), "frame_index": frame,
+        "episode_index": np.repeat(np.arange(len(values)), [len(v) for v in values]),
+    }), folder / "data" / "chunk-000" / "file-000.parquet")  # fmt: skip
+    return folder
 
 
 def table_text(columns: dict[str, np.ndarray]) -> str:

@@ -1,0 +1,50 @@
+"""make fuzz: mutants over all targets, their counts as JSON; exit code 1 where one failed.
+
+python -m fuzzing [--mutants 100000] [--only sage,table] [--seed 0] [--workers 2] [--keep FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+
+from fuzzing import readers
+from fuzzing.harness import Failure, run
+
+GROUPS = {"readers": readers.TARGETS}
+
+
+def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:
+    """(what, how often, the first of them), most frequent first."""
+    what = lambda f: f"{f.target} {f.kind}: {f.text.strip().splitlines()[-1][:150] if f.text.strip() else ''}"  # noqa: E731
+    counts = Counter(map(what, failures))
+    first = {what(f): f for f in reversed(failures)}
+    return [(text, count, first[text]) for text, count in counts.most_common()]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mutants", type=int, default=100_000)
+    parser.add_argument("--only", help="targets or groups of them, with commas between")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder for the files of failed mutants")
+    args = parser.parse_args()
+    known = {t.name: (t,) for group in GROUPS.values() for t in group} | GROUPS
+    chosen = [t for name in (args.only or ",".join(GROUPS)).split(",") for t in known[name]]
+    shown = lambda done, failed: print(f"\r{done} done, {failed} failed", end="", file=sys.stderr)  # noqa: E731
+    result = run(chosen, args.mutants, args.seed, args.workers, args.keep, shown if sys.stderr.isatty() else None)
+    for text, count, failure in grouped(result.failures):
+        print(f"{count:6d}  {text}\n        first: {failure.target} {failure.number}", file=sys.stderr)
+    kinds = Counter(f.kind for f in result.failures)
+    numbers = asdict(result) | {"failures": dict(kinds), "per_second": round(result.mutants / result.seconds, 1)}
+    print(json.dumps(numbers | {"seed": args.seed}))
+    return 1 if result.failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
