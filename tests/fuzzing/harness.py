@@ -42,7 +42,7 @@ class Target:
     Attributes:
         name: Of the target.
         files: Its untouched files: path below the folder → content. Called once in each worker.
-        use: Reads the files in the first folder and writes below the second only; raises AbsurdError for what it stored.
+        use: Reads the files in the first folder and writes below the second only; raises AbsurdError.
         share: How many of a run's mutants it gets, beside the others' shares.
         only: Names of files (suffix) that are changed, all by default; the others stand beside them.
     """
