@@ -175,3 +175,32 @@ def test_a_source_named_by_a_dot_is_known_by_its_folder(so101, tmp_path, monkeyp
     monkeypatch.chdir(write_so101(tmp_path / "wave"))
     meta = import_logs(".", so101, "lab", 0.0, tmp_path / "data").entries[0].meta
     assert (meta.motion, meta.source) == ("wave", "wave")
+
+
+def test_gains_are_the_robots_unless_said_by_joint_or_for_all(logs, so101, tmp_path):
+    first = import_logs(logs, so101, "lab", 0.0, tmp_path / "a").entries[0].meta
+    assert first.kp == tuple(so101.kp)
+    said = import_logs(logs, so101, "lab", 0.0, tmp_path / "b", kp=("elbow_flex=9", "gripper=4"), kd=("0.1",))
+    meta = Dataset(tmp_path / "b").entries[0].meta
+    assert meta == said.entries[0].meta
+    assert dict(zip(so101.joint_names, meta.kp, strict=True)) == (
+        dict(zip(so101.joint_names, so101.kp, strict=True)) | {"elbow_flex": 9.0, "gripper": 4.0}
+    )
+    assert meta.kd == (0.1,) * 6
+
+
+@pytest.mark.parametrize("words", [("stiff",), ("-1",), ("5", "6"), ("elbow_flex=nan",)])
+def test_gains_that_make_no_sense_are_refused(logs, so101, tmp_path, words):
+    with pytest.raises(UsageError, match=r"--kp .*: give one number"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "data", kp=words)
+
+
+def test_a_journal_from_before_gains_were_kept_still_opens(logs, so101, tmp_path):
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    journal = tmp_path / "data" / "sequences.jsonl"
+    old = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in old:
+        del line["meta"]["kp"], line["meta"]["kd"]
+    journal.write_text("".join(json.dumps(line) + "\n" for line in old))
+    data = Dataset(tmp_path / "data")
+    assert data.read(data.entries[0]).meta.kp is None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gaponet.data.log import Channel, Log
-from gaponet.data.sequence import Sequence, SequenceMeta, to_sequence
-from gaponet.errors import LogError
+from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains, to_sequence
+from gaponet.errors import LogError, UsageError
 
 META = SequenceMeta("arm", "a", "wave", 0.0, source="wave.csv")
 ROWS = 50
@@ -100,3 +100,28 @@ def test_identity_is_samples_unit_and_payload_and_not_the_name(arm):
     assert replace(sequence, meta=replace(META, motion="other")).content_hash() == sequence.content_hash()
     assert replace(sequence, meta=replace(META, payload_mass=1.0)).content_hash() != sequence.content_hash()
     assert replace(sequence, qpos=sequence.qpos + 0.001).content_hash() != sequence.content_hash()
+
+
+def test_a_recording_keeps_the_gains_that_are_stated_else_the_logs_else_the_robots(arm):
+    time = 0.02 * np.arange(ROWS)
+    robots = to_sequence(arm_log(time), arm, META).meta
+    assert (robots.kp, robots.notes["gains"]) == (tuple(arm.kp), "of robot.toml")
+    logged = to_sequence(arm_log(time, kp=[7, 8], kd=[0.5, 0.6]), arm, META).meta
+    assert (logged.kp, logged.kd, logged.notes["gains"]) == ((7.0, 8.0), (0.5, 0.6), "as recorded")
+    stated = to_sequence(arm_log(time, kp=[7, 8]), arm, replace(META, kp=(9.0, 9.5))).meta
+    assert (stated.kp, stated.notes["gains"]) == ((9.0, 9.5), "kp as stated, kd of robot.toml")
+
+
+@pytest.mark.parametrize("kp", [(1.0, np.nan), (1.0, -2.0), ("stiff", 2.0), (1.0,)])
+def test_gains_that_are_none_are_refused(arm, kp):
+    with pytest.raises(LogError, match="kp"):
+        to_sequence(arm_log(0.02 * np.arange(ROWS)), arm, replace(META, kp=kp))
+
+
+def test_recordings_with_different_gains_are_not_taken_together_unless_they_do_not_say():
+    soft, stiff = replace(META, kp=(5.0, 5.0)), replace(META, kp=(5.0, 10.0), motion="stiff", unit_id="b")
+    joints = ("shoulder", "elbow")
+    require_same_gains([soft, META, replace(soft, kp=(5.0, 5.0 * (1 + 1e-5)))], joints, joints)
+    require_same_gains([soft, stiff], joints, ("shoulder",))
+    with pytest.raises(UsageError, match=r"kp of elbow was 5 in 'wave' of a and 10 in 'stiff' of b.*--mixed-gains"):
+        require_same_gains([soft, stiff], joints, joints)

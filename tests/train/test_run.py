@@ -235,3 +235,12 @@ def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot,
     model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
     assert model.card["gain"] == 0.5
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
+
+
+def test_recordings_with_two_stiffnesses_are_mixed_only_when_told(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for i, sequence in enumerate(recordings(robot, 8)):
+        data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0 + i % 2, 5.0), kd=(0.1, 0.1))))
+    with pytest.raises(UsageError, match="--mixed-gains"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)

@@ -24,6 +24,7 @@ def calibrate(
     seconds: float = 30.0,
     payload_mass: Literal["recorded", "unknown"] = "recorded",
     robot: str | None = None,
+    mixed_gains: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Fit what is particular to one unit (gain, damping, friction, zero offset, delay of each joint) from a short log.
@@ -39,8 +40,10 @@ def calibrate(
         seconds: How much of the recordings to use, in windows of 8 s.
         payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same.
         robot: Robot name or folder, if not the package's robot of the dataset.
+        mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
+    from gaponet.data.sequence import require_same_gains
     from gaponet.errors import UsageError
     from gaponet.eval.evaluate import corrected_robot
     from gaponet.model import calibration
@@ -58,6 +61,8 @@ def calibrate(
     if not motions:
         trained = set(model.card["motions"]["train"])
         entries = [e for e in entries if e.meta.motion in trained] or entries
+    if not mixed_gains:
+        require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
     with bar("calibrating") as update:
         found = calibration.calibrate(
             model, simulator, data.sequences(entries), seconds, payload_mass == "unknown",

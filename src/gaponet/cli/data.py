@@ -40,6 +40,8 @@ def import_logs(
     position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,
     level: Literal["joint", "upper_body", "whole_body"] | None = None,
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Read logs of a robot into a dataset: all of them or none.
@@ -58,6 +60,9 @@ def import_logs(
             older −100..100.
         time_unit: Tables: unit of time.
         level: What the motions move; whole_body by default.
+        kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
+            states, else the robot's.
+        kd: The same of the damping gain, N·m·s/rad.
         json: One JSON object on stdout.
     """
     from gaponet.data.importer import import_logs as run
@@ -68,7 +73,7 @@ def import_logs(
         report = run(
             src, spec, unit_id, payload_mass, out, payload_side, level, format,
             gravity=gravity_of(spec), simulator=model_hash(spec), progress=update, joint_map=joint_map(map),
-            columns=columns, position_unit=position_unit, time_unit=time_unit,
+            columns=columns, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
         )  # fmt: skip
     show_import(Out(json), report, spec)
 

@@ -31,6 +31,7 @@ def identify(
     robot: str | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
+    mixed_gains: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
@@ -44,8 +45,10 @@ def identify(
         robot: Robot name or folder to start from, if not the package's robot of the dataset.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in gaponet train.
+        mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
+    from gaponet.data.sequence import require_same_gains
     from gaponet.data.split import split_entries
     from gaponet.errors import UsageError
     from gaponet.robot_folder import save_robot
@@ -61,6 +64,8 @@ def identify(
     if strangers:
         raise UsageError(f"--units {min(strangers)}: not in {dataset}")
     parts = split_entries(data, tuple(sorted(others | set(holdout_units))))
+    if not mixed_gains:
+        require_same_gains((e.meta for e in parts["train"]), data.joint_names, spec.operated)
     with bar("identifying") as update:
         found = fit(
             data.sequences(parts["train"]), spec, windows,

@@ -45,6 +45,8 @@ class _Given:
     payload_mass: float | None
     payload_side: str | None
     level: str | None
+    kp: tuple[float, ...] | None
+    kd: tuple[float, ...] | None
 
 
 def import_logs(
@@ -59,6 +61,8 @@ def import_logs(
     gravity: Gravity | None = None,
     simulator: str = "",
     progress: Progress | None = None,
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
     **options: Any,
 ) -> ImportReport:
     """Import every recording under a path; a bad one refuses them all, and nothing is written.
@@ -75,6 +79,8 @@ def import_logs(
         gravity: Nominal model's gravity, to fit offsets with (data.offsets); default: no offsets.
         simulator: Hash of that model, recorded beside the offsets.
         progress: Called after each recording.
+        kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some of the joints;
+            default what the format states, else the robot's.
         options: Of data.formats.read_logs: joint_map, columns, position_unit, time_unit.
 
     Raises:
@@ -88,7 +94,9 @@ def import_logs(
         read_offsets(known)  # a damaged one is said before anything is read
     if payload_side is not None:
         _require_side(robot, payload_side)
-    given = _Given(unit_id, payload_mass, payload_side, level)
+    given = _Given(
+        unit_id, payload_mass, payload_side, level, _given_gains("kp", kp, robot), _given_gains("kd", kd, robot)
+    )
     dataset, entries = _import(src, out, robot, given, known, fmt, progress, options)
     units = dict.fromkeys(e.meta.unit_id for e in entries)
     offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
@@ -157,7 +165,7 @@ def _sequences(
 
 def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha256: str) -> SequenceMeta:
     """The user's word, completed by the format's; contradictions and gaps are refused."""
-    stated = log.meta.get("stated", {})
+    stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items() if v is not None}
     for name, value in vars(given).items():
         flag = "--" + name.replace("_", "-")
         if value is not None and stated.get(name, value) != value:
@@ -168,6 +176,23 @@ def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha
     fields: dict[str, Any] = {"source": _relative(log.source, src), "source_sha256": sha256, "repetition": UNSTATED}
     fields |= {name: value for name, value in vars(given).items() if value is not None}
     return SequenceMeta(**(fields | {"robot": robot.name, "motion": motion} | stated))
+
+
+def _given_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[float, ...] | None:
+    """("17.8",) or ("elbow=9", …) → gains of all joints, (n); joints that are not named keep the robot's."""
+    if not words:
+        return None
+    gains = np.array(getattr(robot.nominal or robot, name), float)
+    for word in words:
+        joint, equals, number = word.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = np.nan
+        if not (np.isfinite(value) and value >= 0) or (not equals and len(words) > 1):
+            raise UsageError(f"--{name} {word}: give one number ≥ 0 for all joints, or JOINT=NUMBER for some")
+        gains[robot.index([joint]) if equals else slice(None)] = value
+    return tuple(gains.tolist())
 
 
 def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -10,19 +11,24 @@ import numpy as np
 
 from gaponet.data.log import Log
 from gaponet.data.signals import differentiate, resample_linear, resample_zoh
-from gaponet.errors import LogError
+from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
+GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 LEVELS = ("joint", "upper_body", "whole_body")
 
 
 @dataclass(frozen=True)
 class SequenceMeta:
-    """Where a sequence comes from. payload_mass has no default: an empty hand is said as 0.0."""
+    """Where a sequence comes from. payload_mass has no default: an empty hand is said as 0.0.
+
+    kp, kd are the gains that the robot had while it was recorded, (n) N·m/rad and N·m·s/rad in the order of the
+    sequence's joints; None in recordings made before gains were kept.
+    """
 
     robot: str
     unit_id: str
@@ -36,8 +42,13 @@ class SequenceMeta:
     source_sha256: str = ""
     recorded_at: str = ""
     notes: dict[str, Any] = field(default_factory=dict)
+    kp: tuple[float, ...] | None = None
+    kd: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        for name in ("kp", "kd"):
+            if (gains := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _gains(name, gains, self.source or self.motion))
         if not (np.isfinite(self.payload_mass) and 0 <= self.payload_mass <= 100):
             raise LogError(f"{self.source or self.motion}: payload_mass is {self.payload_mass}; give kg, 0 when empty")
         if not self.unit_id or not self.motion:
@@ -85,6 +96,9 @@ class Sequence:
                 raise LogError(f"{self.meta.source}: {name} has shape {value.shape} or holds NaN; expected {shape}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+        for name in ("kp", "kd"):
+            if len(getattr(self.meta, name) or self.joint_names) != shape[1]:
+                raise LogError(f"{self.meta.source}: {name} must hold one number for each of the {shape[1]} joints")
 
     def __len__(self) -> int:
         return len(self.ctrl)
@@ -114,6 +128,48 @@ class Sequence:
         return digest.hexdigest()
 
 
+def _recorded(name: str, log: Log, robot: RobotSpec) -> tuple[float, ...]:
+    """Gains (n) that a log says, the robot's own for joints of which it says none."""
+    gains = np.array(getattr(robot.nominal or robot, name), float)
+    if name in log.meta:
+        gains[robot.index(log.joint_names)] = _gains(name, log.meta[name], log.source)
+    return tuple(gains.tolist())
+
+
+def _gains(name: str, values: Any, where: str) -> tuple[float, ...]:
+    try:
+        gains = tuple(float(x) for x in values)
+    except (TypeError, ValueError):
+        gains = (np.nan,)
+    if not all(np.isfinite(x) and x >= 0 for x in gains):
+        raise LogError(f"{where}: {name} is {values!r}; give one finite number ≥ 0 for each joint")
+    return gains
+
+
+def require_same_gains(metas: Iterable[SequenceMeta], joint_names: tuple[str, ...], joints: tuple[str, ...]) -> None:
+    """Refuse recordings made with different gains: what one robot does with two stiffnesses is not one gap.
+
+    Args:
+        metas: Of the recordings that are taken together; one that does not say its gains (an old journal) may be any.
+        joint_names: Of their gains, (n).
+        joints: Those that matter.
+
+    Raises:
+        UsageError: Naming joint, gains and one recording of each.
+    """
+    first: dict[tuple[str, str], tuple[float, SequenceMeta]] = {}
+    for meta in metas:
+        for name in ("kp", "kd"):
+            for joint, gain in zip(joint_names, getattr(meta, name) or (), strict=False):
+                other, where = first.setdefault((name, joint), (gain, meta))
+                if joint in joints and abs(gain - other) > GAIN_TOLERANCE * max(other, gain):
+                    raise UsageError(
+                        f"{name} of {joint} was {other:g} in '{where.motion}' of {where.unit_id} and {gain:g} in "
+                        f"'{meta.motion}' of {meta.unit_id}: take recordings with one set of gains, or add "
+                        "--mixed-gains to take them together"
+                    )
+
+
 def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None = None) -> Sequence:
     """Put a log on a uniform grid.
 
@@ -124,7 +180,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
 
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
-        robot: Decides the joint order.
+        robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
         meta: Where it comes from.
         dt: Force this period, s.
     """
@@ -157,7 +213,10 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
         notes["held_at_home"] = absent
     if converted:
         notes["converted_from"] = converted
-    return Sequence(SequenceMeta(**(asdict(meta) | {"notes": notes})), robot.joint_names, dt, **arrays)
+    gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
+    said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else "of robot.toml" for n in gains]
+    notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
+    return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
 
 
 def _resample(log: Log, dt: float) -> dict[str, Array]:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError
 from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
@@ -50,6 +51,18 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         "model": asdict(config),
         "simulator_only": config.asks_simulator,  # a bound to compare with, not for a robot
     } | facts
+
+
+def recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, list[float] | None]:
+    """kp, kd of the operated joints while the training data were recorded; None where unknown or not one and the same.
+
+    They are the real robot's; "kp" and "kd" of the card are the simulator's.
+    """
+    found: dict[str, list[float] | None] = {}
+    for name in ("kp", "kd"):
+        gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
+        found[name] = list(gains.pop()) if len(gains) == 1 else None
+    return found
 
 
 def write_card(path: Path, card: dict[str, Any]) -> None:

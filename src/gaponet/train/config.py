@@ -98,6 +98,8 @@ class TrainConfig:
     """Only recordings at these control rates, Hz, in all parts; all by default."""
     train_share: float = 1.0
     """Share of the training motions that is used; validation and test motions stay the same."""
+    mixed_gains: bool = False
+    """Take recordings made with different kp or kd together."""
     validate_every: int = 10
     """PPO updates between free runs over the validation motions."""
     threads: int = 0

@@ -25,10 +25,11 @@ import numpy as np
 import torch
 
 from gaponet.data.pair import require_disjoint
+from gaponet.data.sequence import require_same_gains
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset, dataset_hash, write_text
 from gaponet.errors import ModelError, UsageError
-from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.artifact import GapModel, make_card, recorded_gains
 from gaponet.model.baselines import delay_offset
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
@@ -102,6 +103,9 @@ class Trainer:
             show,
         )
         self.parts = split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
+        if not config.mixed_gains:
+            together = (e.meta for part in self.parts.values() for e in part)
+            require_same_gains(together, dataset.joint_names, robot.operated)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
@@ -345,6 +349,7 @@ class Trainer:
             dt=sorted({s.dt for s in seen}),
             payload_seen=sorted({s.meta.payload_mass for s in seen}),
             units=sorted({s.meta.unit_id for s in seen}),
+            recorded=recorded_gains([s.meta for s in seen], self.robot),
             virtual=any(s.meta.virtual for s in seen),
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),

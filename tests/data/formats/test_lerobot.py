@@ -27,6 +27,7 @@ def dataset(arm, tmp_path):
         sequence = arm_sequence(arm, ctrl, late(ctrl, 2), f"m{i}", payload, unit=unit, notes=notes, **extra)
         fields = {"repetition": 2 * i, "virtual": True, "level": "joint", "source": "somewhere/else.csv",
                   "source_sha256": "ab" * 32, "recorded_at": "2026-01-02T03:04:05Z"}  # fmt: skip
+        fields |= {"kp": (5.0 + i, 6.0), "kd": (0.1, 0.2)} if i else {}  # the first from before gains were kept
         data.append(replace(sequence, meta=replace(sequence.meta, **fields)))
     data.state(licence="CC0-1.0")
     return data

@@ -44,6 +44,7 @@ FEATURES = {
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
 OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
 STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
+LATER = ("kp", "kd")  # not in the first exports
 
 
 @dataclass(frozen=True)
@@ -125,9 +126,10 @@ def _open(file: Path) -> Set:
     if not episodes:
         raise LogError(f"{root}: meta/episodes lists no episode; download or export it again")
     episodes.sort(key=lambda e: e["episode_index"])
-    if ours.is_file() and not set(STATED) <= set(episodes[0]):
+    absent = set(STATED) - set(LATER) - set(episodes[0])
+    if ours.is_file() and absent:
         raise LogError(
-            f"{root}/meta/episodes: '{min(set(STATED) - set(episodes[0]))}' is missing, which {ours.name} promises; "
+            f"{root}/meta/episodes: '{min(absent)}' is missing, which {ours.name} promises; "
             f"restore it, or delete {ours.name} to read the set as a stock one"
         )
     return Set(root, info, episodes, json.loads(ours.read_text(encoding="utf-8")) if ours.is_file() else {})
@@ -235,7 +237,8 @@ class _Frames:
             "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
         }
         if self.part.ours:
-            meta["stated"] = {name: row[name] for name in STATED} | {"notes": json.loads(row["notes"])}
+            meta["stated"] = {name: row[name] for name in STATED if name in row}
+            meta["stated"] |= {name: json.loads(row[name]) for name in ("notes", *LATER) if name in row}
             meta["dataset"] = self.part.ours.get("dataset", {})
         return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.data.formats.lerobot import FEATURES, OURS, STATED, VERSION
+from gaponet.data.formats.lerobot import FEATURES, LATER, OURS, STATED, VERSION
 from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
@@ -190,7 +190,8 @@ class _Set:
             "dataset_from_index": self.frames, "dataset_to_index": self.frames + entry.rows,
             "data/chunk_index": self.chunk, "data/file_index": self.file,
             "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-            **{name: meta[name] for name in STATED}, "notes": json.dumps(meta["notes"], ensure_ascii=False),
+            **{name: meta[name] for name in STATED},
+            **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *LATER)},
             "content_hash": entry.hash,
             **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
         })  # fmt: skip
