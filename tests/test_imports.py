@@ -10,8 +10,8 @@ import gaponet
 SOURCE = Path(gaponet.__file__).parent
 # A module may import from its own rank or a lower one.
 RANKS = [
-    {"errors", "packaged", "robot", "robot_folder", "structure"}, {"data"}, {"gap"}, {"sim"}, {"motion"},
-    {"virtual", "collect"}, {"model"}, {"train", "deploy"}, {"eval"}, {"experiment"}, {"cli"},
+    {"errors", "packaged", "robot", "robot_folder", "robot_table", "structure", "mjcf"}, {"data"}, {"gap"}, {"sim"},
+    {"motion"}, {"virtual", "collect"}, {"model"}, {"train", "deploy"}, {"eval"}, {"experiment"}, {"cli"},
 ]  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 

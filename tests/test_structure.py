@@ -27,7 +27,7 @@ BAD = [
     ({"gain": float("nan")}, "gain: should be a finite number, not nan"),
     ({"gain": 10**400}, "gain: should be a finite number"),
     ({"gain": 101}, "gain: should be less than or equal to 100, not 101"),
-    ({"gain": 1, "names": ["pan", 3]}, "names.1: should be a valid string, not 3"),
+    ({"gain": 1, "names": ["pan", 3]}, "names[1]: should be a valid string, not 3"),
     ({"gain": 1, "names": ["\ud800"]}, "surrogates"),
     ({"gain": 1, "gian": 1}, "gian: is not a known field"),
     ({}, "gain: is missing"),

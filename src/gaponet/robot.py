@@ -10,14 +10,16 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import functools
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gaponet.errors import JointMismatchError, RobotError
+
+if TYPE_CHECKING:
+    from gaponet.robot_table import RobotTable
 
 Array = np.ndarray
 
@@ -126,10 +128,13 @@ class RobotSpec:
     @functools.cached_property
     def qpos_range(self) -> Array:
         """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited. Compiles the MJCF on first use."""
-        import mujoco
+        from gaponet.mjcf import compiled, read_mjcf
 
-        model = mujoco.MjModel.from_xml_path(str(self.mjcf))
-        joints = [model.joint(name) for name in self.joint_names]
+        model = compiled(read_mjcf(self.mjcf), self.mjcf)
+        try:
+            joints = [model.joint(name) for name in self.joint_names]
+        except KeyError as error:
+            raise RobotError(f"{self.mjcf}: lacks a joint of robot.toml: {error.args[0]}") from None
         limited = np.array([model.jnt_limited[j.id] for j in joints], bool)[:, None]
         return np.where(limited, [j.range for j in joints], [-np.inf, np.inf])
 
@@ -182,70 +187,51 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     Raises:
         RobotError: With the folder, the field and what to write there.
     """
-    folder = BUILTIN / str(name_or_path)
-    if not (folder / "robot.toml").is_file():
-        folder = Path(name_or_path)
+    from gaponet.robot_table import RobotTable
+    from gaponet.structure import read_toml
+
+    folder = Path(name_or_path)
+    if str(name_or_path) in available():
+        folder = BUILTIN / name_or_path
     toml = folder / "robot.toml"
     if not toml.is_file():
         raise RobotError(
             f"no robot '{name_or_path}': in the package are {', '.join(available())}; "
             "or give a folder that holds robot.toml and robot.xml"
         )
-    try:
-        table = tomllib.loads(toml.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RobotError(f"{toml}: not valid TOML: {error}") from None
-    mjcf = folder / table.get("mjcf", "robot.xml")
+    table = read_toml(RobotTable, toml, RobotError, "docs/new-robot.md lists the fields")
+    mjcf = folder / table.mjcf
     if not mjcf.is_file():
         raise RobotError(f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."')
-    return _spec(table, toml, mjcf)
+    try:
+        return _spec(table, mjcf)
+    except RobotError as error:
+        raise RobotError(f"{toml}: {error}") from None
 
 
-def _spec(table: dict[str, Any], toml: Path, mjcf: Path) -> RobotSpec:
-    joints = table.get("joint")
-    if not isinstance(joints, list) or not joints:
-        raise RobotError(f"{toml}: no [[joint]] entries; add one for each actuated joint, in the log's order")
-    for i, joint in enumerate(joints):
-        _require(joint, {"name": str, "kp": (int, float), "effort_limit": (int, float)}, f"{toml}: [[joint]] {i + 1}")
-        if joint.get("log_unit", "rad") not in LOG_UNITS:
-            raise RobotError(f"{toml}: joint {joint['name']}: log_unit must be one of {', '.join(LOG_UNITS)}")
-    _require(table, {"name": str, "dt": (int, float), "timestep": (int, float)}, str(toml))
-    mounts = table.get("payload_mount", [])
-    for i, mount in enumerate(mounts):
-        _require(mount, {"side": str, "body": str, "pos": list}, f"{toml}: [[payload_mount]] {i + 1}")
-    names = tuple(j["name"] for j in joints)
+def _spec(table: RobotTable, mjcf: Path) -> RobotSpec:
+    joints = table.joint
     robot = RobotSpec(
-        name=table["name"],
-        description=table.get("description", table["name"]),
+        name=table.name,
+        description=table.description or table.name,
         mjcf=mjcf,
-        joint_names=names,
-        operated=tuple(j["name"] for j in joints if j.get("operated", True)),
-        kp=np.array([j["kp"] for j in joints]),
-        kd=np.array([j.get("kd", 0.0) for j in joints]),
-        effort_limit=np.array([j["effort_limit"] for j in joints]),
-        qpos_home=np.array([j.get("home", 0.0) for j in joints]),
-        log_units=tuple(j.get("log_unit", "rad") for j in joints),
-        aliases={alias: j["name"] for j in joints for alias in j.get("aliases", [])},
-        payload_mounts=tuple(PayloadMount(m["side"], m["body"], tuple(m["pos"])) for m in mounts),
-        dt=float(table["dt"]),
-        timestep=float(table["timestep"]),
+        joint_names=tuple(j.name for j in joints),
+        operated=tuple(j.name for j in joints if j.operated),
+        kp=np.array([j.kp for j in joints]),
+        kd=np.array([j.kd for j in joints]),
+        effort_limit=np.array([j.effort_limit for j in joints]),
+        qpos_home=np.array([j.home for j in joints]),
+        log_units=tuple(j.log_unit for j in joints),
+        aliases={alias: j.name for j in joints for alias in j.aliases},
+        payload_mounts=tuple(PayloadMount(m.side, m.body, m.pos) for m in table.payload_mount),
+        dt=table.dt,
+        timestep=table.timestep,
     )
-    return robot.with_servos(_servos(table["identified"], robot, toml)) if "identified" in table else robot
-
-
-def _servos(table: Any, robot: RobotSpec, toml: Path) -> dict[str, dict[str, float]]:
-    for joint, values in table.items():
-        if joint not in robot.joint_names or not isinstance(values, dict):
-            raise RobotError(f"{toml}: [identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
-        for name, value in values.items():
-            if name not in ("kp", *IDENTIFIED) or not isinstance(value, (int, float)):
-                raise RobotError(f"{toml}: [identified.{joint}] {name} = {value}: give kp, {', '.join(IDENTIFIED)}")
-    return table
-
-
-def _require(table: dict[str, Any], fields: dict[str, Any], where: str) -> None:
-    for name, kind in fields.items():
-        if name not in table:
-            raise RobotError(f"{where}: '{name}' is missing; add {name} = ...")
-        if not isinstance(table[name], kind):
-            raise RobotError(f"{where}: '{name}' has the wrong type ({type(table[name]).__name__})")
+    for joint in table.identified:
+        if joint not in robot.joint_names:
+            raise RobotError(f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
+    servos = {
+        joint: {name: value for name, value in vars(servo).items() if value is not None}
+        for joint, servo in table.identified.items()
+    }
+    return robot.with_servos(servos) if servos else robot

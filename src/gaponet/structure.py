@@ -2,7 +2,7 @@
 
 A structure is a dataclass or a TypedDict; ranges and sizes stand in its annotations (annotated_types: Ge, Interval,
 Len). pydantic checks it, strictly: no text for a number, no NaN or infinity unless the annotation says so, no unknown
-field unless the caller keeps those. Nothing outside this module asks pydantic, which is imported when a file is read.
+field unless the caller keeps those. Nothing outside this module asks pydantic.
 """
 
 from __future__ import annotations
@@ -10,12 +10,26 @@ from __future__ import annotations
 import functools
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast
+
+from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
+from pydantic_core import PydanticSerializationError, to_json
 
 from gaponet.errors import GAPONetError
 
 T = TypeVar("T")
 LARGEST = 64 << 20  # bytes of a document that is read at once; ours have kilobytes
+
+
+def _name(text: str) -> str:
+    if not 0 < len(text) <= 200 or "/" in text or "\\" in text or text in (".", "..") or min(text) < " ":
+        raise ValueError("should be 1 to 200 letters, none of them a slash, a backslash or a control character")
+    return text
+
+
+Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
+# Whatever JSON can say in finite numbers.
+Json = TypeAliasType("Json", "dict[str, Json] | list[Json] | str | bool | int | float | None")
 
 
 def validated(
@@ -34,8 +48,6 @@ def validated(
     Raises:
         error: With file, field, what is wrong with it, and the hint.
     """
-    from pydantic_core import PydanticSerializationError, to_json
-
     try:
         text = to_json(data, inf_nan_mode="constants")
     except (PydanticSerializationError, ValueError) as found:  # half a surrogate pair, lists without end
@@ -47,8 +59,6 @@ def parse_json(
     kind: type[T], text: bytes | str, where: str | Path, error: type[GAPONetError], hint: str = "", more: bool = False
 ) -> T:
     """JSON text as a value of type `kind`; arguments and error as of `validated`."""
-    from pydantic import ValidationError
-
     try:
         value = _checker(cast("Any", kind)).validate_json(text, extra="allow" if more else "forbid")
     except ValidationError as found:
@@ -84,8 +94,6 @@ def _content(path: Path, error: type[GAPONetError], hint: str) -> bytes:
 
 @functools.cache
 def _checker(kind: Any) -> Any:
-    from pydantic import ConfigDict, TypeAdapter
-
     # pydantic takes no configuration for a dataclass itself, but hands that of a union on to its members.
     return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
 
@@ -93,8 +101,9 @@ def _checker(kind: Any) -> Any:
 def _first(found: Any) -> str:
     """The first complaint: field, reason, what was there; and how many more there are."""
     errors = found.errors(include_url=False)
-    kind, given, field = errors[0]["type"], errors[0]["input"], ".".join(map(str, errors[0]["loc"]))
-    reason = errors[0]["msg"].removeprefix("Input ").rstrip(".")
+    kind, given = errors[0]["type"], errors[0]["input"]
+    field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]).lstrip(".")
+    reason = errors[0]["msg"].removeprefix("Input ").removeprefix("Value error, ").rstrip(".")
     if kind == "missing":
         reason = "is missing"
     elif kind in ("unexpected_keyword_argument", "extra_forbidden"):

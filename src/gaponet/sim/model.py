@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from gaponet.errors import RobotError, UsageError
+from gaponet.mjcf import compiled, read_mjcf
 from gaponet.robot import IDENTIFIED, RobotSpec
 
 # Joint friction loss is a soft constraint in MuJoCo: with the default parameters a joint that should stick creeps.
@@ -47,10 +48,7 @@ def build_model(
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
     spec = build_spec(robot, payload_mass, payload_side, dt, locked, bare)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise RobotError(f"{robot.mjcf}: does not compile: {' '.join(str(error).split())}") from None
+    model = compiled(spec, robot.mjcf)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         known = {j.name for j in spec.joints}
         raise RobotError(
@@ -133,10 +131,7 @@ def model_hash(robot: RobotSpec) -> str:
 
 
 def _read(robot: RobotSpec) -> mujoco.MjSpec:
-    try:
-        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-    except ValueError as error:
-        raise RobotError(f"{robot.mjcf}: not valid MJCF: {' '.join(str(error).split())}") from None
+    spec = read_mjcf(robot.mjcf)
     known = {j.name for j in spec.joints}
     missing = [name for name in robot.joint_names if name not in known]
     if missing:

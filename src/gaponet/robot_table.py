@@ -1,0 +1,64 @@
+"""The fields of a robot.toml, with their ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from annotated_types import Interval, Len
+
+from gaponet.structure import Name
+
+Gain = Annotated[float, Interval(ge=0, le=1e6)]
+Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]
+Metres = Annotated[float, Interval(ge=-100, le=100)]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One [[joint]]."""
+
+    name: Name
+    kp: Gain  # N·m/rad
+    effort_limit: Gain  # N·m
+    kd: Gain = 0.0  # N·m·s/rad
+    home: Angle = 0.0  # rad
+    operated: bool = True
+    log_unit: Literal["rad", "deg", "fraction"] = "rad"
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Mount:
+    """One [[payload_mount]]; pos in the frame of the body."""
+
+    side: Name
+    body: str
+    pos: tuple[Metres, Metres, Metres]
+
+
+@dataclass(frozen=True)
+class Servo:
+    """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
+
+    kp: Gain | None = None
+    damping: Gain | None = None
+    armature: Gain | None = None
+    frictionloss: Gain | None = None
+    delay: Annotated[float, Interval(ge=0, le=1)] | None = None  # s
+    offset: Angle | None = None  # rad
+
+
+@dataclass(frozen=True)
+class RobotTable:
+    """The whole file."""
+
+    name: Name
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
+    timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
+    joint: Annotated[tuple[Joint, ...], Len(1, 500)]
+    payload_mount: Annotated[tuple[Mount, ...], Len(0, 20)] = ()
+    identified: dict[str, Servo] = field(default_factory=dict)
+    description: str = ""
+    license: str = ""
+    mjcf: str = "robot.xml"
