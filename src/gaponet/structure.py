@@ -8,6 +8,7 @@ field unless the caller keeps those. Nothing outside this module asks pydantic.
 from __future__ import annotations
 
 import functools
+import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
@@ -27,9 +28,16 @@ def _name(text: str) -> str:
     return text
 
 
+def _all_finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("holds a number that is not finite")
+    for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _all_finite(part)
+    return value
+
+
 Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
-# Whatever JSON can say in finite numbers.
-Json = TypeAliasType("Json", "dict[str, Json] | list[Json] | str | bool | int | float | None")
+Json = Annotated[Any, AfterValidator(_all_finite)]  # whatever JSON can say in finite numbers
 
 
 def validated(
