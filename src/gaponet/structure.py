@@ -15,6 +15,7 @@ from typing import Annotated, Any, TypeVar, cast
 
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import PydanticSerializationError, to_json
+from typing_extensions import TypedDict
 
 from gaponet.errors import GAPONetError
 
@@ -34,6 +35,10 @@ def _all_finite(value: Any) -> Any:
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _all_finite(part)
     return value
+
+
+class _Format(TypedDict):
+    format: int
 
 
 Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
@@ -81,6 +86,14 @@ def parse_json(
 def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
     """A JSON file as a value of type `kind`; arguments and error as of `validated`."""
     return parse_json(kind, _content(path, error, hint), path, error, hint, more)
+
+
+def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = "") -> T:
+    """A JSON file whose "format" is a whole number up to `newest`, with fields that `kind` does not name kept."""
+    table = read_json(_Format, path, error, hint, more=True)
+    if table["format"] > newest:
+        raise error(f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); upgrade gaponet")
+    return validated(kind, table, path, error, hint, more=True)
 
 
 def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:

@@ -125,7 +125,7 @@ def test_a_file_with_other_rows_than_the_journal_says_is_named(dataset, arm):
     entry = other.append(shorter)
     file = dataset.path / "sequences" / f"{dataset.entries[0].id}.parquet"
     file.write_bytes((other.path / "sequences" / f"{entry.id}.parquet").read_bytes())
-    with pytest.raises(DatasetError, match=r"'up-a-0kg-r0-.*' holds 40 rows, the journal says 50; restore the file"):
+    with pytest.raises(DatasetError, match=r"up-a-0kg-r0-.*: holds 40 rows, the journal says 50; restore the file"):
         make_card(dataset)
 
 

@@ -62,7 +62,7 @@ def test_a_line_cut_short_by_a_crash_is_dropped(dataset, sequence):
 def test_a_damaged_line_is_named(dataset):
     journal = dataset.path / "sequences.jsonl"
     journal.write_text("{}\n" + journal.read_text())
-    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: damaged line .* delete it and import that log again"):
+    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: id: is missing .* delete the line and import"):
         Dataset(dataset.path)
 
 
@@ -169,3 +169,71 @@ def test_a_line_separator_in_a_name_does_not_break_the_journal(dataset, sequence
     odd = replace(sequence, meta=replace(sequence.meta, payload_mass=1.0, source="a\u2028b.csv"))
     dataset.append(odd)
     assert Dataset(dataset.path).entries[1].meta.source == "a\u2028b.csv"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("id", "../../../etc/passwd", "id: should be 1 to 200 letters"),
+        ("id", 7, "id: should be a valid string"),
+        ("dt", float("nan"), "dt: should be a finite number"),
+        ("dt", 0, "dt: should be greater than"),
+        ("rows", 10**12, "rows: should be less than"),
+        ("channels", ["qpos", "qvel", "qacc"], "channels: .* lack ctrl"),
+        ("channels", ["ctrl", "qpos", "qvel", "__class__"], "channels: .* unknown one"),
+        ("meta", {"robot": "arm"}, r"meta\.unit_id: is missing"),
+        ("meta", [], "meta: should be an object"),
+        ("findings", {"delay_s": {"a": float("inf")}}, "findings.* not finite"),
+    ],
+)
+def test_a_journal_line_of_another_kind_is_refused_with_line_and_field(dataset, field, value, said):
+    journal = dataset.path / "sequences.jsonl"
+    journal.write_text(json.dumps(json.loads(journal.read_text()) | {field: value}) + "\n")
+    with pytest.raises(DatasetError, match=rf"sequences\.jsonl:1: {said}"):
+        Dataset(dataset.path)
+
+
+def test_a_line_listed_twice_is_refused(dataset):
+    journal = dataset.path / "sequences.jsonl"
+    journal.write_text(2 * journal.read_text())
+    with pytest.raises(DatasetError, match=r"sequences\.jsonl:2: .* is listed already; delete this line"):
+        Dataset(dataset.path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "null", "[]", '{"format": 1}', '{"format": "1"}', '{"format": 1, "robot": "../x"}']
+)
+def test_a_damaged_header_is_named(dataset, text):
+    (dataset.path / "dataset.json").write_text(text)
+    with pytest.raises(DatasetError, match=r"dataset\.json: .* restore the file"):
+        Dataset(dataset.path)
+
+
+def columns(rows=40, n=2, kind="float32", value=0.0):
+    array = pa.array(np.full(rows * n, value), kind)
+    column = pa.FixedSizeListArray.from_arrays(array, n)
+    return pa.table(dict.fromkeys(("ctrl", "qpos", "qvel", "tau"), column))
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        (columns(rows=39), "holds 39 rows, the journal says 40"),
+        (columns(n=3), "ctrl is fixed_size_list"),
+        (columns(kind="float64"), "ctrl is fixed_size_list"),
+        (columns(value=np.nan), "ctrl lacks values or holds NaN"),
+        (columns(value=None), "ctrl lacks values or holds NaN"),
+        (pa.table({"ctrl": [1.0] * 40}), "ctrl is double"),
+        (pa.table({"time": [1.0] * 40}), "not a readable Parquet file"),
+    ],
+)
+def test_samples_of_another_shape_are_refused(dataset, table, said):
+    pq.write_table(table, next((dataset.path / "sequences").iterdir()))
+    with pytest.raises(DatasetError, match=rf"\.parquet: .*{said}.*restore the file"):
+        dataset.read(dataset.entries[0])
+
+
+def test_a_name_that_is_not_text_is_written_and_read_with_its_bytes_escaped(dataset, sequence):
+    odd = replace(sequence.meta, motion="\udcff\n[red]", source="/logs/\udcff.csv", payload_mass=2.0)
+    dataset.append(replace(sequence, meta=odd))
+    assert Dataset(dataset.path).entries[1].meta.motion == "\\udcff\n[red]"

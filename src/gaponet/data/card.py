@@ -47,11 +47,6 @@ def make_card(dataset: Dataset, progress: Progress | None = None) -> dict[str, A
         repetitions = Repetitions()
         for entry in group:
             sequence = dataset.read(entry)
-            if len(sequence) != entry.rows:
-                raise DatasetError(
-                    f"{dataset.path}: '{entry.id}' holds {len(sequence)} rows, the journal says {entry.rows}; restore "
-                    "the file or import the log again"
-                )
             for name in entry.channels:
                 ranges[name].add(getattr(sequence, name))
             repetitions.add(sequence)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from gaponet.data.log import Log
 from gaponet.data.signals import differentiate, resample_linear, resample_zoh
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
+from gaponet.structure import Json
 
 Array = np.ndarray
 
@@ -36,16 +38,19 @@ class SequenceMeta:
     payload_mass: float  # kg, in each hand named by payload_side
     payload_side: str = "both"
     level: str = "whole_body"
-    repetition: int = 0
+    repetition: Annotated[int, Interval(ge=0, le=10**9)] = 0
     virtual: bool = False
     source: str = ""
     source_sha256: str = ""
     recorded_at: str = ""
-    notes: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, Json] = field(default_factory=dict)
     kp: tuple[float, ...] | None = None
     kd: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        for name in ("unit_id", "motion", "source"):  # a file's name need not be text
+            text = getattr(self, name).encode("utf-8", "backslashreplace").decode()
+            object.__setattr__(self, name, text)
         for name in ("kp", "kd"):
             if (gains := getattr(self, name)) is not None:
                 object.__setattr__(self, name, _gains(name, gains, self.source or self.motion))

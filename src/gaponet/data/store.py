@@ -22,33 +22,51 @@ import re
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
 
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
 from gaponet.robot import RobotSpec
+from gaponet.structure import Json, Name, parse_json, read_format
 
 FORMAT = 1
+MEND = "restore the file or import the log again"
 UNITS = {
     "time": "s", "ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "qacc": "rad/s²", "tau": "N·m", "tau_eq": "N·m",
     "temperature": "°C",
 }  # fmt: skip
 
 
+class Header(TypedDict):
+    """dataset.json, and whatever else stands there."""
+
+    format: int
+    robot: Name
+    joint_names: Annotated[tuple[Name, ...], Len(1, 500)]
+    licence: NotRequired[str]
+    source: NotRequired[str]
+
+
 @dataclass(frozen=True)
 class Entry:
     """One line of the journal."""
 
-    id: str
-    hash: str
-    dt: float
-    rows: int
+    id: Name
+    hash: Annotated[str, Len(8, 64)]
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]
+    rows: Annotated[int, Interval(ge=1, le=10**8)]
     channels: tuple[str, ...]
     meta: SequenceMeta
-    findings: dict[str, Any]
+    findings: dict[str, Json]
+
+    def __post_init__(self) -> None:
+        if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
+            raise DatasetError(f"channels: {self.channels!r:.80} lack ctrl, qpos or qvel, or hold an unknown one")
 
 
 class Dataset:
@@ -64,17 +82,9 @@ class Dataset:
         header = self.path / "dataset.json"
         if not header.is_file():
             raise DatasetError(f"{self.path}: not a dataset (no dataset.json); make one with gaponet import or collect")
-        try:
-            self.header = json.loads(header.read_text(encoding="utf-8"))
-            self.robot_name: str = self.header["robot"]
-            self.joint_names = tuple(self.header["joint_names"])
-            version = int(self.header["format"])
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-            raise DatasetError(f"{header}: damaged ({error}); restore it or import again") from None
-        if version > FORMAT:
-            raise DatasetError(
-                f"{header}: format {version} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
-            )
+        self.header: dict[str, Any] = {**read_format(Header, header, FORMAT, DatasetError, MEND)}
+        self.robot_name: str = self.header["robot"]
+        self.joint_names: tuple[str, ...] = self.header["joint_names"]
         self.entries = list(self._journal())
         self._by_hash = {entry.hash: entry for entry in self.entries}
 
@@ -174,12 +184,11 @@ class Dataset:
 
     def read(self, entry: Entry) -> Sequence:
         """Load one sequence."""
-        arrays = _read_table(self._file(entry), entry.channels, len(self.joint_names))
-        return Sequence(entry.meta, self.joint_names, entry.dt, **arrays)
+        return Sequence(entry.meta, self.joint_names, entry.dt, **self.channels(entry, entry.channels))
 
     def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Some channels of one sequence, (T, n) float32 each, without reading the others."""
-        return _read_table(self._file(entry), names, len(self.joint_names))
+        return _read_table(self._file(entry), names, entry.rows, len(self.joint_names))
 
     def sequences(self, entries: list[Entry] | None = None) -> list[Sequence]:
         """Load sequences, all by default."""
@@ -203,7 +212,7 @@ class Dataset:
             raise DatasetError(
                 f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet pair {self.path}"
             )
-        arrays = _read_table(file, ("qpos", "qvel", "tau"), len(self.joint_names))
+        arrays = _read_table(file, ("qpos", "qvel", "tau"), entry.rows, len(self.joint_names))
         return Pair(self.read(entry), Twin(model, **arrays))
 
     def _file(self, entry: Entry) -> Path:
@@ -222,17 +231,14 @@ class Dataset:
             write_text(journal, complete)
         folder = self.path / "sequences"
         files = set(os.listdir(folder)) if folder.is_dir() else set()  # one look, not one for each of 11,000 files
+        listed: dict[str, str] = {}  # content hash → id
         for number, line in enumerate(complete.split("\n")[:-1], 1):
-            try:
-                fields = json.loads(line)
-                meta = SequenceMeta(**fields.pop("meta"))
-                entry = Entry(**(fields | {"meta": meta, "channels": tuple(fields["channels"])}))
-            except (json.JSONDecodeError, KeyError, TypeError) as error:
-                raise DatasetError(
-                    f"{journal}:{number}: damaged line ({error}); delete it and import that log again"
-                ) from None
+            where = f"{journal}:{number}"
+            entry = parse_json(Entry, line, where, DatasetError, "delete the line and import that log again")
             if f"{entry.id}.parquet" not in files:
-                raise DatasetError(f"{journal}:{number}: {self._file(entry)} is missing; restore it or delete the line")
+                raise DatasetError(f"{where}: {self._file(entry)} is missing; restore it or delete the line")
+            if listed.setdefault(entry.hash, entry.id) != entry.id or len(listed) < number:
+                raise DatasetError(f"{where}: '{listed[entry.hash]}' is listed already; delete this line")
             yield entry
 
 
@@ -274,16 +280,24 @@ def _write_table(path: Path, columns: dict[str, np.ndarray], dt: float, joint_na
         temporary.unlink(missing_ok=True)
 
 
-def _read_table(path: Path, columns: tuple[str, ...], n: int) -> dict[str, np.ndarray]:
+def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict[str, np.ndarray]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        table = pq.ParquetFile(path).read(columns=list(columns), use_threads=False)
-        arrays = {c: table.column(c).combine_chunks() for c in columns}
-    except (pa.ArrowInvalid, pa.ArrowException, OSError, KeyError) as error:
+        file = pq.ParquetFile(path)
+        if file.metadata.num_rows != rows:
+            raise DatasetError(f"{path}: holds {file.metadata.num_rows} rows, the journal says {rows}; {MEND}")
+        for column in columns:
+            kind = file.schema_arrow.field(column).type
+            if not pa.types.is_fixed_size_list(kind) or kind.list_size != n or kind.value_type != pa.float32():
+                raise DatasetError(f"{path}: {column} is {kind}, not {n} joints' float32; {MEND}")
+        table = file.read(columns=list(columns), use_threads=False)
+        arrays = {c: table.column(c).combine_chunks().flatten().to_numpy(zero_copy_only=False) for c in columns}
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
-        raise DatasetError(
-            f"{path}: not a readable Parquet file ({reason}); restore it or import the log again"
-        ) from None
-    return {c: a.flatten().to_numpy(zero_copy_only=False).reshape(-1, n) for c, a in arrays.items()}
+        raise DatasetError(f"{path}: not a readable Parquet file ({reason}); {MEND}") from None
+    for column, values in arrays.items():
+        if len(values) != rows * n or not np.isfinite(values).all():
+            raise DatasetError(f"{path}: {column} lacks values or holds NaN; {MEND}")
+    return {c: values.reshape(rows, n) for c, values in arrays.items()}
