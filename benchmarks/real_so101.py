@@ -20,7 +20,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 
-from gaponet.eval.figures import COLOURS, NAMES, STYLE, figure
+from gaponet.plot.methods import COLOURS, NAMES
+from gaponet.plot.style import STYLE, figure
 
 TITLES = NAMES | {"identified": "identification", "identified_gaponet": "identification + GAPONet"}
 FILL = COLOURS | {"identified_gaponet": "#7d0a1d"}

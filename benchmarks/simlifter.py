@@ -33,10 +33,10 @@ from gaponet.collect import collect, load_recipe
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval import dataset_figures
-from gaponet.eval.draw_dataset import save
 from gaponet.gap import metrics, runs
 from gaponet.motion.library import Library
 from gaponet.motion.recipe import takes
+from gaponet.plot.style import save
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay

@@ -32,10 +32,11 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
-from gaponet.eval.figures import COLOURS, NAMES, STYLE, figure
 from gaponet.gap import metrics, runs
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
+from gaponet.plot.methods import COLOURS, NAMES
+from gaponet.plot.style import STYLE, figure
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
 

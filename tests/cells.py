@@ -6,7 +6,7 @@ import os
 import time
 
 from gaponet.errors import ModelError
-from gaponet.train.compare import Cell, Tell
+from gaponet.study.pool import Cell, Tell
 
 
 def note_threads(cell: Cell, tell: Tell) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.experiment.trained import Trained
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.backends import Bound
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
+from gaponet.study.played.trained import Trained
 from gaponet.virtual.physics import Physics, neutral
 
 WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)

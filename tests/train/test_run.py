@@ -13,8 +13,8 @@ from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
-from gaponet.eval.figures import COLOURS, NAMES
 from gaponet.model.config import ModelConfig
+from gaponet.plot.methods import COLOURS, NAMES
 from gaponet.train.budget import Budget
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
 from gaponet.train.run import Trainer

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+import json as js
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +10,8 @@ import tyro
 
 from gaponet.cli.out import Out
 from gaponet.robot import load_robot
+
+CALLS = 3000  # of each runtime, with latency
 
 
 def bench(
@@ -24,9 +26,8 @@ def bench(
     """Measure speed; of control steps per second the ratio is what counts, machines differ.
 
     Args:
-        what: sim: replay and environment. train: inference, collection, update, PPO as a whole, and stable-baselines3
-            where it is installed (pip install 'gaponet[bench]'). latency: one correction of a trained model, on each
-            runtime. aligned: the aligned simulator against the nominal one.
+        what: sim: replay and environment. train: inference, collection, update, and PPO as a whole. latency: one
+            correction of a trained model, on each runtime. aligned: the aligned simulator against the nominal one.
         run: Of gaponet train, for latency and aligned.
         robot: Robot name or folder.
         model: Network that is trained.
@@ -34,41 +35,67 @@ def bench(
         rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
         json: One JSON object on stdout.
     """
-    from gaponet.cli.aligned import aligned
-    from gaponet.cli.latency import latency
-
     out = Out(json)
     if what == "latency":
-        return latency(run, out)
-    if what == "aligned":
-        return aligned(run, out, num_envs or 512, rounds or 15)
+        _latency(run, out)
+    elif what == "aligned":
+        _aligned(run, out, num_envs or 512, rounds or 15)
+    elif what == "sim":
+        _sim(robot, out, num_envs or 512, rounds or 15)
+    else:
+        _train(robot, model, out, num_envs or 1024, rounds or 3)
+
+
+def _sim(robot: str, out: Out, num_envs: int, rounds: int) -> None:
+    from gaponet.bench.training import bench_sim
+
+    speeds = bench_sim(load_robot(robot), num_envs, rounds=rounds)
+    _print_speeds(out, f"{robot}, {num_envs} simulations", speeds)
+    out.result({"robot": robot, "num_envs": num_envs, "results": speeds})
+
+
+def _train(robot: str, model: Literal["gaponet", "mlp"], out: Out, num_envs: int, rounds: int) -> None:
+    from gaponet.bench.training import bench_train
     from gaponet.model.config import ModelConfig
-    from gaponet.train.bench import bench_sim, bench_train
     from gaponet.train.config import TrainConfig
 
-    spec = load_robot(robot)
-    columns = ["", "control steps/s", "of bare"]
-    if what == "sim":
-        speeds = bench_sim(spec, num_envs or 512, rounds=rounds or 15)
-        out.table(f"{robot}, {num_envs or 512} simulations", columns, _rows(speeds))
-        out.result({"robot": robot, "num_envs": num_envs or 512, "results": speeds})
-        return
-    baseline = all(find_spec(name) for name in ("stable_baselines3", "gymnasium"))
-    result = bench_train(spec, TrainConfig(ModelConfig(model)), num_envs or 1024, rounds or 3, baseline)
-    out.table(f"{robot}, {model}, {num_envs or 1024} simulations", columns, _rows(result["speeds"]))
+    result = bench_train(load_robot(robot), TrainConfig(ModelConfig(model)), num_envs, rounds)
+    _print_speeds(out, f"{robot}, {model}, {num_envs} simulations", result["speeds"])
     out.say(
         f"PPO: {result['share_of_expected'] * 100:.0f} % of the {result['expected']:,.0f} control steps/s that physics,"
         f" inference and update allow; peak memory {result['peak_memory_bytes'] / 2**30:.2f} GiB"
     )
-    if baseline:
-        out.say("PPO's speed over theirs, same environment, network and epochs; mini-batches of 64, their default, "
-                "unless said otherwise:")  # fmt: skip
-        for name, ratio in result["times_sb3"].items():
-            out.say(f"  {ratio:.1f} x {name}")
-    if not baseline:
-        out.say("stable-baselines3 is not installed and left out; pip install 'gaponet[bench]' to compare with it")
-    out.result({"robot": robot, "model": model, "num_envs": num_envs or 1024} | result)
+    out.result({"robot": robot, "model": model, "num_envs": num_envs} | result)
 
 
-def _rows(speeds: dict[str, dict[str, float]]) -> list[list[str]]:
-    return [[name, f"{r['control_steps_per_s']:,.0f}", f"{r['ratio'] * 100:.0f} %"] for name, r in speeds.items()]
+def _latency(run: Path, out: Out) -> None:
+    from gaponet.bench.latency import in_own_process
+
+    result = js.loads(in_own_process(run, CALLS, threads=1))
+    out.table(
+        f"One step of {run}, {result['joints']} joints, one thread", ["", "p50 µs", "p99 µs", "max µs"],
+        [[name, *(f"{t[q]:.0f}" for q in ("p50", "p99", "max"))] for name, t in result["microseconds"].items()],
+    )  # fmt: skip
+    for name, speed in result["deltas_per_s"].items():
+        out.say(f"{result['batch']} robots at once, {name}: {speed:,.0f} deltas/s")
+    out.result(result)
+
+
+def _aligned(run: Path, out: Out, num_envs: int, rounds: int) -> None:
+    from gaponet.bench.aligned import bench_aligned
+    from gaponet.model.artifact import GapModel
+
+    model = GapModel.load(run, threads=0)
+    kept = run / "robot"
+    robot = load_robot(kept if (kept / "robot.toml").is_file() else model.card["robot"])
+    speed = bench_aligned(robot, model, num_envs, rounds=rounds)
+    ratio = speed["aligned"] / speed["nominal"]
+    out.table(f"{robot.name}, {num_envs} simulations", ["", "control steps/s", "of nominal"], [
+        [name, f"{v:,.0f}", f"{v / speed['nominal'] * 100:.0f} %"] for name, v in speed.items()
+    ])  # fmt: skip
+    out.result({"run": str(run), "num_envs": num_envs, "control_steps_per_s": speed, "ratio": ratio})
+
+
+def _print_speeds(out: Out, title: str, speeds: dict[str, dict[str, float]]) -> None:
+    rows = [[name, f"{r['control_steps_per_s']:,.0f}", f"{r['ratio'] * 100:.0f} %"] for name, r in speeds.items()]
+    out.table(title, ["", "control steps/s", "of bare"], rows)

@@ -34,7 +34,7 @@ def budget(
     from gaponet.data.store import write_text
     from gaponet.eval.budget import gap_budget
     from gaponet.eval.budget_figure import waterfall
-    from gaponet.eval.draw_dataset import save
+    from gaponet.plot.style import save
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)

@@ -18,7 +18,7 @@ from gaponet.train.config import TrainConfig
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
-    from gaponet.train.compare import Cell
+    from gaponet.study.pool import Cell
 
 
 def compare(
@@ -53,10 +53,10 @@ def compare(
         config: Of all models.
         json: One JSON object on stdout.
     """
-    from gaponet.eval.compare import group_table, heading, main_table, write
-    from gaponet.experiment.cells import train_and_evaluate
-    from gaponet.train.compare import plan, run_cells
-    from gaponet.train.variant import Variant, parse_variant
+    from gaponet.study.compare import group_table, heading, main_table, write
+    from gaponet.study.pool import plan, run_cells
+    from gaponet.study.study import train_and_evaluate
+    from gaponet.study.variant import Variant, parse_variant
 
     screen = Out(json)
     if seeds < 1 or workers < 0:
@@ -127,7 +127,7 @@ def _collect(
     out: Path,
 ) -> dict[str, Any]:  # fmt: skip
     """All cells and the baselines as one result; baselines are simulated once and kept."""
-    from gaponet.eval.compare import comparison, evaluate_baselines
+    from gaponet.study.compare import comparison, evaluate_baselines
 
     run, nominal = cells[0].folder, spec.nominal or spec
     with bar("baselines") as update:

@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.experiment_unit import delivery, tracking
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, show_result
 from gaponet.cli.progress import bars
-from gaponet.experiment.options import Options
+from gaponet.study.options import Options
 
 if TYPE_CHECKING:
-    from gaponet.experiment.cells import Show, Study
-    from gaponet.experiment.result import Result
-    from gaponet.train.compare import Cell
+    from gaponet.study.pool import Cell
+    from gaponet.study.result import Result
+    from gaponet.study.study import Show, Study
 
 Shared = Annotated[Options, tyro.conf.arg(name="")]
 MODELS = ("gaponet", "mlp:mlp_match=on")
@@ -43,7 +42,7 @@ def ablation(
             0, or --quick, leaves them out.
         options: Shared.
     """
-    import gaponet.experiment.ablation as table2
+    import gaponet.study.ablation as table2
 
     study = _study(dataset, out, options, holdout_units)
     bound_seeds = 0 if options.quick else bound_seeds
@@ -69,7 +68,7 @@ def payload(
         holdout_units: Units never trained on.
         options: Shared.
     """
-    import gaponet.experiment.payload as experiment
+    import gaponet.study.payload as experiment
 
     study = _study(dataset, out, options, holdout_units)
     asked = experiment.questions(study.data, between, beyond)
@@ -90,7 +89,7 @@ def unit(
         models: As of gaponet compare.
         options: Shared.
     """
-    import gaponet.experiment.unit as experiment
+    import gaponet.study.unit as experiment
 
     study = _study(dataset, out, options)
     cells = [c for fold in experiment.cells(study, models).values() for c in fold]
@@ -115,7 +114,7 @@ def data(
         holdout_units: Units never trained on.
         options: Shared.
     """
-    import gaponet.experiment.data as experiment
+    import gaponet.study.data as experiment
 
     study = _study(dataset, out, options, holdout_units)
     cells = experiment.cells(study, models, shares)
@@ -138,7 +137,7 @@ def experiment(action: Annotated[tyro.conf.OmitSubcommandPrefixes[Action], tyro.
 
 
 def _study(dataset: Path, out: Path, options: Options, holdout_units: tuple[str, ...] = ()) -> Study:
-    from gaponet.experiment.cells import Study
+    from gaponet.study.study import Study
 
     opened, robot = open_dataset(dataset, options.robot)
     return Study.of(opened, robot, out, options, holdout_units)
@@ -146,7 +145,7 @@ def _study(dataset: Path, out: Path, options: Options, holdout_units: tuple[str,
 
 def _carry_out(study: Study, cells: list[Cell], run: Callable[[Show], Result], options: Options) -> None:
     """Say how long it will take, train, and show what came out."""
-    from gaponet.experiment.cells import expected_s
+    from gaponet.study.study import expected_s
 
     screen, todo = Out(options.json), sum(not c.done for c in cells)
     words = len({c.variant.name for c in cells})
@@ -159,21 +158,3 @@ def _carry_out(study: Study, cells: list[Cell], run: Callable[[Show], Result], o
     with bars("trainings", todo) as show:
         result = run(show)
     show_result(result, study.out, screen)
-
-
-def show_result(result: Result, out: Path, screen: Out) -> None:
-    """Write the result's files and print its tables and sentences."""
-    from gaponet.experiment.result import write
-
-    files = write(result, out)
-    screen.say(f"[bold]{escape(result.title)}[/]\n{escape(result.virtual)}")
-    for table in result.tables:
-        screen.table("", [escape(c) for c in table.columns], [[escape(c) for c in row] for row in table.texts()])
-        if table.caption:
-            screen.say(escape(table.caption))
-    for sentence in result.sentences:
-        screen.say(f"- {escape(sentence)}")
-    screen.say(f"written: {', '.join(escape(str(f)) for f in files)}")
-    screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
-                   "sentences": list(result.sentences), "files": [str(f) for f in files],
-                   "tables": {t.name: {"columns": t.columns, "rows": t.records()} for t in result.tables}})  # fmt: skip

@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gaponet.cli.inputs import open_dataset
+from gaponet.cli.out import Out, show_result
 from gaponet.cli.progress import bar
 from gaponet.errors import UsageError
-from gaponet.experiment.options import Options
+from gaponet.study.options import Options
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
-    from gaponet.experiment.play import Progress
-    from gaponet.experiment.result import Result
-    from gaponet.experiment.trained import Trained
     from gaponet.robot import RobotSpec
+    from gaponet.study.played.play import Progress
+    from gaponet.study.played.trained import Trained
+    from gaponet.study.result import Result
 
 Shared = Annotated[Options, tyro.conf.arg(name="")]
 MODELS = ("gaponet", "mlp:mlp_match=on")
@@ -64,14 +65,14 @@ def tracking(
         played: The unit.
         options: Shared.
     """
-    from gaponet.experiment.tracking import track
-    from gaponet.experiment.tracking_result import result
-    from gaponet.experiment.unseen import from_files, generated, require_unseen
+    from gaponet.study.played.tracking import track
+    from gaponet.study.played.tracking_result import result
+    from gaponet.study.played.unseen import from_files, generated, require_unseen
 
     began = time.monotonic()
     data, robot, trained, out = _models(dataset, out, runs, played, options)
     if not any(e.meta.virtual for e in data.entries):
-        _show(_recorded(data, robot, trained, began), out, options)
+        show_result(_recorded(data, robot, trained, began), out, Out(options.json))
         return
     who, physics, payloads = _unit(robot, trained, played, options.quick)
     known = any(who in t.model.card["units"] for t in trained)
@@ -86,7 +87,9 @@ def tracking(
     more: dict[str, Any] = {"unit_trained_on": True} if known else {}
     more |= {"motions": len(made), "compensator": _compensator("tracking")}
     told = _facts(data, trained, who, played, payloads, began, more)
-    _show(result(robot, scores, example, made, _label(data, options.quick and not runs), told), out, options)
+    show_result(
+        result(robot, scores, example, made, _label(data, options.quick and not runs), told), out, Out(options.json)
+    )
 
 
 def delivery(
@@ -116,9 +119,9 @@ def delivery(
         played: The unit.
         options: Shared.
     """
-    from gaponet.experiment.delivery import deliver
-    from gaponet.experiment.delivery_result import result
-    from gaponet.experiment.goals import STOPS, Planner
+    from gaponet.study.played.delivery import deliver
+    from gaponet.study.played.delivery_result import result
+    from gaponet.study.played.goals import STOPS, Planner
 
     began = time.monotonic()
     if hold < 1.5:
@@ -139,14 +142,14 @@ def delivery(
     more = {"goals_per_payload": len(plans) * STOPS * len(planner.arms), "hold_s": hold,
             "compensator": _compensator("delivery")}  # fmt: skip
     told = _facts(data, trained, who, played, payloads, began, more)
-    _show(result(found, costs, example, _label(data, options.quick and not runs), told), out, options)
+    show_result(result(found, costs, example, _label(data, options.quick and not runs), told), out, Out(options.json))
 
 
 def _models(
     dataset: Path, out: Path, runs: tuple[Path, ...], played: Played, options: Options
 ) -> tuple[Dataset, RobotSpec, list[Trained], Path]:
     """Dataset, nominal robot, models (those given, else trained now or found in OUT/cells), folder of the results."""
-    from gaponet.experiment.trained import load_trained
+    from gaponet.study.played.trained import load_trained
 
     data, robot = open_dataset(dataset, options.robot)
     data.require_robot(robot)
@@ -168,7 +171,7 @@ def _train(
         Dataset trained on, runs, folder of the results.
     """
     from gaponet.cli.progress import bars
-    from gaponet.experiment.cells import Study, train_all
+    from gaponet.study.study import Study, train_all
 
     units = sorted({e.meta.unit_id for e in data.entries})
     holdout = (played.unit or units[-1],) if len(units) > 1 and (not played.unit or played.unit in units) else ()
@@ -197,9 +200,9 @@ def _unit(robot: RobotSpec, trained: list[Trained], played: Played, quick: bool)
 def _recorded(data: Dataset, robot: RobotSpec, trained: list[Trained], began: float) -> Result:
     """Alignment with real recordings: the test motions of the runs."""
     from gaponet.eval.evaluate import choose
-    from gaponet.experiment.result import facts, label
-    from gaponet.experiment.tracking import align
-    from gaponet.experiment.tracking_result import result
+    from gaponet.study.played.tracking import align
+    from gaponet.study.played.tracking_result import result
+    from gaponet.study.result import facts, label
 
     entries, unseen = choose(trained[0].run, data, ())
     sequences = data.sequences(entries)
@@ -216,7 +219,7 @@ def _facts(
     data: Dataset, trained: list[Trained], who: str, played: Played, payloads: tuple[float, ...], began: float,
     more: dict[str, Any],
 ) -> dict[str, Any]:  # fmt: skip
-    from gaponet.experiment.result import facts
+    from gaponet.study.result import facts
 
     return facts(
         data, sorted({t.seed for t in trained}), unit=who, fleet=Path(played.fleet).stem,
@@ -236,7 +239,7 @@ def _by_method(update: Callable[[float, float, str], None]) -> Progress:
 
 def _compensator(name: str) -> str:
     """Its settings, in words."""
-    from gaponet.experiment import delivery, tracking
+    from gaponet.study.played import delivery, tracking
 
     config = tracking.PLANNED if name == "tracking" else delivery.HOLD
     return ", ".join(f"{k} {v}" for k, v in asdict(config).items())
@@ -244,14 +247,7 @@ def _compensator(name: str) -> str:
 
 def _label(data: Dataset, trained_here: bool) -> str:
     """Whose numbers; those of a rehearsal's models mean nothing."""
-    from gaponet.experiment.result import label
+    from gaponet.study.result import label
 
     note = " REHEARSAL: hardly any training, on a slice of the dataset; these numbers mean nothing."
     return label(data) + (note if trained_here else "")
-
-
-def _show(found: Result, out: Path, options: Options) -> None:
-    from gaponet.cli.experiment import show_result
-    from gaponet.cli.out import Out
-
-    show_result(found, out, Out(options.json))

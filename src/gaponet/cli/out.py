@@ -5,12 +5,17 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gaponet.data.json_file import finite
+
+if TYPE_CHECKING:
+    from gaponet.study.result import Result
 
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
@@ -46,3 +51,21 @@ class Out:
         if self.as_json:
             json.dump(finite(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
+
+
+def show_result(result: Result, out: Path, screen: Out) -> None:
+    """Write the result's files and print its tables and sentences."""
+    from gaponet.study.page import write
+
+    files = write(result, out)
+    screen.say(f"[bold]{escape(result.title)}[/]\n{escape(result.virtual)}")
+    for table in result.tables:
+        screen.table("", [escape(c) for c in table.columns], [[escape(c) for c in row] for row in table.texts()])
+        if table.caption:
+            screen.say(escape(table.caption))
+    for sentence in result.sentences:
+        screen.say(f"- {escape(sentence)}")
+    screen.say(f"written: {', '.join(escape(str(f)) for f in files)}")
+    screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
+                   "sentences": list(result.sentences), "files": [str(f) for f in files],
+                   "tables": {t.name: {"columns": t.columns, "rows": t.records()} for t in result.tables}})  # fmt: skip

@@ -13,8 +13,8 @@ from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 
 if TYPE_CHECKING:
-    from gaponet.eval.film import Clip
-    from gaponet.eval.scene import Scene
+    from gaponet.view.film import Clip
+    from gaponet.view.scene import Scene
 
 
 def view(
@@ -70,15 +70,15 @@ def view(
         json: One JSON object on stdout.
     """
     from gaponet.errors import UsageError
-    from gaponet.eval.gl import choose_gl, has_display
+    from gaponet.view.gl import choose_gl, has_display
 
     if render is None and not web and not has_display():
         raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
     if render is not None:
         choose_gl()
-    from gaponet.eval.film import Clip, require_kind
-    from gaponet.eval.scene import Scene, View
-    from gaponet.eval.side_by_side import pick, side_by_side
+    from gaponet.view.film import Clip, require_kind
+    from gaponet.view.scene import Scene, View
+    from gaponet.view.side_by_side import pick, side_by_side
 
     if render is not None:
         require_kind(render)
@@ -104,11 +104,11 @@ def view(
         size = render.stat().st_size
         out.say(f"{render}: {pictures} picture{'s' * (pictures > 1)}, {size / 1e6:.2f} MB")
     elif web:
-        from gaponet.eval.web import serve
+        from gaponet.view.web import serve
 
         serve(scene, clip, port, magnify, out.say)
     else:
-        from gaponet.eval.watch import watch
+        from gaponet.view.watch import watch
 
         watch(scene, clip, magnify)
     out.result({
@@ -119,8 +119,8 @@ def view(
 
 
 def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool) -> int:
-    from gaponet.eval.film import write
-    from gaponet.eval.picture import Camera
+    from gaponet.view.film import write
+    from gaponet.view.picture import Camera
 
     span = (clip.start, clip.stop)
     with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:

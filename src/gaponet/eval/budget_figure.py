@@ -6,7 +6,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from gaponet.eval.figures import COLOURS, figure, styled
+from gaponet.plot.methods import COLOURS
+from gaponet.plot.style import figure, styled
 
 TITLES = {
     "nominal": "nominal", "delay": "delay", "offset": "offset", "identified": "identifi-\ncation", "mlp": "MLP",

@@ -11,7 +11,8 @@ from matplotlib.ticker import MultipleLocator
 
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
-from gaponet.eval.figures import COLOURS, figure, styled
+from gaponet.plot.methods import COLOURS
+from gaponet.plot.style import figure, styled
 
 Array = np.ndarray
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -16,7 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
-from gaponet.eval.figures import STYLE
+from gaponet.plot.style import save
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.pairing import pair_dataset
@@ -66,21 +64,6 @@ def draw_all(
         written += save(fig, out / name)
     progress(len(PICTURES), len(PICTURES), "")
     return written, left_out
-
-
-def save(fig: Figure, path: Path) -> list[Path]:
-    """SVG with letters as outlines, so that it looks the same everywhere, and PNG for screens and slides."""
-    files = [path.with_suffix(".svg"), path.with_suffix(".png")]
-    how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
-    with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):  # type: ignore[arg-type]
-        for file, options in zip(files, how, strict=True):
-            temporary = file.with_name(f".{os.getpid()}.{file.name}")
-            try:
-                fig.savefig(temporary, **options)
-                os.replace(temporary, file)
-            finally:
-                temporary.unlink(missing_ok=True)
-    return files
 
 
 class _Nothing(Exception):  # noqa: N818

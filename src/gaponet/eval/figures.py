@@ -4,47 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from gaponet.eval.colours import COLOURS, NAMES
+from gaponet.plot.methods import COLOURS, NAMES
+from gaponet.plot.style import figure, styled
 
 Array = np.ndarray
-
-STYLE = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 9,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.25,
-    "grid.linewidth": 0.5,
-    "legend.frameon": False,
-    "lines.linewidth": 1.2,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "gaponet",
-    "figure.constrained_layout.use": True,
-}
-
-
-def figure(width: float, height: float) -> Figure:
-    """An empty figure, inches; never touches pyplot's global state."""
-    return Figure(figsize=(width, height))
-
-
-def styled(draw: Any) -> Any:
-    """Decorator: draw under STYLE."""
-
-    def wrapped(*args: Any, **kwargs: Any) -> Figure:
-        with mpl.rc_context(STYLE):  # type: ignore[arg-type]
-            return draw(*args, **kwargs)
-
-    wrapped.__doc__ = draw.__doc__
-    return wrapped
 
 
 @styled

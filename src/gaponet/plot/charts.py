@@ -1,0 +1,162 @@
+"""The figures of experiments: dots with error bars by choice, lines over an amount, bars by group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+from typing import Any, Protocol
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gaponet.plot.methods import COLOURS
+from gaponet.plot.style import figure, styled
+
+
+class Spread(Protocol):
+    """One number measured several times (study.table)."""
+
+    @property
+    def mean(self) -> float: ...
+    @property
+    def std(self) -> float: ...
+
+
+Dot = tuple[str, str, Spread, bool]  # group, name, value, whether it is the default
+GAP = 0.7  # between groups, rows
+
+
+@styled
+def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
+    """One dot per setting, groups apart, the default hollow and as a line through all groups.
+
+    What lies far beyond all others is an arrow at the edge with its number.
+    """
+    y = 0.0
+    where: list[float] = []
+    names: list[str] = []
+    last = rows[0][0]
+    for group, name, _, _ in rows:
+        y += (1 if where else 0) + (GAP if group != last else 0)
+        where.append(y)
+        names.append(name)
+        last = group
+    fig = figure(6.0, 0.19 * (y + 1) + 1.0)
+    ax = fig.subplots()
+    limit = _limit([value.mean for _, _, value, _ in rows])
+    for place, (_, _, value, default) in zip(where, rows, strict=True):
+        if value.mean > limit:
+            ax.annotate(f"{value.mean:.2f} ", (limit, place), (-8, 0), textcoords="offset points", va="center",
+                        ha="right", color=COLOURS["gaponet"])  # fmt: skip
+            ax.plot(limit, place, marker=">", ms=5, color=COLOURS["gaponet"], clip_on=False)
+            continue
+        error = value.std if value.std == value.std else 0.0
+        ax.errorbar(
+            value.mean, place, xerr=error or None, fmt="o", ms=4.5, color=COLOURS["gaponet"], elinewidth=1,
+            mfc="white" if default else COLOURS["gaponet"],
+        )  # fmt: skip
+    base = next((value.mean for _, _, value, default in rows if default), None)
+    if base is not None:
+        ax.axvline(base, color=COLOURS["gaponet"], lw=0.8, ls=(0, (4, 3)), zorder=0)
+    ax.set_yticks(where, names)
+    ax.tick_params(axis="y", length=0)
+    ax.set_ylim(y + 0.8, -0.8)
+    ax.grid(axis="y", visible=False)
+    for group in dict.fromkeys(r[0] for r in rows):
+        first = next(i for i, r in enumerate(rows) if r[0] == group)
+        # From the left, since a browser's font may be wider than ours and what is left of the figure is cut off.
+        ax.annotate(group, (0, where[first]), (-170, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
+                    va="center", ha="left", fontweight="bold", annotation_clip=False)  # fmt: skip
+    if limit < np.inf:
+        ax.set_xlim(right=limit)
+    ax.set_xlabel(axis)
+    ax.set_title(title)
+    return fig
+
+
+def _limit(values: ListOf[float]) -> float:
+    """Where the axis ends, so that a few outliers do not press all others together; infinite where there are none."""
+    low, high = float(np.min(values)), float(np.quantile(values, 0.8))
+    usual = [v for v in values if v <= high + 3 * (high - low)]
+    return max(usual) + 0.35 * (max(usual) - low) if len(usual) < len(values) else np.inf
+
+
+@styled
+def lines(
+    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
+    axes: tuple[str, str],
+    ticks: ListOf[tuple[float, str]] = (),
+    log: bool = False,
+    marked: ListOf[float | None] = (),
+) -> Figure:
+    """Values over an amount, with error bars, one line per method; those with error bars are drawn a little apart where
+    x is not logarithmic, so that equal ones are all seen.
+
+    Args:
+        panels: (title, {label: (colour, x, values)}), beside each other on one scale.
+        axes: Labels of x and y.
+        ticks: Where x is labelled, and how; default matplotlib's.
+        log: Whether x is logarithmic.
+        marked: An x of each panel to be shaded: what training left out.
+    """
+    fig = figure(3.6 * len(panels) + 0.6, 3.2)
+    for i, (ax, (title, methods)) in enumerate(zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels,
+                                                   strict=True)):  # fmt: skip
+        spacing = np.diff(sorted({v for _, x, _ in methods.values() for v in x}))
+        if i < len(marked) and (place := marked[i]) is not None:
+            half = 0.3 * float(spacing.min()) if spacing.size else 0.5
+            ax.axvspan(place - half, place + half, color="#000000", alpha=0.06, lw=0)
+            ax.annotate("not in training", (place, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
+                        textcoords="offset points", ha="center", va="bottom", fontsize=8, color="#555555")  # fmt: skip
+        apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
+        drawn = 0  # of those with error bars
+        spreading = sum(any(v.std > 0 for v in values) for _, _, values in methods.values())
+        for label, (colour, x, values) in methods.items():
+            std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+            shift = (drawn - (spreading - 1) / 2) * apart if std.any() else 0.0
+            drawn += bool(std.any())
+            ax.errorbar(
+                np.add(x, shift), [v.mean for v in values], yerr=std if std.any() else None, fmt="o-", ms=3.5,
+                color=colour, elinewidth=0.9, capsize=2, label=label,
+            )  # fmt: skip
+        if log:
+            ax.set_xscale("log")
+            ax.minorticks_off()
+        if ticks:
+            ax.set_xticks([x for x, _ in ticks], [t for _, t in ticks])
+        ax.set_ylim(bottom=0)
+        ax.set_xlabel(axes[0])
+        ax.set_title(title)
+    fig.axes[0].set_ylabel(axes[1])
+    _legend(fig)
+    return fig
+
+
+@styled
+def bars(groups: ListOf[str], methods: Mapping[str, tuple[str, ListOf[Spread]]], axis: str, title: str) -> Figure:
+    """Bars with error bars: {label: (colour, value of each group)}."""
+    fig = figure(max(5.2, 0.2 * len(groups) * len(methods) + 1.6), 3.3)
+    ax = fig.subplots()
+    width = 0.8 / len(methods)
+    for i, (label, (colour, values)) in enumerate(methods.items()):
+        x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
+        std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=std if std.any() else None, color=colour,
+               error_kw={"lw": 0.8}, label=label)  # fmt: skip
+    ax.set_xticks(np.arange(len(groups)), groups)
+    ax.grid(axis="x", visible=False)
+    ax.set_ylabel(axis)
+    ax.set_title(title)
+    _legend(fig)
+    return fig
+
+
+def _legend(fig: Figure) -> None:
+    """Above the plot, in as many columns as fit; methods of all panels once."""
+    found: dict[str, Any] = {}
+    for ax in fig.axes:
+        found |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
+    columns = max(1, min(len(found), int(fig.get_figwidth() / 1.9)))
+    fig.legend(
+        list(found.values()), list(found), loc="outside upper left", ncols=columns, columnspacing=1.1, handlelength=1.4
+    )

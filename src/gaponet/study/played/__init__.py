@@ -1,0 +1,1 @@
+"""Questions for which a virtual unit is played, with models that exist already."""

@@ -1,0 +1,124 @@
+"""Numbers measured several times, and tables of them: for people, for Markdown, for CSV, for JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One number measured several times."""
+
+    mean: float
+    std: float
+    """Of the sample (n − 1); NaN for a single value."""
+    count: int
+
+    @classmethod
+    def of(cls, values: Iterable[float], scale: float = 1.0) -> Spread:
+        """Of seeds, units or motions; scale 1e3 makes mrad of rad. No values at all give a blank cell."""
+        found = np.array([v for v in values if math.isfinite(v)]) * scale
+        std = float(found.std(ddof=1)) if len(found) > 1 else math.nan
+        return cls(float(found.mean()) if len(found) else math.nan, std, len(found))
+
+    @property
+    def error(self) -> float:
+        """Standard error of the mean; NaN for a single value."""
+        return self.std / math.sqrt(self.count) if self.count else math.nan
+
+
+Cell = str | int | float | Spread | None
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns. The first column names the row."""
+
+    name: str
+    columns: tuple[str, ...]
+    """With units: "MPJAE, mrad"."""
+    rows: tuple[tuple[Cell, ...], ...]
+    """Text, whole numbers, numbers, Spread; None is blank."""
+    caption: str = ""
+    digits: int = 2
+    """Behind the point, where people read it; files hold what was measured."""
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: {row}")
+
+    def texts(self) -> list[list[str]]:
+        """Rows as people read them."""
+        return [[text(cell, self.digits) for cell in row] for row in self.rows]
+
+    def records(self) -> list[list[Any]]:
+        """Rows as JSON: a spread is an object."""
+        return [[asdict(c) if isinstance(c, Spread) else c for c in row] for row in self.rows]
+
+
+def text(cell: Cell, digits: int = 2) -> str:
+    """A cell as people read it: 12.28 ± 0.08, 1,234, blank."""
+    if isinstance(cell, Spread):
+        mean, std = text(cell.mean, digits), text(cell.std, digits)
+        return f"{mean} ± {std}" if mean and std else mean
+    if cell is None or isinstance(cell, str):
+        return cell or ""
+    if isinstance(cell, (bool, np.bool_)):
+        return "yes" if cell else "no"
+    if isinstance(cell, (int, np.integer)):
+        return f"{cell:,}"
+    return f"{cell:.{digits}f}" if math.isfinite(cell) else ""
+
+
+def compared(name: str, value: Spread, base: Spread, to: str, unit: str = "") -> str:
+    """Whether a value differs from another by more than seeds do, in words."""
+    change, margin = value.mean - base.mean, noise(value, base)
+    known = "" if margin == margin else " (one seed)"
+    if abs(change) <= margin:
+        return f"{name} {value.mean:.2f}{unit}, no different from {to} within the spread of seeds"
+    way = "more" if change > 0 else "less"
+    return f"{name} {value.mean:.2f}{unit}, {100 * abs(change) / abs(base.mean):.0f} % {way} than {to}{known}"
+
+
+def compared_by_seed(name: str, ratio: Spread, to: str) -> str:
+    """Whether a ratio of two values, seed by seed, differs from one by more than two standard errors, in words."""
+    change = ratio.mean - 1
+    if abs(change) <= 2 * ratio.error:
+        return f"{name} no different from {to} ({100 * change:+.0f} %, seeds ± {100 * ratio.std:.0f} %)"
+    known = f"seeds ± {100 * ratio.std:.0f} %" if ratio.count > 1 else "one seed"
+    return f"{name} {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} than {to} ({known})"
+
+
+def noise(a: Spread, b: Spread) -> float:
+    """Two standard errors of a difference of means; where one has a single value, with the other's std; else NaN."""
+    std = [s for s in (a.std, b.std) if s == s]
+    if not std:
+        return math.nan
+    first, second = (s if s == s else std[0] for s in (a.std, b.std))
+    return 2 * math.sqrt(first**2 / max(a.count, 1) + second**2 / max(b.count, 1))
+
+
+def to_csv(table: Table) -> str:
+    """Full precision; a column with spreads is followed by its std and count."""
+    spread = [any(isinstance(row[i], Spread) for row in table.rows) for i in range(len(table.columns))]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    head: list[str] = []
+    for column, wide in zip(table.columns, spread, strict=True):
+        head += [column, f"{column}: std", f"{column}: n"] if wide else [column]
+    writer.writerow(head)
+    for row in table.rows:
+        line: list[Any] = []
+        for cell, wide in zip(row, spread, strict=True):
+            parts = [cell.mean, cell.std, cell.count] if isinstance(cell, Spread) else [cell, None, None]
+            line += parts if wide else parts[:1]
+        writer.writerow(["" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v for v in line])
+    return out.getvalue()

@@ -1,0 +1,1 @@
+"""Watching recordings and simulations side by side: a window, a browser, a film, a picture."""

@@ -1,0 +1,156 @@
+"""One sequence as it was asked for, simulated, corrected and recorded: the joint angles that `gaponet view` shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset, Entry
+from gaponet.errors import DatasetError, UsageError
+from gaponet.eval.evaluate import corrected_robot, read_split
+from gaponet.model.artifact import GapModel
+from gaponet.plot.methods import COLOURS, NAMES
+from gaponet.robot import RobotSpec
+from gaponet.sim.replay import Corrector, replay
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One copy of the robot.
+
+    Attributes:
+        method: Key of eval.colours.
+        qpos: (T, n), rad; row t at t·dt.
+        error: Mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start.
+    """
+
+    method: str
+    qpos: Array
+    error: Array
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return NAMES[self.method]
+
+    @property
+    def colour(self) -> str:
+        """#rrggbb."""
+        return COLOURS[self.method]
+
+    @property
+    def mpjae(self) -> float:
+        """Mean error over the whole motion, rad: what eval calls MPJAE."""
+        return float(self.error[1:].mean())
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """The motions of one recording.
+
+    Attributes:
+        real: The recording.
+        robot: Whose.
+        motions: Target, nominal, corrected, recorded, in this order.
+        seen: Whether a shown model was trained or chosen on this recording; None without a model.
+    """
+
+    real: Sequence
+    robot: RobotSpec
+    motions: tuple[Motion, ...]
+    seen: bool | None
+
+    def only(self, methods: tuple[str, ...]) -> SideBySide:
+        """Some of the motions, in the order asked for; "aligned" means every model's."""
+        have = {m.method: m for m in self.motions}
+        wanted: list[str] = []
+        for name in methods:
+            models = [m for m in have if m not in ("target", "nominal", "recorded")]
+            wanted += models if name == "aligned" else [name]
+        for name in wanted:
+            if name not in have:
+                raise UsageError(f"--show {name}: here are {', '.join(have)}; models are given with --model RUN")
+        if not wanted:
+            raise UsageError("--show leaves nothing to look at; aligned motion needs --model RUN")
+        return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
+
+    def magnified(self, factor: float) -> SideBySide:
+        """Every difference from the recording times a factor, so that an eye can see it; errors stay as they are."""
+        if not factor > 0:
+            raise UsageError(f"--magnify is {factor}; give a positive factor, 1 for the truth")
+        grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
+        return replace(self, motions=tuple(grow(m) for m in self.motions))
+
+    def busiest(self, seconds: float) -> float:
+        """Start of the stretch of this length with the most motion, s."""
+        n = max(round(seconds / self.real.dt), 1)
+        op = self.robot.operated_index
+        moved = np.concatenate([[0.0], np.abs(np.diff(self.real.qpos[:, op], axis=0)).sum(axis=1).cumsum()])
+        return 0.0 if len(moved) <= n else float((moved[n:] - moved[:-n]).argmax() * self.real.dt)
+
+
+def pick(
+    dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
+) -> Entry:
+    """The first sequence that fits; among those the first run has not seen, where one of them fits."""
+    entries = dataset.select((motion,) if motion else ())
+    known = {h for part in ("train", "val") for h in read_split(runs[0])[part].values()} if runs else set()
+    entries = sorted(entries, key=lambda e: e.hash in known)
+    asked = [
+        e for e in entries
+        if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
+    ]  # fmt: skip
+    if not asked:
+        there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
+        raise DatasetError(
+            f"{dataset.path}: no such recording of {motion or 'any motion'}; there are {', '.join(there)}. "
+            "Change --unit or --payload-mass"
+        )
+    return asked[0]
+
+
+def side_by_side(
+    dataset: Dataset,
+    entry: Entry,
+    robot: RobotSpec,
+    runs: ListOf[Path] = (),
+    progress: Callable[[str, int, int], None] = lambda method, done, total: None,
+) -> SideBySide:
+    """Replay a recording in the nominal simulator, and under each run's shipped model in the simulator it corrects.
+
+    Args:
+        dataset: Where the recording is.
+        entry: Which one.
+        robot: The robot of the dataset.
+        runs: Run folders.
+        progress: Called with method, control steps done, total.
+    """
+    dataset.require_robot(robot)
+    real, nominal = dataset.read(entry), robot.nominal or robot
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (nominal, None)}
+    seen = False
+    for run in runs:
+        model, simulator = GapModel.load(run), corrected_robot(run, nominal)
+        model.require(simulator, real.dt)
+        if model.config.kind in simulators:
+            raise UsageError(f"{run}: a second {model.config.kind} model; give runs of different kinds")
+        simulators[model.config.kind] = (simulator, model.corrector(simulator))
+        split = read_split(run)
+        seen |= any(entry.hash in split[part].values() for part in ("train", "val"))
+    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
+    shown = {"target": target}
+    for method, (simulator, corrector) in simulators.items():
+        told = partial(progress, method)
+        shown[method] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
+    shown["recorded"] = real.qpos
+    op = robot.operated_index
+    motions = tuple(Motion(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
+    return SideBySide(real, robot, motions, seen if runs else None)
