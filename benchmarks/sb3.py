@@ -30,7 +30,8 @@ from gaponet.model.baselines.mlp import matched_hidden
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.layers import dense, size
-from gaponet.model.observation import History, frames_before
+from gaponet.model.loop import DeltaLoop
+from gaponet.model.observation import frames_before
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
@@ -230,7 +231,7 @@ class SingleEnv(gymnasium.Env):
         free = [j for j in robot.joint_names if j not in locked]
         self.free, self.op = robot.index(free), np.array([free.index(j) for j in robot.operated])
         self.low, self.high = robot.qpos_range[self.free].T
-        self.history = History(config, 1, n)
+        self.loop = DeltaLoop(config, robot.qpos_range[robot.operated_index], 1)
         self.rng = np.random.default_rng(seed)
         self.steps = round(10 / robot.dt)
 
@@ -240,8 +241,8 @@ class SingleEnv(gymnasium.Env):
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = self.motion.qpos[self.row, self.free]
         self.data.qvel[:] = self.motion.qvel[self.row, self.free]
-        before, op = frames_before(np.array([self.row]), self.history.depth), self.robot.operated_index
-        self.history.reset(
+        before, op = frames_before(np.array([self.row]), self.loop.history.depth), self.robot.operated_index
+        self.loop.begin(
             slice(None), *(x[before][..., op] for x in (self.motion.qpos, self.motion.qvel, self.motion.ctrl))
         )
         return self._observe(), {}
@@ -251,7 +252,7 @@ class SingleEnv(gymnasium.Env):
         target = self.motion.ctrl[self.row, self.free].astype(float)
         target[op] += action
         np.clip(target, self.low, self.high, out=target)
-        self.history.push(data.qpos[None, op], data.qvel[None, op], target[None, op])
+        self.loop.push(data.qpos[None, op], data.qvel[None, op], target[None, op])
         data.ctrl[:] = target
         mujoco.mj_step(self.model, data, self.robot.decimation)
         self.row += 1
@@ -262,8 +263,8 @@ class SingleEnv(gymnasium.Env):
 
     def _observe(self) -> Array:
         op = self.op
-        o = self.history.observe(self.data.qpos[None, op], self.data.qvel[None, op], np.zeros(1, np.float32))
-        return np.concatenate([o[0], self.motion.ctrl[self.row, self.robot.operated_index]], dtype=np.float32)
+        action = self.motion.ctrl[self.row, self.robot.operated_index]
+        return self.loop.observe(self.data.qpos[None, op], self.data.qvel[None, op], action[None], 0.0)[0].copy()
 
 
 if __name__ == "__main__":

@@ -30,11 +30,11 @@ def run(tmp_path):
 
 
 def test_an_artifact_without_numpy_weights_gets_them(run, capsys):
-    before = GapModel.load(run, "numpy").delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    before = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
     (run / "model" / "weights.npz").unlink()
     assert main(["export", str(run), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["parity_rad"] < 1e-5
-    again = GapModel.load(run, "numpy").delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    again = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
     np.testing.assert_allclose(again, before, atol=1e-7)
 
 

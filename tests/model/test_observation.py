@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
 from gaponet.model.config import ModelConfig
-from gaponet.model.inputs import Inputs
-from gaponet.model.observation import History, frames_before
+from gaponet.model.loop import DeltaLoop
+from gaponet.model.observation import History, Layout, frames_before
 from gaponet.robot import load_robot
 
 
@@ -17,30 +18,37 @@ def test_dimensions_are_the_papers(history, dim):
 
 @pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
 def test_so_they_are_of_the_h1_2(history, dim):
-    n = len(load_robot("h1_2").operated)
+    robot = load_robot("h1_2")
+    n = len(robot.operated)
     for payload in (0, 1):
         config = ModelConfig(history=history, payload_input=bool(payload))
-        empty = History(config, 1, n)
-        state = np.zeros((1, n))
-        assert empty.observe(state, state, np.zeros(1)).shape == (1, dim + payload)
-        assert Inputs(config, 1, np.arange(n)).layout.dim == dim + payload + n
+        assert Layout(config, n).observation.stop == dim + payload
+        assert DeltaLoop(config, robot.qpos_range[robot.operated_index], 1).x.shape == (1, dim + payload + n)
 
 
-def test_layout_is_state_then_frames_newest_first_then_payload():
-    history = History(ModelConfig(history=2, payload_max=2.0), num_envs=1, n=1)
-    history.reset(slice(None), np.full((1, 2, 1), 9.0), np.full((1, 2, 1), 9.0), np.full((1, 2, 1), 9.0))
-    history.push([[1.0]], [[2.0]], [[3.0]])
-    history.push([[4.0]], [[5.0]], [[6.0]])
-    o = history.observe([[7.0]], [[8.0]], np.array([1.0]))
-    np.testing.assert_array_equal(o, [[7, 8, 4, 5, 6, 1, 2, 3, 0.5]])
+def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
+    loop = DeltaLoop(ModelConfig(history=2, payload_max=2.0), np.array([[-9.0, 9.0]]), num_envs=1)
+    loop.begin(slice(None), *np.full((3, 1, 1, 1), 9.0))
+    one = lambda value: np.array([[value]])  # noqa: E731
+    loop.push(one(1.0), one(2.0), one(3.0))
+    loop.push(one(4.0), one(5.0), one(6.0))
+    x = loop.observe(one(7.0), one(8.0), one(10.0), np.array([1.0]))
+    np.testing.assert_array_equal(x, [[7, 8, 4, 5, 6, 1, 2, 3, 0.5, 10]])
 
 
-def test_a_stride_skips_frames():
-    history = History(ModelConfig(history=2, stride=3, payload_input=False), num_envs=1, n=1)
-    history.reset(slice(None), np.zeros((1, 4, 1)), np.zeros((1, 4, 1)), np.zeros((1, 4, 1)))
+@pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
+@pytest.mark.parametrize(("stride", "seen"), [(1, [5, 4, 3]), (3, [5, 2, -1])])
+def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
+    config = ModelConfig(history=3, stride=stride)
+    x = make((2, config.input_dim(1)))
+    history, one = History(config, 1, x), make((2, 1)) + 1
+    history.reset(slice(None), *(one[:, None] * (-1 - k) for k in range(3)))
     for k in range(1, 6):
-        history.push([[k]], [[0.0]], [[0.0]])
-    assert history.observe([[6.0]], [[0.0]], np.zeros(1))[0, [2, 5]].tolist() == [5.0, 2.0]
+        history.push(k * one, 10 * k * one, 100 * k * one)
+    history.write()
+    frames = np.asarray(x)[:, Layout(config, 1).past].reshape(2, 3, 3)
+    assert frames[0, :, 0].tolist() == seen
+    assert frames[1, :2, 2].tolist() == [100 * k for k in seen[:2]]
 
 
 def test_history_at_the_start_is_the_first_frame_repeated():

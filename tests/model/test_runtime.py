@@ -84,11 +84,10 @@ def test_drawn_states_have_the_statistics_trained_on():
 
 
 def test_numpy_answers_as_onnxruntime_step_by_step_and_in_batches(artifact):
-    a, b = GapModel.load(artifact), GapModel.load(artifact, "numpy")
+    models = GapModel.load(artifact), GapModel.load(artifact, "numpy")
     rng = np.random.default_rng(0)
     for num_envs in (1, 5):
-        a.reset()
-        b.reset()
+        a, b = (model.loop(num_envs) for model in models)
         for _ in range(6):
             q, v, u = rng.normal(0, 0.5, (3, num_envs, 2))
             np.testing.assert_allclose(a.delta(q, v, u, 0.1), b.delta(q, v, u, 0.1), atol=1e-6)
@@ -98,7 +97,7 @@ def test_numpy_needs_neither_the_onnx_file_nor_onnxruntime(artifact, tmp_path, m
     for name in ("card.json", "weights.npz"):
         (tmp_path / name).write_bytes((artifact / name).read_bytes())
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
-    assert GapModel.load(tmp_path, "numpy").delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0).shape == (2,)
+    assert GapModel.load(tmp_path, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0).shape == (2,)
     with pytest.raises(ModelError, match=r"no model\.onnx"):
         GapModel.load(tmp_path)
     with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]', or load with backend='numpy'"):
@@ -123,7 +122,7 @@ def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
     assert fuse(net) is None
     export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), drawn_states(net))
     assert not (tmp_path / "weights.npz").exists()
-    assert np.isfinite(GapModel.load(tmp_path).delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
+    assert np.isfinite(GapModel.load(tmp_path).loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
 
 
 @pytest.mark.parametrize(
@@ -139,52 +138,65 @@ def test_every_kind_of_network_ships(robot, tmp_path, how):
     x = torch.randn(20, net.config.input_dim(2)).numpy()
     assert export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), x) <= 1e-5
     model = GapModel.load(tmp_path)
-    if net.config.asks_simulator or net.config.keeps_observation or net.config.delta_hold > 1:
-        with pytest.raises(ModelError, match=r"only sim\.replay runs it"):
+    if net.config.asks_simulator:
+        with pytest.raises(ModelError, match="of no use outside a simulator"):
             model.loop()
     else:
-        assert model.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
+        assert model.loop().delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
 
 
 def test_a_loop_of_ones_own_gets_what_replay_applies(artifact, robot):
     model = GapModel.load(artifact)
     sequences = recordings(robot, 3, rows=30)
-    corrector = model.corrector(robot)
+    corrector, loop = model.corrector(robot), model.loop(3)
     corrector.reset(sequences)
     for t in range(29):
         q, v, a = (np.stack([getattr(s, name)[t] for s in sequences]) for name in ("qpos", "qvel", "ctrl"))
-        delta = model.delta(q, v, a, np.array([s.meta.payload_mass for s in sequences]))
+        delta = loop.delta(q, v, a, np.array([s.meta.payload_mass for s in sequences]))
         np.testing.assert_allclose(a + delta, corrector.correct(t, a, q, v), atol=1e-7)
 
 
 def test_one_robot_among_several_begins_anew(artifact):
-    model = GapModel.load(artifact)
+    loop = GapModel.load(artifact).loop(2)
     q, v, a = np.random.default_rng(1).normal(0, 0.5, (3, 2, 2))
-    first = model.delta(q, v, a, 0.0)
-    later = model.delta(q, v, a, 0.0)
-    model.reset(np.array([0]))
-    again = model.delta(q, v, a, 0.0)
+    first = loop.delta(q, v, a, 0.0)
+    later = loop.delta(q, v, a, 0.0)
+    loop.reset(np.array([0]))
+    again = loop.delta(q, v, a, 0.0)
     np.testing.assert_array_equal(again[0], first[0])
     assert not np.array_equal(later, first)
     assert not np.array_equal(again[1], first[1])
 
 
+def test_robots_that_share_a_model_do_not_share_a_past(artifact):
+    model = GapModel.load(artifact)
+    states = np.random.default_rng(2).normal(0, 0.5, (20, 2, 3, 2))
+    alone = []
+    for robot in range(2):
+        loop = model.loop()
+        alone.append([loop.delta(*state, 0.0) for state in states[:, robot]])
+    loops = model.loop(), model.loop()
+    for t, pair in enumerate(states):
+        for robot in range(2):
+            np.testing.assert_array_equal(loops[robot].delta(*pair[robot], 0.0), alone[robot][t])
+
+
 def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
     model = GapModel.load(artifact)
     np.testing.assert_array_equal(model.qpos_range, robot.qpos_range)
-    edge = robot.qpos_range[:, 1]
+    edge, loop = robot.qpos_range[:, 1], model.loop()
     for _ in range(5):
-        delta = model.delta(edge - 0.1, np.zeros(2), edge, 0.0)
+        delta = loop.delta(edge - 0.1, np.zeros(2), edge, 0.0)
         assert (edge + delta <= edge).all()
 
 
 def test_other_shapes_are_refused(artifact):
-    model = GapModel.load(artifact)
-    model.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
-    with pytest.raises(UsageError, match=r"2 operated joints of 1 robots.*reset\(\) first"):
-        model.delta(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), 0.0)
+    loop = GapModel.load(artifact).loop()
+    loop.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
+    with pytest.raises(UsageError, match=r"2 operated joints of 1 robots.*model\.loop\(num_envs\)"):
+        loop.delta(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), 0.0)
     with pytest.raises(UsageError, match="give the 2 operated joints"):
-        model.delta(np.zeros(3), np.zeros(2), np.zeros(2), 0.0)
+        loop.delta(np.zeros(3), np.zeros(2), np.zeros(2), 0.0)
 
 
 def test_torchscript_is_self_contained_and_the_same(artifact, tmp_path):
@@ -194,6 +206,14 @@ def test_torchscript_is_self_contained_and_the_same(artifact, tmp_path):
     assert loaded.joint_names == ["shoulder", "elbow"]
     assert loaded.dt == [0.02]
     assert compare(loaded, model, num_envs=2) <= 1e-5
+
+
+@pytest.mark.parametrize("how", [{"sensor_hold": 2}, {"delta_hold": 2}, {"sensors": "oracle"}])
+def test_torchscript_refuses_what_it_does_not_hold(robot, tmp_path, how):
+    net = trained(**how)
+    export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), torch.randn(20, net.config.input_dim(2)).numpy())
+    with pytest.raises(ModelError, match="which TorchScript does not; train"):
+        export_torchscript(GapModel.load(tmp_path), tmp_path, tmp_path / "delta.pt")
 
 
 def test_torchscript_of_other_weights_is_refused(artifact, tmp_path):

@@ -13,7 +13,7 @@ from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import drawn_states, export
-from gaponet.train.learned_inverse import learn_inverse
+from gaponet.train.learned_inverse import learn_inverse, visit
 
 CONFIG = ModelConfig(
     history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,), payload_max=0.4
@@ -49,6 +49,21 @@ def test_it_sends_what_the_fixed_point_sends(robot, model):
     uninverted = sent(robot, model, replace(LEARNED, inverse="fixed_point", iterations=0))
     missed = np.abs(sent(robot, model, LEARNED) - solved).mean()
     assert missed < 0.25 * np.abs(solved - uninverted).mean()
+
+
+def test_it_is_fitted_to_what_it_will_be_shown(robot, model):
+    shown, compensator = [], Compensator(robot, model, replace(LEARNED, inverse="fixed_point", iterations=8))
+    targets = commands(20, 3)
+    loop = compensator.loop
+    run = loop.bound.run
+    loop.bound = replace(loop.bound, run=lambda: (shown.append(loop.x.copy()), run()))
+    compensator.reset(targets[0], 0.3)
+    for target in targets:
+        compensator.step(target, None)
+    x, _ = visit(robot, model, [targets], np.array([0.3]))
+    action = compensator.loop.layout.action
+    last = np.concatenate(shown)[7::8]  # of each period's eight questions
+    np.testing.assert_allclose(x[:, 0, : action.start], last[:, : action.start], atol=1e-6)
 
 
 def test_without_one_it_says_how_to_make_one(robot, model):

@@ -112,6 +112,8 @@ class Compensator:
         """
         self.dt = robot.dt if dt is None else dt
         model.require(robot, self.dt)
+        if model.config.delta_hold > 1:
+            raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
         self.num_envs = num = 1 if num_envs is None else num_envs
         heaviest = model.config.payload_max if robot.payload_mounts else 0.0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
 from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
-from gaponet.model.runtime import DeltaLoop
+from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray
@@ -76,14 +76,14 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
 class GapModel:
     """A delta-action model and its card.
 
-    `delta` serves a loop of one's own, deploy.AlignedSim a simulator, `corrector` sim.replay.
+    `loop` serves a control loop, and remembers its past; the model itself remembers nothing and can be shared.
+    deploy.AlignedSim is a simulator with such a loop, `corrector` serves sim.replay.
     """
 
     path: Path
     card: dict[str, Any]
     config: ModelConfig
     infer: Network
-    _loops: list[DeltaLoop] = field(default_factory=list, repr=False, compare=False)  # at most one: that of `delta`
 
     @classmethod
     def load(cls, path: str | Path, backend: Backend = "onnxruntime", threads: int = 1) -> GapModel:
@@ -122,29 +122,14 @@ class GapModel:
         return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
 
     def loop(self, num_envs: int = 1) -> DeltaLoop:
-        """A history of its own for num_envs robots."""
-        return DeltaLoop(self.infer, self.config, self.qpos_range, num_envs)
+        """The corrections of num_envs robots, with a past of their own: loop.delta(qpos, qvel, ctrl, payload_mass).
 
-    def delta(self, qpos: Array, qvel: Array, ctrl: Array, payload_mass: Array | float) -> Array:
-        """Δa for the coming control period, rad, to be added to ctrl; ask exactly once per period.
+        Joints are those of the card (joint_names), in that order.
 
-        The model remembers its last frames; reset() where another motion begins.
-
-        Args:
-            qpos, qvel: State now of the operated joints (card: joint_names), (n,) or (num_envs, n); rad, rad/s.
-            ctrl: Target of the coming period, the same shape, rad.
-            payload_mass: kg, one number or (num_envs,).
+        Raises:
+            ModelError: The model asks the simulator, which a control loop does not have.
         """
-        if not self._loops:
-            self._loops.append(self.loop(len(ctrl) if np.ndim(ctrl) == 2 else 1))
-        return self._loops[0].delta(qpos, qvel, ctrl, payload_mass)
-
-    def reset(self, ids: Array | None = None) -> None:
-        """Forget the past, of robots `ids` only where given."""
-        if ids is None:
-            self._loops.clear()
-        elif self._loops:
-            self._loops[0].reset(ids)
+        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""

@@ -20,10 +20,10 @@ Backend = Literal["onnxruntime", "numpy"]
 
 @dataclass(frozen=True)
 class Bound:
-    """One batch size's buffers: write x, (B, dim) float32, call run, read delta, (B, n) float32."""
+    """One batch size's buffers: write x, (B, dim) float32, call run, read delta, (B, n) float32; numpy or torch."""
 
-    x: Array
-    delta: Array
+    x: Any
+    delta: Any
     run: Callable[[], object]
 
 
@@ -35,6 +35,24 @@ class Network(Protocol):
 
     def bind(self, batch: int) -> Bound:
         """Buffers for `batch` rows; run() allocates nothing of Python's."""
+
+
+class FunctionNetwork:
+    """A function x → Δa on numpy arrays as a network: one that is being trained, or a rule."""
+
+    def __init__(self, infer: Callable[[Array], Array], dim: int, n: int) -> None:
+        self.infer, self.dim, self.n = infer, dim, n
+
+    def __call__(self, x: Array) -> Array:
+        return self.infer(x)
+
+    def bind(self, batch: int) -> Bound:
+        x, delta = np.zeros((batch, self.dim), np.float32), np.zeros((batch, self.n), np.float32)
+
+        def run() -> None:
+            delta[:] = self.infer(x)
+
+        return Bound(x, delta, run)
 
 
 class OnnxNetwork:

@@ -10,6 +10,7 @@ are predicted and held; S_t, the simulator's answers to the probes, where it is 
 from __future__ import annotations
 
 from itertools import accumulate, pairwise
+from typing import Any
 
 import numpy as np
 
@@ -34,68 +35,60 @@ class Layout:
 
 
 class History:
-    """Past frames of num_envs robots and the observation made from them, float32."""
+    """The past frames of num_envs robots, written into x; numpy and torch arrays alike."""
 
-    def __init__(self, config: ModelConfig, num_envs: int, n: int, x: Array | None = None) -> None:
-        """Empty history: reset every environment before observing.
-
+    def __init__(self, config: ModelConfig, n: int, x: Any) -> None:
+        """
         Args:
             config: Of the model.
-            num_envs: Robots.
             n: Operated joints.
-            x: Where observations will be written, (num_envs, dim) float32, by observe(out=x) alone: frames are kept
-                there if they can be, so that they need not be copied.
+            x: The network's input, (num_envs, dim). Without a stride the frames are kept there and nothing is copied.
         """
+        layout = Layout(config, n)
         self.n = n
-        self.payload_max = config.payload_max
-        self.payload_input = config.payload_input
         self.depth = (config.history - 1) * config.stride + 1
-        self.picked = np.arange(0, self.depth, config.stride)  # newest first
-        self.dim = config.observation_dim(n)
-        self.place = slice(2 * n, 2 * n + 3 * n * config.history)
-        self.inside = x is not None and config.stride == 1
-        held = (
-            x[:, self.place] if x is not None and self.inside else np.zeros((num_envs, 3 * n * self.depth), np.float32)
-        )
-        self.frames = held.reshape(num_envs, self.depth, 3 * n)  # of a slice of columns, too, this is a view
+        self.picked = slice(0, self.depth, config.stride)  # newest first
+        self.place = x[:, layout.past]
+        self.inside = config.stride == 1
+        held = self.place if self.inside else zeros_like(x, len(x), 3 * n * self.depth)
+        self.frames = held.reshape(len(x), self.depth, 3 * n)  # a view, of a slice of columns too
 
-    def reset(self, ids: Array | slice, qpos: Array, qvel: Array, u: Array) -> None:
-        """Fill histories from real frames before the start index, never with zeros.
+    def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
+        """Fill histories from real frames before the start, never with zeros.
 
         Args:
-            ids: Environments, (k,).
-            qpos, qvel, u: Frames, (k, depth, n), newest first.
+            ids: Environments: indices, a slice or a mask that picks k.
+            qpos, qvel, u: Frames, (k, depth, n), newest first, or (k, 1, n), repeated.
         """
-        self.frames[ids] = np.concatenate([qpos, qvel, u], axis=-1)
+        n = self.n
+        self.frames[ids, :, :n] = qpos
+        self.frames[ids, :, n : 2 * n] = qvel
+        self.frames[ids, :, 2 * n :] = u
 
-    def push(self, qpos: Array, qvel: Array, u: Array) -> None:
+    def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
         frames, n = self.frames, self.n
         if self.depth > 1:
-            frames[:, 1:] = frames[:, :-1]
+            frames[:, 1:] = copy_of(frames[:, :-1])  # torch would overwrite what it has yet to read
         newest = frames[:, 0]
         newest[:, :n] = qpos
         newest[:, n : 2 * n] = qvel
         newest[:, 2 * n :] = u
 
-    def observe(self, qpos: Array, qvel: Array, payload_mass: Array | float, out: Array | None = None) -> Array:
-        """The observation, (num_envs, dim), float32.
-
-        Args:
-            qpos, qvel: State now, (num_envs, n).
-            payload_mass: (num_envs,) kg.
-            out: Where to write it, of the same shape; default a new array.
-        """
-        n = self.n
-        out = np.empty((len(self.frames), self.dim), np.float32) if out is None else out
-        out[:, :n] = qpos
-        out[:, n : 2 * n] = qvel
+    def write(self) -> None:
+        """Bring x up to date."""
         if not self.inside:
-            past = self.frames if len(self.picked) == self.depth else self.frames[:, self.picked]
-            out[:, self.place] = past.reshape(len(out), -1)
-        if self.payload_input:
-            out[:, -1] = payload_mass / self.payload_max
-        return out
+            self.place[:] = self.frames[:, self.picked].reshape(len(self.place), -1)
+
+
+def zeros_like(x: Any, *shape: int) -> Any:
+    """Zeros of x's kind, type and device, numpy or torch."""
+    return np.zeros(shape, x.dtype) if isinstance(x, np.ndarray) else x.new_zeros(shape)
+
+
+def copy_of(x: Any) -> Any:
+    """A copy of a numpy or torch array."""
+    return x.copy() if isinstance(x, np.ndarray) else x.clone()
 
 
 def frames_before(t: Array, depth: int) -> Array:

@@ -29,7 +29,7 @@ CHECKED = 12  # control periods
 
 
 class DeltaModule(nn.Module):
-    """model/runtime.DeltaLoop in torch. The observation is that of model/observation.History; the export compares."""
+    """model/loop.DeltaLoop for models that hold nothing, in TorchScript; the export compares them."""
 
     frames: Tensor
     fresh: Tensor
@@ -104,7 +104,12 @@ def export_torchscript(model: GapModel, run: Path, path: Path) -> float:
     Raises:
         ModelError: It is above 1e-5 rad; nothing is written.
     """
-    n = len(model.card["joint_names"])
+    n, config = len(model.card["joint_names"]), model.config
+    if config.asks_simulator or config.keeps_observation or config.delta_hold > 1:
+        raise ModelError(
+            f"{model.path}: holds sensors or corrections, or asks the simulator, which TorchScript does not; train "
+            "with sensors predicted or off, sensor_hold 1 and delta_hold 1"
+        )
     net = traced(torch_network(model, run), model.config.observation_dim(n) + n)
     temporary = path.with_name(f".{path.name}.tmp")
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,7 +43,7 @@ def env_state(env: DeltaEnv) -> State:
 
 def _inputs(env: DeltaEnv) -> dict[str, np.ndarray]:
     """What the next observation remembers."""
-    return {"frames": env.inputs.history.frames, "age": env.inputs.age, "more": env.inputs.more}
+    return {"frames": env.loop.history.frames, "age": env.loop.age, "more": env.loop.more}
 
 
 def restore_env(env: DeltaEnv, state: State) -> None:

@@ -12,11 +12,11 @@ from tensordict import TensorDict
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.model.inputs import Inputs
+from gaponet.model.loop import Ask, DeltaLoop
 from gaponet.model.observation import frames_before
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
 from gaponet.train.config import RewardConfig
 
@@ -58,11 +58,11 @@ class DeltaEnv(VecEnv):
         self._load(sequences)
         conditions = [self.conditions[g] for g in self.group]
         self.sim = BatchSim(robot, conditions, nthread, self.locked)
-        oracle = ProbeOracle(robot, config, conditions, nthread, self.locked) if config.asks_simulator else None
-        self.inputs = Inputs(config, num_envs, self.op, oracle)
+        ask = self._simulator(conditions, nthread) if config.asks_simulator else None
+        self.loop = DeltaLoop(config, self.sim.range[self.op], num_envs, ask=ask)
         shortest = min(c[2] for c in self.conditions)
         under_way = 1 + int(np.ceil(robot.delay.max() / shortest))  # periods whose command a late servo has not met yet
-        self.depth = max(self.inputs.history.depth, under_way)
+        self.depth = max(self.loop.history.depth, under_way)
         self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
@@ -107,6 +107,10 @@ class DeltaEnv(VecEnv):
         rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
         self.condition_features = np.stack([self.payload / self.config.payload_max, rate / 100], axis=1)
 
+    def _simulator(self, conditions: list[Condition], nthread: int) -> Ask:
+        oracle = ProbeOracle(self.robot, self.config, conditions, nthread, self.locked)
+        return lambda ids, offsets: oracle(self.sim.qpos[ids], self.sim.qvel[ids], offsets, ids)
+
     def reset(self, ids: Array | None = None) -> None:
         """Put environments at uniformly drawn recorded frames, with the frames before as history."""
         ids = np.arange(self.num_envs) if ids is None else ids
@@ -118,16 +122,16 @@ class DeltaEnv(VecEnv):
         t = self.row[ids]
         before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.depth)
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
-        before = before[:, : self.inputs.history.depth]
-        self.inputs.reset(ids, self.qpos[before], self.qvel[before], self.ctrl[before])
+        before = before[:, : self.loop.history.depth]
+        self.loop.begin(ids, *(x[before][..., self.op] for x in (self.qpos, self.qvel, self.ctrl)))
         self.previous[ids] = 0.0
         self.episode_length_buf[ids] = 0
         self.now[ids] = self.track[t]
 
     def get_observations(self) -> TensorDict:
         """Actor and critic observations of the present row."""
-        state = 2 * self.num_actions
-        actor = self.inputs.x(self.sim.qpos, self.sim.qvel, self.now[:, state:], self.payload)
+        state, op, sim = 2 * self.num_actions, self.op, self.sim
+        actor = self.loop.observe(sim.qpos[:, op], sim.qvel[:, op], self.now[:, state:], self.payload).copy()
         then = self.track.take(self.row + 1, axis=0)
         critic = np.concatenate([actor, self.now[:, :state], then[:, :state], self.condition_features], axis=1)
         return TensorDict(
@@ -158,7 +162,7 @@ class DeltaEnv(VecEnv):
         op, n = self.op, self.sim
         target = self.ctrl.take(self.row, axis=0).astype(float)
         target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])
-        self.inputs.push(n.qpos, n.qvel, target)
+        self.loop.push(n.qpos[:, op], n.qvel[:, op], target[:, op])
         n.step(target)
         self.row += 1
         self.track.take(self.row, axis=0, out=self.now)

@@ -40,9 +40,17 @@ def visit(robot: RobotSpec, model: GapModel, targets: list[Array], masses: Array
     played = np.stack([target[:rows] for target in targets], axis=1)
     compensator.reset(played[0], masses)
     loop, x, offset = compensator.loop, [], []
+    run, seen = loop.bound.run, np.zeros_like(loop.x)
+
+    def noted() -> None:  # what the network sees; once the period is over, that period is the newest frame of its past
+        seen[:] = loop.x
+        run()
+
+    loop.bound = replace(loop.bound, run=noted)
     for target in played:
         compensator.step(target, None)
-        x.append(np.concatenate([loop.observation, compensator.wanted], axis=1, dtype=np.float32))
+        seen[:, loop.layout.action] = compensator.wanted
+        x.append(seen.copy())
         offset.append(compensator.offset.astype(np.float32))
     return np.stack(x), np.stack(offset)
 
@@ -80,7 +88,8 @@ def learn_inverse(
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    masses = rng.uniform(0.0, model.config.payload_max, len(motions))
+    seen = model.card.get("payload_seen") or [0.0, model.config.payload_max]
+    masses = rng.uniform(min(seen), max(seen), len(motions))  # beyond them the model itself is a guess
     x, offset = visit(robot, model, motions, masses)
     judged = rng.permutation(len(motions)) < max(1, round(HELD_OUT * len(motions)))
     flat = lambda values, which: values[:, which].reshape(-1, values.shape[2])  # noqa: E731

@@ -30,6 +30,7 @@ from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset, dataset_hash, write_text
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
+from gaponet.model.backends import FunctionNetwork
 from gaponet.model.baselines import delay_offset
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
@@ -202,7 +203,7 @@ class Trainer:
             restore_env(env, self.env_state)
             torch.set_rng_state(self.rng)
         self.warm_state, self.net = None, trained_by(runner)
-        env.inputs.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
+        env.loop.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
         while self._spent() < 1:
             for p in trained:  # first let the critic learn what the policy is worth
@@ -262,7 +263,9 @@ class Trainer:
         return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
 
     def _corrector(self, net: DeltaNet) -> DeltaCorrector:
-        return DeltaCorrector(torch_infer(net), self.config.model, self.robot, points_of(net))
+        config = self.config.model
+        network = FunctionNetwork(torch_infer(net), config.input_dim(self.n), self.n)
+        return DeltaCorrector(network, config, self.robot, points_of(net))
 
     def _consider(self, shrunk: DeltaNet | None = None) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""

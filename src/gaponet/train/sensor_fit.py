@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaponet.model.inputs import Infer
 from gaponet.model.layers import DeltaNet
+from gaponet.model.loop import Infer
 from gaponet.model.observation import Layout
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec

@@ -67,7 +67,7 @@ class WarmStart:
         env, net = self.env, self.net
         env.reset()
         net.eval()
-        env.inputs.points = points_of(net)
+        env.loop.points = points_of(net)
         self.visited.clear()
         xs, ys = [], []
         disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
