@@ -15,7 +15,7 @@ from arm import commands
 from gaponet.data.importer import import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.deploy.clock import SimulatedClock
-from gaponet.deploy.controller import NEXT, ControlConfig, Controller, Phase, play
+from gaponet.deploy.controller import COMMANDING, NEXT, ControlConfig, Controller, Phase, play
 from gaponet.deploy.driver import DriverError
 from gaponet.deploy.drivers.virtual import VirtualDriver
 from gaponet.deploy.publisher import sole_publisher
@@ -79,7 +79,7 @@ def phases(recording: Recording) -> list[str]:
 def test_a_run_goes_through_all_phases_and_follows_the_motion(arm):
     driver = Tampered(arm, SimulatedClock())
     recording = run(arm, driver)
-    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "damp", "stopped"]
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "stopped"]
     assert recording.fault is None
     log = recording.log()
     np.testing.assert_allclose(log.channels["ctrl"].values, MOTION.ctrl, atol=1e-12)
@@ -163,9 +163,9 @@ def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
     monkeypatch.setattr("gaponet.deploy.controller.PATIENCE", 0.3)
     driver = Tampered(arm, SimulatedClock(), at=0.0, kind="hot")
     recording = run(arm, driver)
-    assert phases(recording) == ["idle", "damp", "stopped"]
+    assert phases(recording) == ["idle", "stopped"]
     assert "never ready" in recording.fault.text
-    assert all(ctrl is None for _, ctrl in driver.sent)
+    assert driver.sent == []
 
 
 @pytest.mark.parametrize("how", ["call", "signal"])
@@ -189,10 +189,12 @@ def test_a_stop_takes_effect_in_the_next_period(arm, how):
 
 
 def test_a_stop_is_latched(arm):
-    controller = Controller(Tampered(arm, SimulatedClock()), arm, QUICK, clock=SimulatedClock())
+    driver = Tampered(arm, SimulatedClock())
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
     controller.stop("first")
     controller.stop("second")
-    assert phases(controller.run(play(MOTION, 0.02))) == ["idle", "damp", "stopped"]
+    assert phases(controller.run(play(MOTION, 0.02))) == ["idle", "stopped"]
+    assert driver.sent == [], "nothing was commanded, so nothing is sent"
     assert "first" in controller.recording.events[1].text
     with pytest.raises(UsageError, match="runs once"):
         controller.run(play(MOTION, 0.02))
@@ -201,7 +203,7 @@ def test_a_stop_is_latched(arm):
 def test_from_damp_the_only_way_is_to_stopped():
     assert NEXT[Phase.DAMP] == (Phase.STOPPED,)
     assert NEXT[Phase.STOPPED] == ()
-    assert all(Phase.DAMP in NEXT[p] for p in (Phase.IDLE, Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT))
+    assert all(Phase.DAMP in NEXT[p] for p in COMMANDING)
 
 
 def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
@@ -213,7 +215,93 @@ def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
     driver = Tampered(arm, SimulatedClock())
     with pytest.raises(ZeroDivisionError):
         Controller(driver, arm, QUICK, clock=driver.clock).run(lambda k, state: np.zeros(2) / (1 if k < 9 else 1 // 0))
+    damping = [t for t, ctrl in driver.sent if ctrl is None]
+    assert damping[-1] - damping[0] >= QUICK.damp, "the whole damping, as after any other fault"
     assert driver.sent[-1][1] is None
+
+
+def test_a_listener_that_fails_does_not_keep_the_robot_from_damping(arm):
+    def broken(event):
+        if event.phase in ("run", "damp"):
+            raise BrokenPipeError("no terminal")
+
+    driver = Tampered(arm, SimulatedClock())
+    with pytest.raises(BrokenPipeError):
+        Controller(driver, arm, QUICK, clock=driver.clock, on_event=broken).run(play(MOTION, 0.02))
+    assert driver.sent[-1][1] is None
+
+
+@pytest.mark.parametrize("where", ["read", "policy", "compensator"])
+def test_a_period_that_stood_still_sends_nothing(arm, where):
+    clock = SimulatedClock()
+
+    class Standing(Tampered):
+        def read(self):
+            state = super().read()
+            stand("read")
+            return state
+
+    def stand(here, at=0.9):
+        if here == where and clock.now() >= at and not stood:
+            stood.append(clock.now())
+            clock.wait_until(clock.now() + 0.7)
+
+    class Model:
+        def reset(self, target, payload_mass=None): ...
+
+        def step(self, target, qpos, qvel):
+            stand("compensator")
+            return target
+
+    stood: list[float] = []
+    driver, motion = Standing(arm, clock), play(MOTION, 0.02)
+
+    def policy(k, state):
+        stand("policy")
+        return motion(k, state)
+
+    recording = Controller(driver, arm, QUICK, compensator=Model(), clock=clock).run(policy)
+    assert stood
+    assert recording.fault.kind == "overrun"
+    assert all(ctrl is None for t, ctrl in driver.sent if t > stood[0])
+
+
+def test_handing_over_holds_the_arms_while_the_weight_goes_to_zero(arm):
+    class Shared(Tampered):
+        at_end = "hand_over"
+        closed: list[bool]
+
+        def write(self, ctrl, weight=1.0):
+            weights.append((self.clock.now(), weight))
+            super().write(ctrl, weight)
+
+        def close(self, hold=False):
+            self.closed = [hold]
+
+    weights: list[tuple[float, float]] = []
+    driver = Shared(arm, SimulatedClock())
+    recording = run(arm, driver)
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "release", "stopped"]
+    released = [w for t, w in weights if t >= recording.events[-2].time]
+    assert released[0] == 1.0
+    assert released[-1] == 0.0
+    assert np.diff(released).max() <= 0
+    assert all(ctrl is not None for _, ctrl in driver.sent), "no damping: the arms would sink"
+    assert driver.closed == [True], "leaving sends nothing more"
+
+
+def test_a_fault_while_little_is_handed_over_damps_with_that_little(arm):
+    weights: list[float] = []
+
+    class Shared(Tampered):
+        def damp(self, weight=1.0):
+            weights.append(weight)
+            super().damp(weight)
+
+    driver = Shared(arm, SimulatedClock(), at=0.2, kind="hot")
+    recording = run(arm, driver)
+    assert recording.fault.kind == "temperature"
+    assert 0 < max(weights) < 0.7, "the robot keeps what it held"
 
 
 def test_a_slow_policy_is_an_overrun(arm):
@@ -265,7 +353,14 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
     class Guard:
         beats = 0
 
-        def beat(self):
+        def alive(self):
+            return True
+
+        def fired(self):
+            return False
+
+        def beat(self, weight):
+            assert guard.beats or not driver.sent, "from the first beat on it would damp the robot"
             self.beats += 1
             return True
 

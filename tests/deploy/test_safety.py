@@ -26,20 +26,24 @@ def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
 
 def test_no_command_ever_leaves_range_rate_or_torque(arm):
     rng = np.random.default_rng(0)
-    limits = Limits.of(arm.with_servos({"elbow": {"kp": 3.0}}), arm.joint_names, SafetyConfig())
-    limits.kd[:] = (0.0, 1.5)
+    limits = Limits.of(arm, arm.joint_names, SafetyConfig(), gains=(np.array([20.0, 3.0]), np.array([0.0, 1.5])))
     for _ in range(4):
         rows = MILLION // 4
         target, previous, qpos, qvel = (drawn(rng, s, rows) for s in (2.0, 1.5, 1.5, 3.0))
-        out = limit_command(target, previous, qpos, qvel, DT, limits)
+        age = 0.04 * rng.random((rows, 1)) ** 2
+        out = limit_command(target, previous, qpos, qvel, DT, limits, age)
         sent = out.feasible.all(axis=1)
         u, q, v = out.ctrl[sent], qpos[sent], qvel[sent]
-        assert 0.2 < sent.mean() < 0.99
+        assert 0.1 < sent.mean() < 0.99
         assert (u >= limits.low).all()
         assert (u <= limits.high).all()
         before = np.clip(previous[sent], limits.low, limits.high)
         assert (np.abs(u - before) <= limits.speed * DT).all()
         assert (np.abs(limits.kp * (u - q) - limits.kd * v) <= limits.effort).all()
+        # Where the joint really is by then, after any acceleration up to the stated one.
+        pushed = limits.acceleration * rng.uniform(-1, 1, v.shape).round(rng.integers(3))
+        q, v = q + v * age[sent] + pushed * age[sent] ** 2 / 2, v + pushed * age[sent]
+        assert (np.abs(limits.kp * (u - q) - limits.kd * v) <= limits.effort * (1 + 1e-9)).all()
 
 
 def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits):
@@ -54,6 +58,11 @@ def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits)
         u = low[part] + grid * (high - low)[part]
         possible = (np.abs(limits.kp * (u - qpos[part]) - limits.kd * qvel[part]) <= limits.effort).any(axis=0)
         assert not (possible & ~out.feasible[part]).any()
+
+
+def test_identified_gains_are_not_those_of_the_real_servo(arm):
+    identified = arm.with_servos({"elbow": {"kp": 3.0}})
+    assert Limits.of(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [20.0, 20.0]
 
 
 def test_a_harmless_command_passes_unchanged(limits):

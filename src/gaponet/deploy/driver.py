@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from gaponet.errors import GAPONetError
 
 Array = np.ndarray
+End = Literal["hand_over", "hold", "damp"]
 
 
 class DriverError(GAPONetError):
     """A robot cannot be reached, does not answer, or answers nonsense; the message says what to check."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why a robot was stopped: a kind of safety.FAULTS, and a sentence."""
+
+    kind: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -24,6 +33,8 @@ class State:
         time: When it was measured, on this machine's monotonic clock, s.
         qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not measure it.
         refused: Messages refused so far because their checksum was wrong.
+        tilt: Of the trunk against the vertical, rad; 0 where a robot does not measure it.
+        fault: What the robot itself says is wrong, or that its operator pressed stop; the driver remembers it.
     """
 
     time: float
@@ -32,6 +43,8 @@ class State:
     tau: Array
     temperature: Array
     refused: int = 0
+    tilt: float = 0.0
+    fault: Fault | None = None
 
 
 class Driver(Protocol):
@@ -43,6 +56,10 @@ class Driver(Protocol):
         joint_names: All joints of the robot, (n), in the order of every array.
         commanded: The joints that `write` commands; the others are left to whoever commands them.
         noisy: Readings of a working robot are never twice the same, so equal ones mean that it is frozen.
+        kp, kd: Gains that the real servos follow under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
+        facts: What a recording keeps about the servos beside (registers, kind of machine); final once connected.
+        at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
+            takes over), hold (servos keep the last target after `close`), damp (nobody holds it afterwards).
     """
 
     address: str
@@ -50,9 +67,13 @@ class Driver(Protocol):
     joint_names: tuple[str, ...]
     commanded: tuple[str, ...]
     noisy: bool
+    kp: Array
+    kd: Array
+    facts: dict[str, Any]
+    at_end: End
 
     def connect(self) -> None:
-        """Open the bus and wait for a first state; commands nothing.
+        """Open the bus and wait for a first state; commands nothing, publishes nothing.
 
         Raises:
             DriverError: Nobody answers, or not the robot that was expected.
@@ -72,8 +93,13 @@ class Driver(Protocol):
     def damp(self, weight: float = 1.0) -> None:
         """No position command: joints only brake, or are free where the hardware cannot brake."""
 
-    def close(self) -> None:
-        """Leave the bus, joints damped or free; never raises."""
+    def close(self, hold: bool = False) -> None:
+        """Leave the bus; never raises.
+
+        Args:
+            hold: Send nothing: nothing was commanded, or what was commanded last shall stay. Otherwise joints are left
+                damped or free.
+        """
 
     def guard(self) -> dict[str, object] | None:
         """How another process can damp this robot if this one dies (deploy.guard); None if it cannot."""

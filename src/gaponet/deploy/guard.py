@@ -1,12 +1,14 @@
 """A second process that damps the robot if the controller dies or hangs: `python -m gaponet.deploy.guard JSON`.
 
-The controller sends it a byte every period through a pipe. The pipe closes when the controller's process ends, however
-it ends (kill -9 too), and no byte comes when it hangs. It holds the controller's lock as long as it lives, so no
-other controller starts while it damps.
+The controller sends it a byte every period through a pipe, from just before its first command on: the weight of that
+command. The pipe closes when the controller's process ends, however it ends (kill -9 too), and no byte comes when it
+hangs. If no byte ever came, nothing was commanded, and nothing is sent. It holds the controller's lock as long as it
+lives, so no other controller starts while it damps.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -18,7 +20,9 @@ from typing import Any
 
 from gaponet.deploy.driver import Driver, DriverError
 
-BEAT, RELEASE, READY = b".", b"x", b"ready"
+RELEASE, READY, FIRED = b"\xff", b"ready\n", b"fired\n"
+STEPS = 200  # a beat is a weight in these parts of 1
+RETRY = 60.0  # s for which it tries to reach a robot that cannot be reached
 
 
 class Guard:
@@ -41,6 +45,7 @@ class Guard:
         assert self._process.stdout
         self._in, self._out = self._process.stdin, self._process.stdout
         os.set_blocking(self._in.fileno(), False)
+        self._fired = False
 
     def wait_ready(self, timeout: float = 20.0) -> None:
         """Return when it could damp.
@@ -49,14 +54,24 @@ class Guard:
             DriverError: It could not reach the robot.
         """
         ready, _, _ = select.select([self._out], [], [], timeout)
-        if not ready or READY not in self._out.readline():
+        if not ready or self._out.readline() != READY:
             self._process.kill()
             raise DriverError("the guard process could not reach the robot; see its message above")
 
-    def beat(self) -> bool:
-        """Say that the controller lives; False if the guard does not."""
+    def alive(self) -> bool:
+        """Whether it runs and has not taken this process for dead or hanging."""
+        return self._process.poll() is None and not self.fired()
+
+    def fired(self) -> bool:
+        """Whether it damps the robot, or has: nothing more may be sent."""
+        if not self._fired and select.select([self._out], [], [], 0)[0]:
+            self._fired = self._out.readline() == FIRED
+        return self._fired
+
+    def beat(self, weight: float) -> bool:
+        """Say that the controller lives and has commanded the robot with this weight; False if the guard is gone."""
         try:
-            self._in.write(BEAT)
+            self._in.write(bytes([round(STEPS * weight)]))
         except BlockingIOError:
             return True
         except (BrokenPipeError, ValueError):
@@ -88,29 +103,46 @@ def main(spec: dict[str, Any]) -> None:
     driver = open_driver(**spec)
     if early:
         driver.connect()
-    sys.stdout.buffer.write(READY + b"\n")
-    sys.stdout.buffer.flush()
-    begun = False
+    _say(READY)
+    weight = None  # of the controller's last command; None: nothing was commanded
     while True:
-        readable, _, _ = select.select([0], [], [], hang if begun else None)
+        readable, _, _ = select.select([0], [], [], None if weight is None else hang)
         data = os.read(0, 4096) if readable else b""
-        if RELEASE in data:
-            driver.close()
-            return
-        if not data:
+        if not data or RELEASE in data:
             break
-        begun = True
+        weight = data[-1] / STEPS
+    if weight is None or RELEASE in data:
+        driver.close(hold=True)
+        return
+    _say(FIRED)
     why = "ended" if readable else f"was silent for {hang * 1e3:.0f} ms"
     print(f"guard: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
-    if not early:
-        driver.connect()
-    _damp(driver, damp)
+    _damp(driver, damp, weight, connected=early)
 
 
-def _damp(driver: Driver, seconds: float) -> None:
-    start = time.monotonic()
-    while (passed := time.monotonic() - start) < seconds:
-        driver.damp(1.0 - passed / seconds)
+def _say(word: bytes) -> None:
+    with contextlib.suppress(BrokenPipeError):  # a controller that was killed does not listen
+        sys.stdout.buffer.write(word)
+        sys.stdout.buffer.flush()
+
+
+def _damp(driver: Driver, seconds: float, weight: float, connected: bool) -> None:
+    """Damp for some seconds from when the robot could be reached; what fails is tried again."""
+    began, since, said = time.monotonic(), None, ""
+    while since is None or time.monotonic() - since < seconds:
+        try:
+            if not connected:
+                driver.connect()
+                connected = True
+            since = since or time.monotonic()
+            driver.damp(weight * max(1.0 - (time.monotonic() - since) / seconds, 0.0))
+        except (DriverError, OSError) as error:
+            if str(error) != said:
+                said = str(error)
+                print(f"guard: {said}; trying again", file=sys.stderr, flush=True)
+            if time.monotonic() - began > RETRY:
+                print(f"guard: gave up on {driver.address} after {RETRY:g} s", file=sys.stderr, flush=True)
+                break
         time.sleep(0.01)
     driver.close()
 

@@ -65,7 +65,7 @@ class Recording:
     @property
     def fault(self) -> Event | None:
         """The fault that ended it, if one did."""
-        return next((e for e in self.events if e.phase == "damp" and e.kind not in ("end", "")), None)
+        return next((e for e in self.events if e.phase in ("damp", "stopped") and e.kind not in ("end", "")), None)
 
     def log(self, source: str = "controller", phase: str = "run") -> Log:
         """The periods of a phase as a Log of the commanded joints, time from its first period, s.

@@ -4,7 +4,8 @@ A position command leaves only if it is within
 
 1. the joint range less a margin,
 2. the command rate: |u − u_previous| ≤ speed · dt,
-3. the torque that it asks for: |kp (u − q) − kd q̇| ≤ share · effort limit,
+3. the torque that it asks for: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can have got to since it
+   was measured, accelerating at most as `acceleration` says,
 
 all three, for every joint. Each is an interval; the command is moved into their intersection. Range and rate always
 intersect, because the previous command was within the range. The torque interval follows the measured joint and may
@@ -21,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gaponet.deploy.driver import State
+from gaponet.deploy.driver import Fault, State
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 
@@ -40,6 +41,8 @@ class SafetyConfig:
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
     """Of a joint's effort limit that a command may ask for."""
+    acceleration: float = 100.0
+    """Fastest acceleration of a joint, rad/s²: how wrong an old state may be."""
     delta: float = 0.5
     """Largest correction of a model, rad."""
     delta_rate: float = 2.0
@@ -50,12 +53,16 @@ class SafetyConfig:
     """Control periods with new messages but equal readings until a state counts as frozen; 0: never."""
     frozen_travel: float = 0.3
     """Where readings may repeat (coarse encoders): rad that a command moves while nothing moves, until that counts."""
+    frozen_joint: float = 0.1
+    """Where they do not: rad by which one joint's command or its velocity moves on while its position stands still."""
     joint_speed: float = 12.0
     """A joint that moves faster between two states has jumped, rad/s."""
     jump: float = 0.05
     """rad allowed beyond that."""
     temperature: float = 85.0
     """Hottest motor, °C."""
+    tilt: float = 0.7
+    """Largest lean of the trunk, rad."""
     tracking: float = 0.6
     """Largest |command − measured|, rad, …"""
     tracking_time: float = 0.25
@@ -75,7 +82,7 @@ class SafetyConfig:
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds of the commands to some joints, (n) each: rad, rad, rad/s, N·m, N·m/rad, N·m·s/rad, rad, rad/s."""
+    """Bounds of the commands to some joints, (n) each: rad, rad, rad/s, N·m, N·m/rad, N·m·s/rad, rad, rad/s, rad/s²."""
 
     low: Array
     high: Array
@@ -85,10 +92,21 @@ class Limits:
     kd: Array
     delta: Array
     delta_rate: Array
+    acceleration: Array
 
     @classmethod
-    def of(cls, robot: RobotSpec, joints: tuple[str, ...], config: SafetyConfig) -> Limits:
-        """Limits of a robot's joints, in the order of `joints`."""
+    def of(
+        cls, robot: RobotSpec, joints: tuple[str, ...], config: SafetyConfig, gains: tuple[Array, Array] | None = None
+    ) -> Limits:
+        """Limits of a robot's joints, in the order of `joints`.
+
+        Args:
+            robot: Ranges and effort limits.
+            joints: Names.
+            config: The rest.
+            gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
+        """
+        kp, kd = gains or ((robot.nominal or robot).kp, (robot.nominal or robot).kd)
         at = robot.index(joints)
         low, high = robot.qpos_range[at, 0] + config.margin, robot.qpos_range[at, 1] - config.margin
         if (low > high).any():
@@ -96,8 +114,8 @@ class Limits:
             raise UsageError(f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller")
         full = lambda value: np.full(len(joints), value)  # noqa: E731
         return cls(
-            low, high, full(config.speed), config.torque_share * robot.effort_limit[at], robot.kp[at], robot.kd[at],
-            full(config.delta), full(config.delta_rate),
+            low, high, full(config.speed), config.torque_share * robot.effort_limit[at], kp[at], kd[at],
+            full(config.delta), full(config.delta_rate), full(config.acceleration),
         )  # fmt: skip
 
 
@@ -119,7 +137,9 @@ def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Arr
     return np.clip(wanted, -limits.delta, limits.delta)
 
 
-def limit_command(target: Array, previous: Array, qpos: Array, qvel: Array, dt: float, limits: Limits) -> Limited:
+def limit_command(
+    target: Array, previous: Array, qpos: Array, qvel: Array, dt: float, limits: Limits, age: Array | float = 0.0
+) -> Limited:
     """The nearest command to `target` within range, rate and torque, or the statement that there is none.
 
     Args:
@@ -128,14 +148,18 @@ def limit_command(target: Array, previous: Array, qpos: Array, qvel: Array, dt: 
         qpos, qvel: Measured, (..., n) rad and rad/s.
         dt: Control period, s.
         limits: Of these joints.
+        age: Of the state when the command leaves, s, or (..., n).
     """
     before = np.clip(previous, limits.low, limits.high)
     step = limits.speed * dt * (1 - ROUNDING)
     low, high = np.maximum(limits.low, before - step), np.minimum(limits.high, before + step)
     with np.errstate(divide="ignore", invalid="ignore"):
         brake, half = limits.kd * qvel / limits.kp, limits.effort * (1 - ROUNDING) / limits.kp
-        rounding = ROUNDING * np.abs(qpos + brake)
-        low, high = np.maximum(low, qpos + brake - half + rounding), np.minimum(high, qpos + brake + half - rounding)
+        # As measured, and where the joint can be by now: it went on and may have accelerated either way.
+        spread = limits.acceleration * age * (age / 2 + limits.kd / limits.kp)
+        for centre, width in ((qpos + brake, half), (qpos + qvel * age + brake, half - spread)):
+            rounding = ROUNDING * np.abs(centre)
+            low, high = np.maximum(low, centre - width + rounding), np.minimum(high, centre + width - rounding)
         finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
         feasible = finite & (low <= high)
         ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
@@ -146,14 +170,6 @@ def damping(kd: Array, qvel: Array, effort: Array) -> Array:
     """Damping gains (n) at most kd whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
     speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
     return np.minimum(kd, effort / np.maximum(speed, 1e-6))
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Why a robot was stopped: a kind of FAULTS, and a sentence."""
-
-    kind: str
-    text: str
 
 
 FAULTS = {
@@ -168,7 +184,10 @@ FAULTS = {
     "torque": "no position command is within range, rate and torque",
     "target": "the motion or the model gave something that is not a number",
     "driver": "the bus failed",
-    "stop": "asked for: key, signal or call",
+    "robot": "the robot itself reports an error, or is not the one that was connected",
+    "tilt": "the robot leans too far: it falls",
+    "error": "the motion, the model or this program failed",
+    "stop": "asked for: key, signal, call or the robot's remote",
 }
 
 
@@ -190,6 +209,8 @@ class Watch:
         self._last: State | None = None
         self._equal, self._travel = 0, np.zeros(len(commanded))
         self._ctrl: Array | None = None
+        self._anchor: Array | None = None
+        self._glided = np.zeros(len(commanded))
         self._astray = 0.0
         self._refused: list[tuple[float, int]] = []
 
@@ -203,21 +224,25 @@ class Watch:
             late: By how much this period starts late, s.
         """
         fault = (
-            self._overrun(late)
+            self.overrun(late)
             or self._stale(now, state)
             or self._finite(state)
+            or state.fault
+            or self._tilt(state)
             or self._jump(state)
             or self._hot(state)
             or self._frozen(state, ctrl)
+            or self._frozen_joint(state, ctrl)
             or self._tracking(state, ctrl)
             or self._checksum(now, state)
         )
         self._last, self._ctrl = state, ctrl
         return fault
 
-    def _overrun(self, late: float) -> Fault | None:
+    def overrun(self, late: float) -> Fault | None:
+        """What is wrong if a period that was due `late` s ago has not sent its command yet."""
         if late > self.config.overrun * self.dt:
-            return Fault("overrun", f"the period started {late * 1e3:.0f} ms late; make the loop lighter or slower")
+            return Fault("overrun", f"the period was {late * 1e3:.0f} ms late; make the loop lighter or slower")
         return None
 
     def _stale(self, now: float, state: State) -> Fault | None:
@@ -231,6 +256,11 @@ class Watch:
             bad = ~np.isfinite(getattr(state, name))
             if bad.any():
                 return Fault("nan", f"{name} of {self.names[int(bad.argmax())]} is not a number")
+        return None
+
+    def _tilt(self, state: State) -> Fault | None:
+        if not state.tilt <= self.config.tilt:
+            return Fault("tilt", f"the robot leans by {state.tilt:.2f} rad")
         return None
 
     def _jump(self, state: State) -> Fault | None:
@@ -262,6 +292,24 @@ class Watch:
         if self._equal < self.config.frozen or not (self.noisy or self._travel.max() > self.config.frozen_travel):
             return None
         return Fault("frozen", f"{self._equal + 1} states in a row read exactly the same")
+
+    def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
+        """One encoder that stands still while its command moves on or its velocity says that the joint does."""
+        qpos, last = state.qpos[self.commanded], self._last
+        if last is None or ctrl is None or not self.noisy:
+            self._anchor = ctrl
+            return None
+        moved = qpos != last.qpos[self.commanded]
+        anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
+        passed = max(state.time - last.time, 0.0)
+        self._anchor, self._glided = anchor, np.where(moved, 0.0, self._glided + state.qvel[self.commanded] * passed)
+        beyond = np.maximum(np.abs(ctrl - anchor), np.abs(self._glided))
+        worst = int(beyond.argmax())
+        if beyond[worst] <= self.config.frozen_joint:
+            return None
+        joint = self.names[int(self.commanded[worst])]
+        far = f"{beyond[worst]:.2f} rad"
+        return Fault("frozen", f"the position of {joint} stands still while its command or velocity goes {far}")
 
     def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
         error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])

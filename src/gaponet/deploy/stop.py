@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -61,11 +61,15 @@ class Keys:
 
     def poll(self) -> None:
         """Look, without waiting."""
-        if self._before is not None and select.select([sys.stdin], [], [], 0)[0]:
-            self.stop(f"key {sys.stdin.read(1)!r}")
+        try:
+            if self._before is not None and select.select([sys.stdin], [], [], 0)[0]:
+                self.stop(f"key {sys.stdin.read(1)!r}")
+        except OSError as error:
+            self.stop(f"the terminal is gone ({error})")
 
     def __exit__(self, *_: object) -> None:
         if self._before is not None:
             import termios
 
-            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
+            with suppress(termios.error):  # the terminal is gone
+                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)  # type: ignore[arg-type]

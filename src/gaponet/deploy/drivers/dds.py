@@ -3,6 +3,10 @@
 
 The classes below are what other participants see of our types. They carry a message as bytes: `serialize` and
 `deserialize`, which cyclonedds calls on every sample, hand them through instead of walking 500 fields.
+
+What is uint8 in Unitree's IDL is byte here: the wire is the same, and uint8 as cyclonedds 11 describes it ends every
+program on libddsc 0.10, Unitree's SDK among them, with a null pointer in its discovery (eclipse-cyclonedds/cyclonedds
+issue 1554; tests/deploy/test_peers.py).
 """
 
 import time
@@ -19,7 +23,7 @@ try:
     from cyclonedds.domain import Domain, DomainParticipant
     from cyclonedds.idl import IdlStruct
     from cyclonedds.idl import annotations as annotate
-    from cyclonedds.idl.types import array, float32, int16, uint8, uint32
+    from cyclonedds.idl.types import array, byte, float32, int16, uint32
     from cyclonedds.pub import DataWriter
     from cyclonedds.qos import Policy, Qos
     from cyclonedds.sub import DataReader
@@ -51,7 +55,7 @@ class IMUState(IdlStruct, typename="unitree_hg.msg.dds_.IMUState_"):
 class MotorState(IdlStruct, typename="unitree_hg.msg.dds_.MotorState_"):
     """What a motor says."""
 
-    mode: uint8
+    mode: byte
     q: float32
     dq: float32
     ddq: float32
@@ -69,7 +73,7 @@ class MotorState(IdlStruct, typename="unitree_hg.msg.dds_.MotorState_"):
 class MotorCmd(IdlStruct, typename="unitree_hg.msg.dds_.MotorCmd_"):
     """What a motor is told."""
 
-    mode: uint8
+    mode: byte
     q: float32
     dq: float32
     tau: float32
@@ -85,12 +89,12 @@ class LowState(IdlStruct, typename="unitree_hg.msg.dds_.LowState_"):
     """rt/lowstate."""
 
     version: array[uint32, 2]
-    mode_pr: uint8
-    mode_machine: uint8
+    mode_pr: byte
+    mode_machine: byte
     tick: uint32
     imu_state: IMUState
     motor_state: array[MotorState, 35]
-    wireless_remote: array[uint8, 40]
+    wireless_remote: array[byte, 40]
     reserve: array[uint32, 4]
     crc: uint32
 
@@ -101,8 +105,8 @@ class LowState(IdlStruct, typename="unitree_hg.msg.dds_.LowState_"):
 class LowCmd(IdlStruct, typename="unitree_hg.msg.dds_.LowCmd_"):
     """rt/lowcmd and rt/arm_sdk."""
 
-    mode_pr: uint8
-    mode_machine: uint8
+    mode_pr: byte
+    mode_machine: byte
     motor_cmd: array[MotorCmd, 35]
     reserve: array[uint32, 4]
     crc: uint32

@@ -14,11 +14,11 @@ import contextlib
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.deploy.driver import DriverError, State
+from gaponet.deploy.driver import DriverError, End, State
 from gaponet.deploy.drivers import feetech as reg
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
@@ -40,6 +40,7 @@ class SO101Driver:
 
     virtual = False
     noisy = False  # a resting encoder reads the same for ever
+    at_end: End = "hold"
 
     def __init__(
         self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None, timeout: float = 0.01
@@ -58,6 +59,8 @@ class SO101Driver:
         self.address = port
         self.joint_names = self.commanded = robot.joint_names
         self.servos, self.middle, self.sign = read_calibration(calibration, robot)
+        self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
+        self.facts: dict[str, Any] = {}
         self._serial: Serial | None = None
         self._enabled = False
 
@@ -138,12 +141,13 @@ class SO101Driver:
         except self._lost as error:
             raise DriverError(f"{self.port}: {error}") from None
 
-    def close(self) -> None:
-        """Torque off, port closed."""
+    def close(self, hold: bool = False) -> None:
+        """Torque off, or as it is, and port closed."""
         if self._serial is None:
             return
         with contextlib.suppress(DriverError):
-            self.damp()
+            if not hold:
+                self.damp()
         self._serial.close()
         self._serial = None
 

@@ -2,9 +2,10 @@
 
 Facts from Unitree's public SDK examples (h1_2_arm_sdk_dds_example.cpp, h1_2_low_level_example.py): motor numbers,
 topics, the weight of rt/arm_sdk in q of motor 27, mode 1 = enabled, mode_machine echoed from the state, mode_pr 0 for
-pitch/roll ankles. Tested against a virtual robot on real DDS only. Not checked, for want of a robot: that `tick` counts
-milliseconds (measured when connecting; arrival times are used where it does not), how the robot behaves when commands
-cease, and the sign and scale of tau_est. The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one
+pitch/roll ankles. Tested against a virtual robot and against programs on Unitree's IDL and DDS version only. Not
+checked, for want of a robot: that `tick` counts milliseconds (measured when connecting; arrival times are used where it
+does not), how the robot behaves when commands cease, the sign and scale of tau_est, that slots without a motor stay
+zero, that motorstate is 0 where all is well. The arm_sdk example numbers the wrists yaw, pitch, roll, the low-level one
 roll, pitch, yaw (17 to 19 and 24 to 26): ours follows the latter, as the MJCF does; check it with one small wrist
 motion first.
 """
@@ -13,11 +14,12 @@ from __future__ import annotations
 
 import contextlib
 import time
-from typing import TYPE_CHECKING, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from gaponet.deploy.driver import DriverError, State
+from gaponet.deploy.driver import DriverError, End, Fault, State
 from gaponet.deploy.drivers import hg
 from gaponet.deploy.safety import damping
 from gaponet.errors import UsageError
@@ -37,11 +39,14 @@ MOTOR_NAMES = (
     "torso_joint",
     *(f"{side}_{joint}_joint" for side in ("left", "right") for joint in ARM),
 )
+SPOKEN = ("mode", "q", "dq", "tau_est", "temperature", "vol", "motorstate")
 WEIGHT_MOTOR = 27
 DAMPING = 4.0  # times the robot's kd: 8 N·m·s/rad at the shoulder, where a straight arm then sinks at about 1 rad/s
 VIRTUAL_MARK = 0x54524956  # "VIRT" in LowState.reserve[0], written by our virtual robot
 TICKS = (0.001, 0.002)  # s, what a tick may be
 DRIFT = 2e-4  # how much slower the robot's clock may run than ours
+G1_MACHINES = (1, 2, 3, 4, 5, *range(10, 17))  # mode_machine of a G1 (unitree_ros); 6 is said of both, slots decide
+SELECT, L2_B = 1 << 3, 1 << 5 | 1 << 9  # stop keys in bytes 2 and 3 of wireless_remote
 CONNECT = 3.0  # s to wait for a robot
 LISTEN = 0.4  # s to listen for its rate
 
@@ -62,7 +67,7 @@ class UnitreeDriver:
     ) -> None:
         """
         Args:
-            robot: The H1-2; its kp and kd are sent with every command.
+            robot: The H1-2; its kp and kd, as before any identification, are sent with every command.
             topic: arm_sdk leaves legs and balance to the robot; lowcmd switches off all motors that are not commanded
                 and is for a robot that hangs.
             joints: arms, upper_body (with torso), or all.
@@ -76,6 +81,9 @@ class UnitreeDriver:
             raise UsageError("rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd")
         first = {"arms": 13, "upper_body": 12, "all": 0}[joints]
         self.robot, self.topic, self.joints = robot, topic, joints
+        self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
+        self.facts: dict[str, Any] = {}
+        self.at_end: End = "hand_over" if topic == "arm_sdk" else "damp"
         self.domain, self.interface, self.sole = domain, interface, sole
         self.address = f"unitree dds domain {domain}"
         self.virtual = False
@@ -85,6 +93,8 @@ class UnitreeDriver:
         self._at = robot.index(self.commanded)
         self._command = hg.LowCmd.new()
         self._refused = 0
+        self._fault: Fault | None = None  # the first one that the robot told; it may be in one message only
+        self._state: State | None = None
         self._bus: Bus | None = None
 
     def connect(self) -> None:
@@ -102,38 +112,53 @@ class UnitreeDriver:
                 f"{others} other participant(s) publish {topic} on {self.interface}; stop them first (on the "
                 "robot: leave debug programs, and for lowcmd release the motion mode)"
             )
-        seen = self._listen()
-        self._clock = TickClock(*seen)
-        self._state: State | None = None
-        deadline = time.monotonic() + CONNECT
-        while self._state is None:
-            self._drain()
-            if time.monotonic() > deadline:
-                raise DriverError(
-                    f"rt/lowstate on {self.interface} has {self._refused} messages, all with a wrong checksum"
-                )
-            time.sleep(0.001)
+        heard = self._listen()
+        self._require_h1_2([data for _, data in heard])
+        self._clock = TickClock([now for now, _ in heard], [int(hg.LowState.view(d, "tick")[0]) for _, d in heard])
+        self._state = self._decode(heard[-1][1], heard[-1][0])
         hg.LowCmd.view(self._command, "mode_machine")[:] = self._machine
+        self.facts = {"mode_machine": self._machine, "topic": self.topic}
 
-    def _listen(self) -> tuple[list[float], list[int]]:
-        """Arrival times and ticks of a while."""
-        arrivals: list[float] = []
-        ticks: list[int] = []
+    def _listen(self) -> list[tuple[float, Array]]:
+        """Intact messages of a while, and when they came."""
+        heard: list[tuple[float, Array]] = []
         start = time.monotonic()
-        while not arrivals or time.monotonic() < arrivals[0] + LISTEN:
+        while not heard or time.monotonic() < heard[0][0] + LISTEN:
             now = time.monotonic()
             for data in self._dds.receive(self._reader)[-1:]:
-                if len(data) == hg.LowState.wire_size and hg.LowState.intact(data):
-                    arrivals.append(now)
-                    ticks.append(int(hg.LowState.view(data, "tick")[0]))
-            if now - start > CONNECT and not arrivals:
+                if self._intact(data):
+                    heard.append((now, data))
+            if now - start > CONNECT and not heard:
+                wrong = f"; {self._refused} messages came, all damaged or of another type" if self._refused else ""
                 raise DriverError(
                     f"nobody speaks on rt/lowstate, domain {self.domain}, interface {self.interface}, within "
-                    f"{CONNECT:g} s. Is the robot on, the cable in, the interface right? A virtual "
+                    f"{CONNECT:g} s{wrong}. Is the robot on, the cable in, the interface right? A virtual "
                     "one: gaponet virtual serve"
                 )
             time.sleep(0.001)
-        return arrivals, ticks
+        return heard
+
+    def _intact(self, data: Array) -> bool:
+        """Whether a message is whole; others are counted."""
+        intact = len(data) == hg.LowState.wire_size and hg.LowState.intact(data)
+        self._refused += not intact
+        return intact
+
+    def _require_h1_2(self, heard: list[Array]) -> None:
+        """Refuse a robot that is not an H1-2: by its kind, and by which of the 35 motor slots ever say anything."""
+        self._machine = int(hg.LowState.view(heard[-1], "mode_machine")[0])
+        said = [np.abs(hg.LowState.motors(data, name)).reshape(hg.MOTORS, -1) for data in heard for name in SPOKEN]
+        spoken = np.concatenate(said, axis=1).max(axis=1) != 0
+        strange, silent = np.flatnonzero(spoken[len(MOTOR_NAMES) :]), np.flatnonzero(~spoken[: len(MOTOR_NAMES)])
+        if self._machine in G1_MACHINES:
+            found = f"its mode_machine is {self._machine}, a G1's"
+        elif len(strange):
+            found = f"there are motors in slots {', '.join(str(len(MOTOR_NAMES) + i) for i in strange)}, a G1's"
+        elif len(silent):
+            found = f"no motor in slot {silent[0]}, {MOTOR_NAMES[silent[0]]}"
+        else:
+            return
+        raise DriverError(f"the robot on {self.interface} is not an H1-2: {found}; nothing was sent")
 
     def read(self) -> State:
         """The newest state whose checksum is right; its time is the robot's, mapped to ours (TickClock)."""
@@ -144,35 +169,50 @@ class UnitreeDriver:
     def _drain(self) -> None:
         now, newest = time.monotonic(), None
         for data in self._dds.receive(self._reader):
-            if len(data) != hg.LowState.wire_size or not hg.LowState.intact(data):
-                self._refused += 1
-            else:
+            if self._intact(data):
                 newest = data
+                self._fault = self._fault or self._told(data)
         if newest is not None:
             self._state = self._decode(newest, now)
         elif self._state is not None and self._refused != self._state.refused:
-            s = self._state
-            self._state = State(s.time, s.qpos, s.qvel, s.tau, s.temperature, self._refused)
+            self._state = replace(self._state, refused=self._refused)
+
+    def _told(self, data: Array) -> Fault | None:
+        """What a robot says itself: its operator's stop keys, motor errors, that it is another one."""
+        keys = int(hg.LowState.view(data, "wireless_remote")[2:4].view("<u2")[0])
+        if keys & SELECT or keys & L2_B == L2_B:
+            return Fault("stop", f"asked to stop: {'select' if keys & SELECT else 'L2 + B'} on the robot's remote")
+        machine = int(hg.LowState.view(data, "mode_machine")[0])
+        if machine != self._machine:
+            return Fault("robot", f"mode_machine changed from {self._machine} to {machine}")
+        errors = hg.LowState.motors(data, "motorstate")[: len(MOTOR_NAMES)]
+        if errors.any():
+            motor = int(errors.argmax())
+            return Fault("robot", f"{MOTOR_NAMES[motor]} reports error 0x{errors[motor]:x}")
+        return None
 
     def _decode(self, data: Array, now: float) -> State:
         message, at = hg.LowState, self._motor
         measured = self._clock.time(int(message.view(data, "tick")[0]), now)
-        self._machine = int(message.view(data, "mode_machine")[0])
         self.virtual = int(message.view(data, "reserve")[0]) == VIRTUAL_MARK
         q, dq, tau = (message.motors(data, name)[at].astype(float) for name in ("q", "dq", "tau_est"))
         temperature = message.motors(data, "temperature")[at].max(axis=1).astype(float)  # case and winding
-        return State(measured, q, dq, tau, temperature, self._refused)
+        _, x, y, _ = quaternion = message.view(data, "imu_state.quaternion").astype(float)
+        # The vertical's share along the trunk; a quaternion that is none gives NaN, which is a tilt too.
+        upright = 1.0 - 2.0 * (x * x + y * y) if abs(np.linalg.norm(quaternion) - 1.0) < 0.1 else np.nan
+        tilt = float(np.arccos(np.clip(upright, -1.0, 1.0)))
+        return State(measured, q, dq, tau, temperature, self._refused, tilt, self._fault)
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Targets with the robot's gains; on rt/arm_sdk the weight tells how far it hands over."""
-        self._send(ctrl, self.robot.kp, self.robot.kd, weight)
+        self._send(ctrl, self.kp, self.kd, weight)
 
     def damp(self, weight: float = 1.0) -> None:
         """Stiffness zero and damping gains, no more than the effort limits allow at the present speed."""
         state = self._state
         qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
         qvel = state.qvel if state else np.zeros(len(self._motor))
-        kd = damping(DAMPING * self.robot.kd, qvel, self.robot.effort_limit)
+        kd = damping(DAMPING * self.kd, qvel, self.robot.effort_limit)
         self._send(qpos, np.zeros_like(kd), kd, weight)
 
     def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:
@@ -188,12 +228,13 @@ class UnitreeDriver:
         hg.LowCmd.seal(data)
         self._dds.send(self._writer, self._dds.LowCmd, data)
 
-    def close(self) -> None:
-        """Leave the bus; on rt/arm_sdk the last word is weight 0: the arms are the robot's own again."""
+    def close(self, hold: bool = False) -> None:
+        """Leave the bus; after damping on rt/arm_sdk the last word is weight 0: the arms are the robot's own again."""
         if self._bus is None:
             return
         with contextlib.suppress(DriverError):
-            self.damp(0.0)
+            if not hold:
+                self.damp(0.0)
         self._bus = self._reader = self._writer = None  # type: ignore[assignment]
 
     def guard(self) -> dict[str, object] | None:

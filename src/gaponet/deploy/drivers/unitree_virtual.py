@@ -76,6 +76,7 @@ class VirtualH12:
         """
         from gaponet.deploy.drivers import dds
 
+        robot = robot.nominal or robot
         self._dds, bus = dds, dds.Bus(domain, interface)
         self.robot, self.rate, self.fault, self.fault_at = robot, rate, fault, fault_at
         self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order

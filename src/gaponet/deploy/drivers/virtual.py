@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gaponet.deploy.clock import Clock
-from gaponet.deploy.driver import DriverError, State
+from gaponet.deploy.driver import DriverError, End, State
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.virtual.physics import Physics
@@ -69,6 +71,7 @@ class VirtualDriver:
 
     virtual = True
     noisy = True
+    at_end: End = "hold"
 
     def __init__(
         self,
@@ -92,6 +95,9 @@ class VirtualDriver:
             seed: Of its noise.
             period: Between two states, s.
         """
+        robot = robot.nominal or robot  # the hidden physics replaces what was identified
+        self.kp, self.kd = robot.kp, robot.kd
+        self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name}"
         self.joint_names = robot.joint_names
         self.clock, self._given = clock, (robot, physics, payload, start, seed, period)
@@ -122,16 +128,16 @@ class VirtualDriver:
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Takes effect after the unit's own command delay."""
-        self.live.set_gains(self.live.robot.kp, self.live.robot.kd)
+        self.live.set_gains(self.kp, self.kd)
         self.live.ctrl[self._at] = ctrl[self._at]
 
     def damp(self, weight: float = 1.0) -> None:
         """Stiffness zero, damping four times the robot's, on the commanded joints."""
-        kp, kd = self.live.robot.kp.copy(), self.live.robot.kd.copy()
+        kp, kd = self.kp.copy(), self.kd.copy()
         kp[self._at], kd[self._at] = 0.0, DAMPING * kd[self._at]
         self.live.set_gains(kp, kd)
 
-    def close(self) -> None:
+    def close(self, hold: bool = False) -> None:
         """Nothing is left: the robot ends with the process."""
 
     def guard(self) -> None:
