@@ -22,7 +22,7 @@ NUMBERS = (
 WORDS = (
     "", "x", "..", "../../secret/file", "/etc/passwd", "[red]m[/]", "$(id)", "<b>&", "a\nb", "a/b", "é∆", "\x00",
     "\x1b[31m", "{0}", "{chunk_index:099999999d}", "{chunk_index.__class__.__mro__}", "{file_index}/../..", "%s",
-    "A" * 300, "A" * 140_000, "nan", "None", "true", "positions", "time", "ctrl.elbow", "qpos", "v9.9", "-", "--help", " ",
+    "A" * 300, "A" * 140_000, "nan", "None", "positions", "time", "ctrl.elbow", "qpos", "v9.9", "-", "--help", " ",
 )  # fmt: skip
 VALUES: tuple[Any, ...] = (
     None, True, False, 0, 1, -1, 2, 10**9, 10**30, 2**63, -(2**63) - 1, 0.5, -0.5, 1e-9, 1e30, 1e308, float("nan"),
