@@ -206,9 +206,7 @@ def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
         replace(RECIPE, repetitions=0)
     file = tmp_path / "mine.toml"
     file.write_text('motions = ["*"]\npayloads = [0]\nunit = ["virtual-1"]\n')
-    with pytest.raises(
-        UsageError, match=r"mine.toml: 'unit' is not a field of a recipe; fields are name, payloads, units"
-    ):
+    with pytest.raises(UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"):
         load_recipe(file)
     file.write_text('motions = ["*"]\nunits = ["virtual-1"]\n')
     with pytest.raises(UsageError, match=r"mine.toml: 'payloads' is missing; add payloads = \[\.\.\.\]"):

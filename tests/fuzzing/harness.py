@@ -196,14 +196,14 @@ def _work(
     targets: list[Target], plan: list[tuple[int, int]], seed: int, keep: Path | None, room: Path, pipe: Any
 ) -> None:
     """A worker: its mutants one after the other, below an empty folder."""
-    quiet = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(quiet, 1)
-    os.dup2(quiet, 2)
-    sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
     untouched = {i: targets[i].files() for i in sorted({i for i, _ in plan})}
     for i, files in untouched.items():  # must be taken: a fuzzer of what is refused anyway finds nothing
         _lay(files, room)
         targets[i].use(room / "in", room / "out")
+    quiet = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(quiet, 1)
+    os.dup2(quiet, 2)
+    sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
     sys.addaudithook(_watch)
     _limit_memory()
     pipe.send("begin")

@@ -21,6 +21,9 @@ Array = np.ndarray
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
+SHORTEST, LONGEST = 1e-4, 1.0  # periods, s
+MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
+MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
 LEVELS = ("joint", "upper_body", "whole_body")
 
 
@@ -89,8 +92,8 @@ class Sequence:
     temperature: Array | None = None
 
     def __post_init__(self) -> None:
-        if not 1e-4 <= self.dt <= 1.0:
-            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected 0.0001 to 1")
+        if not SHORTEST <= self.dt <= LONGEST:
+            raise LogError(f"{self.meta.source}: dt is {self.dt} s; expected {SHORTEST} to {LONGEST:g}")
         shape = (len(self.ctrl), len(self.joint_names))
         for name in ARRAYS:
             value = getattr(self, name)
@@ -181,7 +184,8 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
     is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz); or the exact period where
     the format states one. Otherwise measurements are interpolated and commands held on a grid of the state's median
-    period. The manifest says which.
+    period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms or above 1 s, a gap
+    of more than 2 s, three times as many rows as were recorded, a stated period that the timestamps contradict.
 
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
@@ -191,7 +195,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     """
     time = log.channels["qpos"].time
     period = np.diff(time)
-    median = float(np.median(period))
+    median = _median_period(log)
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
     regular = bool(shared and (np.abs(period - median) <= 0.1 * median).all() and dt is None)
     if regular:
@@ -222,6 +226,35 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else "of robot.toml" for n in gains]
     notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
+
+
+def _median_period(log: Log) -> float:
+    """Of the state, s; a clock that cannot be right is refused before anything is put on a grid."""
+    time = log.channels["qpos"].time
+    period = np.diff(time)
+    median, longest = float(np.median(period)), int(period.argmax())
+    if not SHORTEST <= median <= LONGEST:
+        raise LogError(
+            f"{log.source}: the median period is {median:.3g} s, expected {SHORTEST} to {LONGEST:g}; is the unit of "
+            "time right (tables: --time-unit)?"
+        )
+    if period[longest] > MAX_GAP:
+        raise LogError(
+            f"{log.row('qpos', longest + 1)}: {period[longest]:.4g} s after the row before it; longer gaps than "
+            f"{MAX_GAP:g} s are not filled: cut the log there, or mend a clock that jumped"
+        )
+    if time[-1] - time[0] > MAX_GROWTH * median * len(time):
+        raise LogError(
+            f"{log.source}: {len(time)} rows lie in bursts over {time[-1] - time[0]:.4g} s: at their median period of "
+            f"{median * 1e3:.3g} ms there would be {(time[-1] - time[0]) / median:.0f}; mend the timestamps"
+        )
+    stated = log.meta.get("dt", median)
+    if abs(stated - median) > 0.1 * stated:
+        raise LogError(
+            f"{log.source}: the period is said to be {stated:.6g} s, but the timestamps are {median:.6g} s apart; mend "
+            "one of them"
+        )
+    return median
 
 
 def _resample(log: Log, dt: float) -> dict[str, Array]:

@@ -6,10 +6,14 @@ rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: 
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gaponet.data.formats import refuse_degrees
+from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.errors import LogError
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
@@ -17,6 +21,7 @@ from gaponet.robot import RobotSpec
 Array = np.ndarray
 
 SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
+LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz
 SUFFIXES = (".txt", ".csv", ".npz")
 
 
@@ -40,11 +45,17 @@ def read_motion(
         raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise LogError(f"{path}: no such file")
+    if path.stat().st_size > LARGEST:
+        raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
     period = dt or period or SAGE_DT
-    columns = robot.index([robot.resolve(name, str(path), extra) for name in names])
-    if len(set(columns.tolist())) != len(columns):
+    if not SHORTEST <= period <= LONGEST:
+        raise LogError(f"{path}: its period is {period:g} s; expected {SHORTEST} to {LONGEST:g}")
+    joints = tuple(robot.resolve(name, str(path), extra) for name in names)
+    columns = robot.index(joints)
+    if len(set(joints)) != len(joints):
         raise LogError(f"{path}: two columns are the same joint of {robot.name}; delete one")
+    refuse_degrees(rows, joints, robot, lambda row: f"{path}: command {row + 1}")
     ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
     ctrl[:, columns] = rows
     return Motion(path.stem, level_of(ctrl, robot), period, ctrl)
@@ -107,12 +118,25 @@ def _text(path: Path) -> tuple[list[str], Array, float | None]:
 
 
 def _npz(path: Path) -> tuple[list[str], Array, float | None]:
-    with np.load(path, allow_pickle=False) as file:
-        for key in ("joint_names", "ctrl"):
-            if key not in file:
-                raise LogError(f"{path}: array '{key}' is missing; it holds {', '.join(file.files)}")
-        names, rows = [str(name) for name in file["joint_names"]], np.asarray(file["ctrl"], float)
-        dt = float(file["dt"]) if "dt" in file else None
-    if rows.ndim != 2 or rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
+    try:
+        with zipfile.ZipFile(path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size > LARGEST:
+            raise LogError(f"{path}: unpacks to more than {LARGEST >> 20} MiB; cut it into shorter motions")
+        with np.load(path, allow_pickle=False) as file:
+            arrays: dict[str, Any] = {name: file[name] for name in ("joint_names", "ctrl", "dt") if name in file}
+    except LogError:
+        raise
+    except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds for a damaged file, and name none
+        reason = f"{type(error).__name__}: {error}"
+        raise LogError(f"{path}: not a readable npz file ({reason}); write it again") from None
+    for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
+        if name not in arrays and name != "dt":
+            raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'no other either'}")
+        if name in arrays and (arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions):
+            what = "text" if kind == "U" else "numbers"
+            raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")
+    names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
+    if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
         raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
-    return names, rows, dt
+    return names, rows, float(arrays["dt"]) if "dt" in arrays else None

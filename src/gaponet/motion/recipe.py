@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
 from gaponet.packaged import load_toml
+from gaponet.structure import validated
 
 RECIPES = Path(__file__).parent / "recipes"
+MOST_TAKES = 1_000_000
+
+Name = Annotated[str, Len(1, 200)]
+Count = Annotated[int, Interval(ge=1, le=10_000)]
+Names = Annotated[tuple[Name, ...], Len(0, 1000)]
 
 
 @dataclass(frozen=True)
@@ -30,14 +38,14 @@ class Recipe:
     """
 
     name: str
-    payloads: tuple[float, ...]
-    units: tuple[str, ...]
-    motions: tuple[str, ...] = ()
-    files: tuple[str, ...] = ()
-    rates: tuple[float, ...] = (50.0,)
-    repetitions: int = 1
-    variants: int = 1
-    payload_side: str = "both"
+    payloads: Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(0, 1000)]
+    units: Names
+    motions: Names = ()
+    files: Names = ()
+    rates: Annotated[tuple[Annotated[float, Interval(ge=1, le=10_000)], ...], Len(0, 1000)] = (50.0,)
+    repetitions: Count = 1
+    variants: Count = 1
+    payload_side: Name = "both"
 
     def __post_init__(self) -> None:
         for field in ("payloads", "units", "rates"):
@@ -73,16 +81,9 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
         UsageError: No such recipe, or a field is unknown, missing or empty; with the file and what to write.
     """
     path, table = load_toml("recipe", RECIPES, name_or_path)
-    known_fields = [f.name for f in fields(Recipe)]
-    for key in table:
-        if key not in known_fields:
-            raise UsageError(f"{path}: '{key}' is not a field of a recipe; fields are {', '.join(known_fields)}")
-    for key in ("payloads", "units"):
-        if key not in table:
-            raise UsageError(f"{path}: '{key}' is missing; add {key} = [...]")
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in table.items()}
-    values["files"] = tuple(str(path.parent / f) for f in values.get("files", ()))
-    return Recipe(**({"name": path.stem} | values))
+    hint = f"fields are {', '.join(Recipe.__dataclass_fields__)}"
+    recipe = validated(Recipe, {"name": path.stem} | table, path, UsageError, hint)
+    return replace(recipe, files=tuple(str(path.parent / file) for file in recipe.files))
 
 
 def takes(recipe: Recipe, names: list[str]) -> list[Take]:
@@ -98,9 +99,13 @@ def takes(recipe: Recipe, names: list[str]) -> list[Take]:
             raise UsageError(f"recipe '{recipe.name}': no motion of this robot matches '{pattern}'")
         motions += found or [pattern]
     motions += [Path(file).stem for file in recipe.files]
+    motions = list(dict.fromkeys(motions))
+    count = len(motions) * len(recipe.rates) * len(recipe.payloads) * len(recipe.units) * recipe.repetitions
+    if count > MOST_TAKES:
+        raise UsageError(f"recipe '{recipe.name}': {count} sequences; at most {MOST_TAKES} in one recipe")
     return [
         Take(motion, unit, float(payload), float(rate), repetition)
-        for motion in dict.fromkeys(motions)
+        for motion in motions
         for rate in recipe.rates
         for payload in recipe.payloads
         for unit in recipe.units

@@ -213,8 +213,8 @@ def test_timestamps_that_are_not_regular_are_believed(so101, tmp_path):
     ("change", "complaint"),
     [
         ({"codebase_version": "v2.1"}, r"codebase_version is v2\.1, this reads v3\.0; convert the set with lerobot's"),
-        ({"fps": 0}, "fps is 0; expected 1 to 10000"),
-        ({"fps": None}, r"not a LeRobot info\.json"),
+        ({"fps": 0}, r"info\.json: fps: should be greater than or equal to 1, not 0; download or"),
+        ({"fps": None}, r"info\.json: fps: should be a valid number, not None"),
         ({"features": {}}, "no feature 'action'"),
     ],
     ids=["older version", "no rate", "damaged", "no action"],

@@ -9,7 +9,8 @@ A format is a module with
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.data.log import Log
+from gaponet.data.log import CHANNELS, DERIVED, Log
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 
@@ -29,6 +30,9 @@ FORMATS = {
     "lerobot": "LeRobotDataset v3.0 folder: meta/info.json",
 }
 TABLES = (".csv", ".parquet")
+UNITS = CHANNELS | DERIVED
+# Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
+MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
 
 
 def detect(path: Path) -> str:
@@ -102,20 +106,42 @@ def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: li
     return out
 
 
-def refuse_degrees(log: Log, robot: RobotSpec) -> Log:
-    """Return the log, or refuse positions that can only be degrees (or another joint's).
+def refuse_absurd(log: Log, robot: RobotSpec) -> Log:
+    """Return the log, or refuse positions that can only be degrees (or another joint's), and what no motor does.
+
+    A sensor may read more torque than the motor has, not 20 times as much.
+    """
+    columns = robot.index(log.joint_names)
+    for name in (n for n in UNITS if n in log.channels):
+        values = log.channels[name].values
+        if name in ("ctrl", "qpos"):
+            refuse_degrees(values, log.joint_names, robot, partial(_place, log, name))
+            continue
+        most = np.maximum(20 * robot.effort_limit[columns], 100.0) if name == "tau" else MOST[name]
+        beyond = np.argwhere(np.abs(values) > most)
+        if len(beyond):
+            row, column = beyond[0]
+            raise LogError(
+                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
+                f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
+            )
+    return log
+
+
+def _place(log: Log, name: str, row: int) -> str:
+    return f"{log.row(name, row)}: {name}"
+
+
+def refuse_degrees(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
+    """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
 
     A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
     """
-    for name in ("ctrl", "qpos"):
-        values = log.channels[name].values
-        for column, joint in enumerate(log.joint_names):
-            row = int(abs(values[:, column]).argmax())
-            value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
-            if abs(value) > 3.3 and not low - 1.0 <= value <= high + 1.0:
-                raise LogError(
-                    f"{log.row(name, row)}: {name} of {joint} is {value:.3f}, outside its range "
-                    f"[{low:.2f}, {high:.2f}] rad; positions must be in radians: these look like degrees "
-                    "(tables: --position-unit deg)"
-                )
-    return log
+    for column, joint in enumerate(joint_names):
+        row = int(abs(values[:, column]).argmax())
+        value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
+        if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
+            raise LogError(
+                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
+                "must be in radians: these look like degrees (tables: --position-unit deg)"
+            )

@@ -13,20 +13,23 @@ its units, periods and metadata itself. Images and videos are left alone.
 
 from __future__ import annotations
 
-import json
+import os.path
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, cast
 
 import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
 
-from gaponet.data.formats import refuse_degrees, to_radians
+from gaponet.data.formats import refuse_absurd, to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import JointMismatchError, LogError, UsageError
 from gaponet.robot import RobotSpec
+from gaponet.structure import parse_json, read_json, validated
 
 Array = np.ndarray
 
@@ -43,28 +46,83 @@ FEATURES = {
 }
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
 OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
+INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
 STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
 LATER = ("kp", "kd")  # not in the first exports
 
 
+AGAIN = "download or export it again"
+
+Name = Annotated[str, Len(1, 200)]
+Count = Annotated[int, Interval(ge=0, le=10**9)]
+Place = Annotated[int, Interval(ge=0, le=10**6)]
+
+
+class Info(TypedDict):
+    """meta/info.json, what is read of it."""
+
+    codebase_version: Name
+    fps: Annotated[float, Interval(ge=1, le=10_000)]
+    data_path: Annotated[str, Len(1, 500)]
+    features: dict[str, Any]
+
+
+class Feature(TypedDict):
+    """One of its features; names are a list, or a list in a dictionary, often with .pos behind each."""
+
+    shape: Annotated[list[Annotated[int, Interval(ge=1, le=1000)]], Len(1, 2)]
+    names: list[Name] | dict[str, Any] | None
+    info: NotRequired[dict[str, Any] | None]
+
+
+# One row of meta/episodes; beside it, in what gaponet exported, the fields of SequenceMeta.
+Episode = TypedDict("Episode", {
+    "episode_index": Count, "length": Annotated[int, Interval(ge=1, le=10**8)],
+    "data/chunk_index": Place, "data/file_index": Place, "tasks": NotRequired[list[str] | None],
+})  # fmt: skip
+NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
+
+
+class Stated(TypedDict):
+    """What a dataset says of itself."""
+
+    licence: NotRequired[str]
+    source: NotRequired[str]
+
+
+class Ours(TypedDict):
+    """gaponet.json, what is read of it."""
+
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]
+    dataset: Stated
+
+
 @dataclass(frozen=True)
 class Set:
-    """One LeRobot folder: its info.json, the metadata of its episodes, and ours where it is an export."""
+    """One LeRobot folder: its info.json, its features that are read, its episodes; ours is None for a stock set."""
 
     path: Path
-    info: dict[str, Any]
+    info: Info
+    features: dict[str, Feature]
     episodes: list[dict[str, Any]]
-    ours: dict[str, Any]
+    ours: Ours | None
 
     @property
     def dt(self) -> float:
         """s, exact."""
-        return float(self.ours.get("dt", 1 / self.info["fps"]))
+        return self.ours["dt"] if self.ours else 1 / self.info["fps"]
 
     def data_file(self, episode: dict[str, Any]) -> Path:
-        """Where the frames of an episode are."""
-        place = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
-        return self.path / self.info["data_path"].format(**place)
+        """Where the frames of an episode are; never outside the set."""
+        given = self.info["data_path"]
+        number = lambda m: f"{episode[f'data/{m[1]}']:0{m[2] or 0}d}"  # noqa: E731
+        place = os.path.normpath(re.sub(r"\{(chunk_index|file_index)(?::0?(\d))?d?\}", number, given))
+        if re.search(r"[{}\0]", place) or os.path.isabs(place) or place.startswith(".."):
+            raise LogError(
+                f"{self.path}/meta/info.json: data_path '{given}' is not a path inside the set with "
+                f"{{chunk_index:03d}} and {{file_index:03d}}; {AGAIN}"
+            )
+        return self.path / place
 
 
 def find(path: Path) -> list[Path]:
@@ -93,7 +151,7 @@ def read(
                 open_file, table = file, _Frames(part, file, robot, joint_map, unit)
             assert table is not None
             log = table.episode(episode)
-            yield _motion(episode, tasks), log if part.ours else refuse_degrees(log, robot)
+            yield _motion(episode, tasks), refuse_absurd(log, robot)
 
 
 def _sets(path: Path) -> list[Set]:
@@ -107,41 +165,55 @@ def _sets(path: Path) -> list[Set]:
 
 
 def _open(file: Path) -> Set:
-    try:
-        info = json.loads(file.read_text(encoding="utf-8"))
-        version, _ = str(info["codebase_version"]), info["features"]
-        fps, _ = float(info["fps"]), info["data_path"]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise LogError(f"{file}: not a LeRobot info.json ({error}); download or export it again") from None
+    info = read_json(Info, file, LogError, AGAIN, more=True)
+    version = info["codebase_version"]
     if version.split(".")[0] != VERSION.split(".")[0]:
         raise LogError(
             f"{file}: codebase_version is {version}, this reads {VERSION}; convert the set with lerobot's "
             "convert_dataset_v21_to_v30"
         )
-    if not 1 <= fps <= 10_000:
-        raise LogError(f"{file}: fps is {info['fps']}; expected 1 to 10000")
-    root = file.parents[1]
+    root, features = file.parents[1], info["features"]
     ours = file.with_name(OURS)
-    episodes = [row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f)]
+    told = (
+        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", more=True)
+        if ours.is_file()
+        else None
+    )
+    episodes = [row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, told)]
     if not episodes:
-        raise LogError(f"{root}: meta/episodes lists no episode; download or export it again")
+        raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
     episodes.sort(key=lambda e: e["episode_index"])
-    absent = set(STATED) - set(LATER) - set(episodes[0])
-    if ours.is_file() and absent:
-        raise LogError(
-            f"{root}/meta/episodes: '{min(absent)}' is missing, which {ours.name} promises; "
-            f"restore it, or delete {ours.name} to read the set as a stock one"
-        )
-    return Set(root, info, episodes, json.loads(ours.read_text(encoding="utf-8")) if ours.is_file() else {})
+    known = {
+        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, more=True)
+        for f in FEATURES.values()
+        if f in features
+    }
+    return Set(root, info, known, episodes, told)
 
 
-def _episodes(file: Path) -> list[dict[str, Any]]:
-    need = ("episode_index", "length", "dataset_from_index", "data/chunk_index", "data/file_index")
-    table = _table(file, lambda name: not name.startswith("stats/"))
-    for name in need:
-        if name not in table.column_names:
-            raise LogError(f"{file}: column '{name}' is missing; it has {', '.join(table.column_names[:12])}")
-    return table.to_pylist()
+def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
+    said = STATED if ours else ()
+    hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
+    table = _table(file, (*NEEDED, *(n for n in said if n not in LATER)), ("tasks", *(LATER if ours else ())), hint)
+    try:
+        rows = table.to_pylist()
+    except ValueError as error:  # a date that Python cannot hold
+        raise LogError(f"{file}: not readable ({error}); {AGAIN}") from None
+    known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
+    return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
+
+
+def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
+    """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
+    where = f"{file}: episode {row['episode_index']}"
+    told = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
+    told["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
+    for name in LATER:
+        gains = told.pop(name, None)
+        if gains not in (None, "null"):
+            told[name] = parse_json(list[float], str(gains), f"{where}: {name}", LogError, hint)
+    stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
+    return row | {"stated": {name: stated[name] for name in STATED}}
 
 
 def _tasks(part: Set) -> dict[int, str]:
@@ -149,17 +221,16 @@ def _tasks(part: Set) -> dict[int, str]:
     file = part.path / "meta" / "tasks.parquet"
     if not file.is_file():
         return {}
-    table = _table(file)
-    text = next((n for n in table.column_names if n != "task_index"), None)
-    if text is None or "task_index" not in table.column_names:
-        raise LogError(f"{file}: no task and task_index in it; download or export it again")
-    return dict(zip(table["task_index"].to_pylist(), map(str, table[text].to_pylist()), strict=True))
+    table = _table(file, ("task_index",), ("task", "__index_level_0__"))
+    if table.num_columns != 2:
+        raise LogError(f"{file}: no task and task_index in it; {AGAIN}")
+    return dict(zip(table["task_index"].to_pylist(), map(str, table.column(1).to_pylist()), strict=True))
 
 
 def _unit(part: Set, given: str | None) -> str:
     """The unit of positions: stated by an export, else by the user."""
-    stated = {part.info["features"][f].get("info", {}).get("unit") for f in ("action", "observation.state")
-              if f in part.info["features"]}  # fmt: skip
+    stated = {(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
+              if f in part.features}  # fmt: skip
     if part.ours and stated == {"rad"}:
         if given not in (None, "rad"):
             raise UsageError(f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out")
@@ -178,12 +249,13 @@ class _Frames:
 
     def __init__(self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str) -> None:
         self.part, self.file, self.robot = part, file, robot
-        features = part.info["features"]
+        features = part.features
         present = {ours: theirs for ours, theirs in FEATURES.items() if theirs in features}
         for need in ("ctrl", "qpos"):
             if need not in present:
                 raise LogError(
-                    f"{part.path}/meta/info.json: no feature '{FEATURES[need]}'; it has {', '.join(features)}"
+                    f"{part.path}/meta/info.json: no feature '{FEATURES[need]}'; it has "
+                    f"{', '.join(part.info['features'])}"
                 )
         names = {c: self._joints(f, features[f], joint_map) for c, f in present.items()}
         self.joints = tuple(j for j in robot.joint_names if j in names["ctrl"])
@@ -194,20 +266,19 @@ class _Frames:
                     f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
                 )
         self.units = [self._joint_unit(j, unit) for j in self.joints]
-        table = _table(file, {*present.values(), "timestamp", "frame_index", "episode_index"}.__contains__)
+        table = _table(file, (*present.values(), *INDEX))
         self.columns = {
-            c: _matrix(file, table, f)[:, [names[c].index(j) for j in self.joints]] for c, f in present.items()
+            c: _matrix(file, table, f, len(self.joints))[:, [names[c].index(j) for j in self.joints]]
+            for c, f in present.items()
         }
-        self.timestamp, self.frame, self.episodes = (
-            table[name].to_numpy() for name in ("timestamp", "frame_index", "episode_index")
-        )
+        self.timestamp, self.frame, self.episodes = (_matrix(file, table, name, 1)[:, 0] for name in INDEX)
 
-    def _joints(self, feature: str, spec: dict[str, Any], joint_map: dict[str, str] | None) -> list[str]:
-        """The robot's own joint of each column; names are a list, or a list in a dictionary, often with .pos behind."""
-        names, where = spec.get("names"), f"{self.part.path}/meta/info.json: {feature}"
+    def _joints(self, feature: str, spec: Feature, joint_map: dict[str, str] | None) -> list[str]:
+        """The robot's own joint of each column."""
+        names, where = spec["names"], f"{self.part.path}/meta/info.json: {feature}"
         if isinstance(names, dict):
             names = next((v for v in names.values() if isinstance(v, list)), None)
-        if not isinstance(names, list) or len(names) != int(np.prod(spec["shape"])):
+        if not names or len(names) != int(np.prod(spec["shape"])):
             raise LogError(f"{where} does not name its {spec['shape']} values; write the joints' names there")
         found = [self.robot.resolve(str(name).removesuffix(".pos"), where, joint_map) for name in names]
         if len(set(found)) != len(found):
@@ -237,16 +308,13 @@ class _Frames:
             "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
         }
         if self.part.ours:
-            meta["stated"] = {name: row[name] for name in STATED if name in row}
-            meta["stated"] |= {name: json.loads(row[name]) for name in ("notes", *LATER) if name in row}
-            meta["dataset"] = self.part.ours.get("dataset", {})
+            meta |= {"stated": row["stated"], "dataset": self.part.ours["dataset"]}
         return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
         """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
         regular = np.arange(len(where)) * self.part.dt
-        told = self.timestamp[where].astype(float)
-        told = told - told[0]
+        told = self.timestamp[where] - self.timestamp[where[0]]
         return regular if np.abs(told - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1]) else told
 
     def _si(self, channel: str, values: Array) -> Array:
@@ -262,35 +330,47 @@ class _Frames:
 
 def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
     """The motion's own name in an export; in a stock set, whose episodes are not repetitions, task and number."""
-    if "motion" in episode:
-        return str(episode["motion"])
+    if "stated" in episode:
+        return str(episode["stated"]["motion"])
     told = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
-    slug = re.sub(r"[^a-z0-9]+", "_", str(told[0]).lower()).strip("_")[:40] or "episode"
-    return f"{slug}-{int(episode['episode_index']):04d}"
+    slug = re.sub(r"[^a-z0-9]+", "_", told[0].lower()).strip("_")[:40] or "episode"
+    return f"{slug}-{episode['episode_index']:04d}"
 
 
-def _matrix(file: Path, table: Any, feature: str) -> Array:
-    """A column of lists, or of numbers where there is one joint: (frames, n)."""
+def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
+    """A column of lists of n numbers, or of numbers where n is 1: (frames, n) float64."""
     import pyarrow as pa
+    import pyarrow.compute as pc
 
-    column = table[feature].combine_chunks()
-    if column.null_count:
-        raise LogError(f"{file}: {feature} is empty in row {int(np.argmax(column.is_null().to_numpy(False)))}")
-    nested = pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
-    flat = (column.flatten() if nested else column).to_numpy(zero_copy_only=False)
-    if len(flat) % max(len(column), 1):
-        raise LogError(f"{file}: rows of {feature} differ in length; download or export the set again")
-    return flat.reshape(len(column), -1)
+    column, kind = table[feature].combine_chunks(), table.schema.field(feature).type
+    lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
+    kind = kind.value_type if lists else kind
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or not (lists or n == 1):
+        raise LogError(f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; {AGAIN}")
+    wrong = column.is_null().to_numpy(False)
+    if lists and not wrong.any():
+        wrong = pc.list_value_length(column).to_numpy(zero_copy_only=False) != n
+    flat = column.flatten() if lists else column
+    if wrong.any() or flat.null_count:
+        row = int(wrong.argmax()) if wrong.any() else int(flat.is_null().to_numpy(False).argmax()) // n
+        raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
+    return flat.to_numpy(zero_copy_only=False).astype(float).reshape(-1, n)
 
 
-def _table(file: Path, wanted: Callable[[str], bool] = lambda name: True) -> Any:
-    """The wanted columns of a Parquet file, as a pyarrow table."""
+def _table(file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN) -> Any:
+    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         parquet = pq.ParquetFile(file)
-        return parquet.read(columns=[name for name in parquet.schema_arrow.names if wanted(name)])
-    except (pa.ArrowException, OSError) as error:
+        there = parquet.schema_arrow.names
+        for name in need:
+            if there.count(name) != 1:
+                text = "is missing" if name not in there else "stands twice"
+                raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
+        wanted = [*need, *(name for name in also if there.count(name) == 1)]
+        return parquet.read(columns=wanted).select(wanted)
+    except (pa.ArrowException, OSError, KeyError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
-        raise LogError(f"{file}: not a readable Parquet file ({reason}); download or export the set again") from None
+        raise LogError(f"{file}: not a readable Parquet file ({reason}); {AGAIN}") from None

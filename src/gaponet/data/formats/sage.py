@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.data.formats import refuse_degrees, to_radians
+from gaponet.data.formats import refuse_absurd, to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
@@ -39,7 +39,7 @@ def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) 
     if not folders:
         raise LogError(f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder")
     for folder in folders:
-        yield os.path.basename(os.path.abspath(folder)), refuse_degrees(_read_motion(folder, robot, joint_map), robot)
+        yield os.path.basename(os.path.abspath(folder)), refuse_absurd(_read_motion(folder, robot, joint_map), robot)
 
 
 def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
@@ -53,8 +53,8 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     if len(set(names)) != len(names):
         raise LogError(f"{list_file}: two names map to one joint: {', '.join(names)}; mend --map")
     control, state = folder / "control.csv", folder / "state_motor.csv"
-    ctrl_time, ctrl = _read_csv(control, len(names))
-    state_time, values = _read_csv(state, len(names))
+    ctrl_time, ctrl = _read_csv(control, len(names), "control")
+    state_time, values = _read_csv(state, len(names), "state_motor")
     units = [robot.log_units[robot.joint_names.index(name)] for name in names]
     channels = {COLUMNS[k]: Channel(state_time, v) for k, v in values.items() if k in COLUMNS}
     channels["ctrl"] = Channel(ctrl_time, ctrl["positions"])
@@ -72,7 +72,7 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     )
 
 
-def _read_csv(file: Path, n: int) -> tuple[Array, dict[str, Array]]:
+def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
     """Time (k,) in seconds and {column: (k, n)}."""
     if not file.is_file():
         raise LogError(f"{file}: missing; a SAGE motion needs control.csv and state_motor.csv")
@@ -82,17 +82,19 @@ def _read_csv(file: Path, n: int) -> tuple[Array, dict[str, Array]]:
     lists = columns[2:]
     if columns[:2] != ["type", "timestamp"]:
         raise LogError(f"{file}:1: header is '{header[:60]}', expected type,timestamp,positions,...")
+    if len(set(columns)) != len(columns):
+        raise LogError(f"{file}:1: a column stands twice in the header {', '.join(columns)}; delete or rename one")
     if "positions" not in lists:
         raise LogError(f"{file}:1: column 'positions' is missing; the header has: {', '.join(columns)}")
     body = body.rstrip()
     if not body:
         raise LogError(f"{file}: holds no rows; delete the motion folder or record it again")
-    table = _parse(file, body, n, len(lists))
+    table = _parse(file, body, n, len(lists), kind)
     time = table[:, 0] * _seconds(file, table[:, 0])
     return time, {name: table[:, 1 + i * n : 1 + (i + 1) * n] for i, name in enumerate(lists)}
 
 
-def _parse(file: Path, body: bytes, n: int, k: int) -> Array:
+def _parse(file: Path, body: bytes, n: int, k: int, kind: str) -> Array:
     """Numbers of all rows, (rows, 1 + k n). The whole body is looked at once; lines singly only to name a bad one."""
     import pyarrow as pa
     import pyarrow.csv as csv
@@ -100,8 +102,14 @@ def _parse(file: Path, body: bytes, n: int, k: int) -> Array:
     skeletons = set(body.translate(None, DIGITS).split(b"\n"))
     numbers = b'"[' + b"," * (n - 1) + b']"'
     kinds = {s.partition(b",")[0] for s in skeletons}
-    if not skeletons <= {b",".join([kind, b"", *[numbers] * k]) for kind in kinds if kind}:
+    if not skeletons <= {b",".join([known, b"", *[numbers] * k]) for known in kinds if known}:
         _refuse_row(file, body, n, k)
+    if {found.lower() for found in kinds} != {kind.encode().translate(None, DIGITS)}:
+        lines = body.decode("utf-8", errors="replace").split("\n")
+        row, found = next((i, t) for i, line in enumerate(lines) if (t := line.partition(",")[0]).lower() != kind)
+        raise LogError(
+            f"{file}:{row + 2}: a row of type '{found}', not {kind.upper()}: are the files swapped or mixed?"
+        )
     names = [str(i) for i in range(2 + n * k)]
     try:
         table = csv.read_csv(

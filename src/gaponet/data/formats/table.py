@@ -17,18 +17,18 @@ Torques are N·m and temperatures °C. Units have no default: a wrong guess look
 from __future__ import annotations
 
 import csv
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
-from gaponet.data.formats import TABLES, refuse_degrees, to_radians
+from gaponet.data.formats import TABLES, refuse_absurd, to_radians
 from gaponet.data.log import CHANNELS, REQUIRED, Channel, Log
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import LOG_UNITS, RobotSpec
+from gaponet.structure import read_toml
 
 Array = np.ndarray
 
@@ -55,6 +55,16 @@ class ColumnMap:
             if unit not in known:
                 given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
                 raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
+
+
+class ColumnFile(TypedDict, total=False):
+    """The TOML file of a column map."""
+
+    time: str
+    time_unit: str
+    position_unit: str
+    columns: dict[str, str]
+    joint_units: dict[str, str]
 
 
 def find(path: Path) -> list[Path]:
@@ -87,19 +97,15 @@ def read(
     if not files:
         raise LogError(f"{path}: no .csv or .parquet file in it; point at a table or a folder of tables")
     for file in files:
-        yield file.stem, refuse_degrees(_read_table(file, robot, joint_map, mapping), robot)
+        yield file.stem, refuse_absurd(_read_table(file, robot, joint_map, mapping), robot)
 
 
 def _column_map(
     robot: RobotSpec, toml: str | Path | None, position_unit: str | None, time_unit: str | None
 ) -> ColumnMap:
     where = f"--columns {toml}"
-    table = _toml(Path(toml)) if toml is not None else {}
-    strange = set(table) - {"time", "time_unit", "position_unit", "columns", "joint_units"}
-    if strange:
-        raise UsageError(
-            f"{where}: '{min(strange)}' is unknown; use time, time_unit, position_unit, [columns], [joint_units]"
-        )
+    hint = "use time, time_unit, position_unit, [columns], [joint_units]"
+    table = read_toml(ColumnFile, Path(toml), UsageError, hint) if toml is not None else ColumnFile()
     names = table.get("columns", {}) | ({"time": table["time"]} if "time" in table else {})
     for ours in names:
         if ours != "time" and ours.partition(".")[0] not in CHANNELS:
@@ -110,15 +116,6 @@ def _column_map(
         names,
         {robot.resolve(joint, where): unit for joint, unit in table.get("joint_units", {}).items()},
     )
-
-
-def _toml(file: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UsageError(f"--columns {file}: {error.strerror}; give a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"--columns {file}: not valid TOML: {error}") from None
 
 
 def _read_table(file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, mapping: ColumnMap) -> Log:
@@ -190,7 +187,10 @@ def _is_parquet(file: Path) -> bool:
 
 def _csv_header(file: Path) -> list[str]:
     with file.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
-        header = next(csv.reader(lines), [])
+        try:
+            header = next(csv.reader(lines), [])
+        except csv.Error as error:
+            raise LogError(f"{file}:1: not a header of a table ({error}); is it the right file?") from None
     if not any(header):
         raise LogError(f"{file}: empty; a table needs a header line and rows")
     return [name.strip() for name in header]
@@ -227,9 +227,16 @@ def _refuse_line(file: Path, header: list[str], wanted: list[str]) -> None:
     places = {name: header.index(name) for name in wanted}
     with file.open(encoding="utf-8-sig", errors="replace", newline="") as lines:
         rows = csv.reader(lines)
-        next(rows)
-        for row in rows:
+        while True:
+            try:
+                row = next(rows)
+            except StopIteration:
+                return
+            except csv.Error as error:
+                raise LogError(f"{file}:{rows.line_num}: {error}; repair or cut the row") from None
             where = f"{file}:{rows.line_num}"
+            if rows.line_num == 1:
+                continue
             if len(row) != len(header):
                 raise LogError(
                     f"{where}: {len(row)} cells, the header has {len(header)}; the file may be cut short: remove the "
