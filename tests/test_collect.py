@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 
 import numpy as np
@@ -14,7 +15,8 @@ from arm import write_arm
 
 from gaponet.collect import Recipe, collect, load_recipe
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError, FolderError, UsageError
+from gaponet.files import writing
 from gaponet.motion.library import Library
 from gaponet.motion.recipe import takes
 from gaponet.robot import load_robot
@@ -140,7 +142,7 @@ if __name__ == "__main__":
 def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tmp_path):
     """kill -9 while two processes record and write: nothing is lost, doubled or left lying about.
 
-    benchmarks/kill_collect.py does it ten times on the H1-2.
+    benchmarks/kills.py does it to every command.
     """
     out, script = tmp_path / "killed", tmp_path / "child.py"
     script.write_text(CHILD)
@@ -186,13 +188,11 @@ def test_what_something_else_collected_is_not_mixed(whole, spec):
 
 
 def test_two_collectors_do_not_share_a_folder(spec, fleet, tmp_path):
-    import fcntl
-
     collect(spec, fleet, replace(RECIPE, motions=("creep-elbow",), rates=(50.0,), repetitions=1), tmp_path, nproc=1)
-    with (tmp_path / "collect.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(DatasetError, match="another gaponet collect is writing here"):
-            collect(spec, fleet, RECIPE, tmp_path, nproc=1)
+    with ThreadPoolExecutor(1) as other, writing(tmp_path, "dataset"):
+        asked = other.submit(collect, spec, fleet, RECIPE, tmp_path, nproc=1)
+        with pytest.raises(FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"):
+            asked.result()
 
 
 def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):

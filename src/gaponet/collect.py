@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
@@ -20,8 +19,9 @@ from pathlib import Path
 
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.data.store import Dataset, write_text
+from gaponet.data.store import KIND, Dataset
 from gaponet.errors import DatasetError
+from gaponet.files import write_text, writing
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.robot import RobotSpec
 from gaponet.sim.pairing import pair_dataset
@@ -77,15 +77,15 @@ def collect(
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.
-        DatasetError: `out` holds something else, or another collect is writing there.
+        DatasetError: `out` is another robot's, or holds what something else recorded.
+        FolderError: `out` is something else, or another process writes into it.
     """
     start = time.monotonic()
     for unit in recipe.units:
         fleet.unit(unit)
     wanted = takes(recipe, library(robot, seed, recipe).names(recipe.variants))
-    Dataset.create(out, robot)
-    with _alone(Path(out)):
-        dataset = Dataset(out)
+    with writing(Path(out), KIND):
+        dataset = Dataset.create(out, robot)
         _claim(dataset, robot, fleet, recipe, seed)
         present = {_key(m.motion, m.unit_id, m.payload_mass, dt, m.repetition) for m, dt in _listed(dataset)}
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
@@ -112,21 +112,6 @@ def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> 
 
 def _listed(dataset: Dataset) -> list[tuple[SequenceMeta, float]]:
     return [(entry.meta, entry.dt) for entry in dataset.entries]
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """One collector per folder. The lock ends with its process, whatever ends it; what a killed one left is cleared."""
-    import fcntl
-
-    with (folder / "collect.lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise DatasetError(f"{folder}: another gaponet collect is writing here; wait for it or stop it") from None
-        for temporary in (folder / "sequences").glob(".*.tmp"):
-            temporary.unlink()
-        yield
 
 
 def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int) -> None:

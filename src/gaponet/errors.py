@@ -31,6 +31,10 @@ class DatasetError(GAPONetError):
     """A dataset folder is missing, damaged or belongs to another robot."""
 
 
+class FolderError(GAPONetError):
+    """A folder to write into is somebody else's, or another process is writing into it."""
+
+
 class ModelError(GAPONetError):
     """A run or model artifact is missing, damaged or does not fit the robot, rate or gains."""
 

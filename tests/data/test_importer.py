@@ -1,7 +1,10 @@
-"""Importing: all recordings or none, into a new dataset or behind what is there."""
+"""Importing: nothing of a bad source, whatever is missing of a good one, into a new dataset or behind what is there."""
 
+import errno
 import hashlib
+import itertools
 import json
+import os
 import shutil
 
 import numpy as np
@@ -11,7 +14,7 @@ from logs import SERVO_NAMES, arm_columns, late, table_text, wave, write_sage, w
 from gaponet.data.importer import import_logs
 from gaponet.data.offsets import FILE
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, LogError, UsageError
+from gaponet.errors import DatasetError, FolderError, LogError, UsageError
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 
@@ -64,20 +67,19 @@ def test_progress_counts_to_the_number_of_recordings(logs, so101, tmp_path):
     assert seen == [(1, 2, "down"), (2, 2, "up")]
 
 
-def test_a_recording_that_is_there_is_refused_by_name_and_nothing_is_added(logs, so101, tmp_path):
+def test_what_is_there_is_counted_and_the_rest_is_added(logs, so101, tmp_path):
     first = import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
     write_so101(logs / "real" / "so101" / "custom" / "new")
-    with pytest.raises(
-        DatasetError, match=rf"2 of 3 recordings are there already .* '{first.entries[0].id}' of .*data"
-    ):
-        import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
-    assert len(Dataset(tmp_path / "data")) == 2
+    second = import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    assert [e.meta.motion for e in second.entries] == ["new"]
+    assert second.present == first.entries
+    assert len(Dataset(tmp_path / "data")) == 3
 
 
 def test_one_recording_twice_in_the_source_is_refused(logs, so101, tmp_path):
     custom = logs / "real" / "so101" / "custom"
     shutil.copytree(custom / "up", custom / "up_again")
-    with pytest.raises(DatasetError, match=r"1 of 3 recordings are there already .*up_again is logs/.*/up\."):
+    with pytest.raises(DatasetError, match=r"1 of 3 recordings are there twice .*up_again is logs/.*/up\."):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
     assert not (tmp_path / "data").exists()
 
@@ -108,18 +110,60 @@ def test_one_bad_file_leaves_nothing_behind(logs, so101, tmp_path):
     assert not (tmp_path / "data").exists()
 
 
-def test_a_disk_that_fills_up_leaves_no_new_dataset(logs, so101, tmp_path, monkeypatch):
-    append = Dataset.append
+def test_an_import_cut_short_at_any_write_is_finished_by_the_same_call(logs, so101, tmp_path, monkeypatch):
+    """Every operation on the disk fails once; the journal lists whole files only, and the end is always the same."""
+    whole = import_logs(logs, so101, "lab", 0.0, tmp_path / "whole", gravity=lambda q, m, s: 0 * q)
+    real = {name: getattr(os, name) for name in ("replace", "fsync", "pwrite", "mkdir")}
+    left = None
 
-    def once(self, sequence, findings=None):
-        if len(self):
-            raise OSError("no space left on device")
-        return append(self, sequence, findings)
+    def failing(name):
+        def call(*args, **more):
+            nonlocal left
+            left -= 1
+            if left == 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return real[name](*args, **more)
 
-    monkeypatch.setattr(Dataset, "append", once)
-    with pytest.raises(OSError, match="no space left"):
+        return call
+
+    for name in real:
+        monkeypatch.setattr(os, name, failing(name))
+    for n in itertools.count(1):
+        left, out = n, tmp_path / f"cut{n}"
+        try:
+            import_logs(logs, so101, "lab", 0.0, out, gravity=lambda q, m, s: 0 * q)
+        except OSError:
+            assert left == 0
+        if left > 0:  # there are no more
+            break
+        left = -1
+        if (out / "dataset.json").exists():
+            Dataset(out).sequences()
+        else:
+            assert not out.exists()
+        import_logs(logs, so101, "lab", 0.0, out, gravity=lambda q, m, s: 0 * q)
+        assert Dataset(out).entries == whole.dataset.entries
+        assert sorted(f.name for f in out.rglob("*")) == sorted(f.name for f in whole.dataset.path.rglob("*"))
+    assert n > 20
+
+
+def test_a_folder_with_something_else_in_it_is_left_as_it_is(logs, so101, tmp_path):
+    (tmp_path / "proj" / ".git").mkdir(parents=True)
+    (tmp_path / "proj" / ".env").write_text("mine")
+    with pytest.raises(FolderError, match=r"proj: holds \.env, \.git, so it is no dataset of gaponet"):
+        import_logs(logs, so101, "lab", 0.0, tmp_path / "proj")
+    assert sorted(f.name for f in (tmp_path / "proj").iterdir()) == [".env", ".git"]
+
+
+def test_what_a_person_added_to_a_dataset_stays(logs, so101, tmp_path, monkeypatch):
+    import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
+    (tmp_path / "data" / "NOTES").write_text("mine")
+    write_so101(logs / "real" / "so101" / "custom" / "new")
+    monkeypatch.setattr(Dataset, "append", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
         import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
-    assert not (tmp_path / "data").exists()
+    assert (tmp_path / "data" / "NOTES").read_text() == "mine"
+    assert len(Dataset(tmp_path / "data")) == 2
 
 
 def test_another_robots_dataset_is_refused_before_anything_is_read(logs, so101, arm, tmp_path):

@@ -12,7 +12,7 @@ from logs import arm_sequence, late, wave
 
 from gaponet.data.pair import Twin
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.errors import DatasetError
+from gaponet.errors import DatasetError, FolderError
 
 
 @pytest.fixture
@@ -51,12 +51,25 @@ def test_another_payload_of_the_same_motion_is_another_sequence(dataset, sequenc
     assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]
 
 
-def test_a_line_cut_short_by_a_crash_is_dropped(dataset, sequence):
+def test_a_line_cut_short_by_a_crash_is_not_there_and_reading_leaves_it_alone(dataset, sequence):
+    """It may be one that another process is just writing."""
     journal = dataset.path / "sequences.jsonl"
-    whole = journal.read_text()
-    journal.write_text(whole + whole[: len(whole) // 2])
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + whole[: len(whole) // 2])
     assert len(Dataset(dataset.path)) == 1
-    assert journal.read_text() == whole
+    assert len(journal.read_bytes()) > len(whole)
+    Dataset(dataset.path).append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    assert journal.read_bytes().startswith(whole)
+    assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]
+
+
+def test_what_another_writer_appended_meanwhile_is_known(dataset, sequence):
+    other = Dataset(dataset.path)
+    other.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    with pytest.raises(DatasetError, match="already in"):
+        dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=2.0)))
+    assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0, 2.0]
 
 
 def test_a_damaged_line_is_named(dataset):
@@ -93,16 +106,17 @@ def test_a_robot_with_other_joints_and_the_same_name_is_another_robot(dataset, t
 
 def test_a_folder_with_other_things_in_it_is_not_taken(arm, tmp_path):
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "cat.jpg").touch()
-    with pytest.raises(DatasetError, match="exists, holds files and is not a dataset; choose an empty folder"):
+    (tmp_path / "photos" / ".cat.jpg").touch()
+    with pytest.raises(FolderError, match=r"holds \.cat\.jpg, so it is no dataset of gaponet; choose an empty folder"):
         Dataset.create(tmp_path / "photos", arm)
+    assert [f.name for f in (tmp_path / "photos").iterdir()] == [".cat.jpg"]
 
 
 def test_peeking_makes_nothing(arm, tmp_path):
     assert Dataset.peek(tmp_path / "new", arm) is None
     assert not (tmp_path / "new").exists()
     (tmp_path / "file").touch()
-    with pytest.raises(DatasetError, match="file: is a file; choose a folder"):
+    with pytest.raises(FolderError, match="file: is no folder; choose another place"):
         Dataset.peek(tmp_path / "file", arm)
 
 

@@ -31,9 +31,9 @@ def budget(
         robot: Robot name or folder, if not the package's robot of the dataset.
         json: One JSON object on stdout.
     """
-    from gaponet.data.store import write_text
     from gaponet.eval.budget import gap_budget
     from gaponet.eval.budget_figure import waterfall
+    from gaponet.files import write_text
     from gaponet.plot.style import save
 
     out = Out(json)

@@ -44,7 +44,7 @@ def import_logs(
     kd: tuple[str, ...] = (),
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Read logs of a robot into a dataset: all of them or none.
+    """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
 
     Args:
         src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
@@ -125,12 +125,14 @@ def gravity_of(robot: RobotSpec) -> Callable[[np.ndarray, float, str], np.ndarra
 
 def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     """What came in, the lag and the offsets of each joint, and what to do next."""
-    entries, data = report.entries, report.dataset
+    entries, data = report.entries or report.present, report.dataset
     minutes = sum(e.rows * e.dt for e in entries) / 60
     rates = sorted({round(1 / e.dt, 2) for e in entries})
     units = ", ".join(dict.fromkeys(e.meta.unit_id for e in entries))
     payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
     virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
+    if report.present:
+        out.say(f"{len(report.present)} there already, {len(report.entries)} added")
     out.say(
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {escape(units)}, payload {payloads} kg; {escape(str(data.path))} now holds {len(data)}"
@@ -142,7 +144,8 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         out.say(f"Offsets are recorded in {escape(str(data.path))}/offsets.json; nothing was applied to the data.")
     out.say(f"Next: gaponet doctor {escape(str(data.path))}")
     out.result({
-        "dataset": str(data.path), "imported": [e.id for e in entries], "sequences": len(data), "minutes": minutes,
+        "dataset": str(data.path), "imported": [e.id for e in report.entries],
+        "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
         "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings["delay_s"] for e in entries},
         "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
     })  # fmt: skip

@@ -12,8 +12,9 @@ import numpy as np
 from gaponet import __version__
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import ARRAYS
-from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash, write_text
+from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
+from gaponet.files import write_text
 
 Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion

@@ -1,10 +1,9 @@
-"""Logs → dataset. Everything is read and checked before anything is written."""
+"""Logs → dataset. Everything is read and checked before anything is written; one that was cut short is resumed."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,8 +17,9 @@ from gaponet.data.log import Log
 from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
-from gaponet.data.store import Dataset, Entry
+from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.errors import DatasetError, LogError, UsageError
+from gaponet.files import writing
 from gaponet.robot import RobotSpec
 
 Progress = Callable[[float, float, str], None]  # done, total, motion
@@ -30,10 +30,17 @@ UNSTATED = -1  # repetition that the format does not state, until it is counted
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What one import added; offsets are None where no gravity model was given or several units were recorded."""
+    """What one import added.
+
+    Attributes:
+        entries: Added.
+        present: There before, by the content of the source's other recordings.
+        offsets: None where no gravity model was given or several units were recorded.
+    """
 
     dataset: Dataset
     entries: list[Entry]
+    present: list[Entry]
     offsets: UnitOffsets | None
 
 
@@ -65,14 +72,16 @@ def import_logs(
     kd: tuple[str, ...] = (),
     **options: Any,
 ) -> ImportReport:
-    """Import every recording under a path; a bad one refuses them all, and nothing is written.
+    """Import every recording under a path that is not there yet; a bad one refuses them all, and nothing is written.
+
+    What could be written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
         src: File or folder in one of data.formats.FORMATS.
         robot: The robot that was recorded.
         unit_id: Which of its kind; zero offsets belong to a unit. None where the format states it.
         payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None where the format states it.
-        out: Dataset folder; made, or appended to.
+        out: Dataset folder; made, or appended to by one process at a time.
         payload_side: "both" (default), or the side of one payload mount.
         level: joint, upper_body or whole_body (default).
         fmt: Format; default by looking.
@@ -86,23 +95,25 @@ def import_logs(
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
         UsageError: Unit or payload are missing, or contradict what the format states.
-        DatasetError: `out` is another robot's, or holds one of the recordings already.
+        DatasetError: `out` is another robot's, or a recording is in the source twice.
+        FolderError: `out` is something else, or another process writes into it.
     """
     src, out = Path(src), Path(out)
-    known = Dataset.peek(out, robot)
-    if known:
-        read_offsets(known)  # a damaged one is said before anything is read
     if payload_side is not None:
         _require_side(robot, payload_side)
     given = _Given(
         unit_id, payload_mass, payload_side, level, _given_gains("kp", kp, robot), _given_gains("kd", kd, robot)
     )
-    dataset, entries = _import(src, out, robot, given, known, fmt, progress, options)
-    units = dict.fromkeys(e.meta.unit_id for e in entries)
-    offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
-    for unit, fitted in offsets.items():
-        record_offsets(dataset, unit, fitted, simulator)
-    return ImportReport(dataset, entries, next(iter(offsets.values())) if len(offsets) == 1 else None)
+    with writing(out, KIND):
+        known = Dataset.peek(out, robot)
+        if known:
+            read_offsets(known)  # a damaged one is said before anything is read
+        dataset, added, present = _import(src, out, robot, given, known, fmt, progress, options)
+        units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
+        offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
+        for unit, fitted in offsets.items():
+            record_offsets(dataset, unit, fitted, simulator)
+    return ImportReport(dataset, added, present, next(iter(offsets.values())) if len(offsets) == 1 else None)
 
 
 def _import(
@@ -114,8 +125,12 @@ def _import(
     fmt: str | None,
     progress: Progress | None,
     options: dict[str, Any],
-) -> tuple[Dataset, list[Entry]]:
-    """Read and check all, then write all; where all is too much to hold, read it again for writing."""
+) -> tuple[Dataset, list[Entry], list[Entry]]:
+    """Read and check all, then write what is new; where all is too much to hold, read it again for writing.
+
+    Returns:
+        Dataset, entries added, entries that were there.
+    """
     digests: list[tuple[str, str]] = []
     held: list[Sequence] = []
     facts: dict[str, str] = {}
@@ -129,21 +144,23 @@ def _import(
             held.clear()
         if progress:
             progress(len(digests), total, sequence.meta.motion)
-    _refuse_known(digests, known, out)
+    _refuse_twice(digests)
     again = (s for s, _ in _sequences(src, robot, given, fmt, options))
-    with _Undo(out, made=known is None):
-        dataset = known or Dataset.create(out, robot)
-        if known is None and facts:
-            dataset.state(**facts)
-        taken = Counter(_slot(e.meta) for e in dataset.entries)
-        entries = []
-        for sequence in held if size <= HOLD else again:
-            slot = _slot(sequence.meta)
-            if sequence.meta.repetition < 0:  # the format does not state it
-                sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
-            entries.append(dataset.append(sequence, findings(sequence)))
-            taken[slot] += 1
-    return dataset, entries
+    dataset = known or Dataset.create(out, robot)
+    if facts and not dataset.entries:
+        dataset.state(**facts)
+    present = [entry for digest, _ in digests if (entry := dataset.find(digest))]
+    taken = Counter(_slot(e.meta) for e in dataset.entries)
+    added = []
+    for sequence in held if size <= HOLD else again:
+        if dataset.find(sequence.content_hash()):
+            continue
+        slot = _slot(sequence.meta)
+        if sequence.meta.repetition < 0:  # the format does not state it
+            sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
+        added.append(dataset.append(sequence, findings(sequence)))
+        taken[slot] += 1
+    return dataset, added, present
 
 
 def _sequences(
@@ -204,29 +221,11 @@ def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:
     return {"delay_s": by_joint(lag), "fast_speed": by_joint(fast_speed(sequence.ctrl, sequence.dt))}
 
 
-class _Undo:
-    """Removes a dataset folder made in this block if the block fails; one that was there keeps what was appended."""
-
-    def __init__(self, path: Path, made: bool) -> None:
-        self.path, self.made, self.there = path, made, path.exists()
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None or not self.made:
-            return
-        for child in self.path.iterdir() if self.path.is_dir() else ():
-            shutil.rmtree(child) if child.is_dir() else child.unlink()
-        if self.path.is_dir() and not self.there:
-            self.path.rmdir()
-
-
-def _refuse_known(recordings: list[tuple[str, str]], known: Dataset | None, out: Path) -> None:
-    """Refuse (content hash, source) that the dataset holds already, or that stand twice in the source."""
-    names = {e.hash: f"'{e.id}' of {out}" for e in known.entries} if known else {}
+def _refuse_twice(recordings: list[tuple[str, str]]) -> None:
+    """Refuse (content hash, source) that stand twice in the source."""
     if not recordings:
         raise LogError("no recording found")
+    names: dict[str, str] = {}
     twice = []
     for digest, source in recordings:
         if digest in names:
@@ -235,9 +234,8 @@ def _refuse_known(recordings: list[tuple[str, str]], known: Dataset | None, out:
     if twice:
         source, twin = twice[0]
         raise DatasetError(
-            f"{len(twice)} of {len(recordings)} recordings are there already (same samples, unit and payload): "
-            f"{source} is {twin}. Nothing was imported; point at new recordings only, or say another --unit-id or "
-            "--payload-mass"
+            f"{len(twice)} of {len(recordings)} recordings are there twice (same samples, unit and payload): {source} "
+            f"is {twin}. Nothing was imported; leave one of them out"
         )
 
 

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from gaponet.data.store import write_text
+from gaponet.files import write_text
 
 
 def finite(value: Any) -> Any:

@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.holds import Holds, StaticError, find_holds, join, static_error
-from gaponet.data.store import Dataset, write_text
+from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
+from gaponet.files import write_text
 from gaponet.robot import RobotSpec
 
 Array = np.ndarray

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.data.pair import hash_order, split_by_motion
-from gaponet.data.store import Dataset, Entry, dataset_hash, write_text
+from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError, UsageError
+from gaponet.files import write_text
 
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 Parts = dict[str, list[Entry]]

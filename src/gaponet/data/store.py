@@ -9,8 +9,9 @@
     card.json, CARD.md      what is in it (data.card)
     splits/<name>.json      which sequences are for training, validation, test (data.split)
 
-A sequence is written to a temporary file, renamed, then listed: a file that is not listed does not exist, and a line
-cut short by a crash is dropped on opening. Real data is never rewritten; twins can be computed again.
+A sequence is written to a temporary file, renamed, on the disk, and only then listed: a file that is not listed does
+not exist, nor does a line cut short by a crash. One process writes at a time (gaponet.files); reading needs no lock
+and changes nothing. Real data is never rewritten; twins can be computed again.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, NotRequired
@@ -31,11 +33,13 @@ from typing_extensions import TypedDict
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
+from gaponet.files import require_ours, sync, whole, write_text, writing
 from gaponet.robot import RobotSpec
 from gaponet.structure import Json, Name, parse_json, read_format
 
 FORMAT = 1
 MEND = "restore the file or import the log again"
+KIND, JOURNAL = "dataset", "sequences.jsonl"
 UNITS = {
     "time": "s", "ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "qacc": "rad/s²", "tau": "N·m", "tau_eq": "N·m",
     "temperature": "°C",
@@ -85,6 +89,11 @@ class Dataset:
         self.header: dict[str, Any] = {**read_format(Header, header, FORMAT, DatasetError, MEND)}
         self.robot_name: str = self.header["robot"]
         self.joint_names: tuple[str, ...] = self.header["joint_names"]
+        self._load()
+
+    def _load(self) -> None:
+        """Read the journal."""
+        self._end = 0  # of the last whole line, bytes
         self.entries = list(self._journal())
         self._by_hash = {entry.hash: entry for entry in self.entries}
 
@@ -92,13 +101,14 @@ class Dataset:
     def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
         """Open the dataset at path, making an empty one where there is none; refuses another robot's."""
         dataset = cls.peek(path, robot)
-        if dataset is None:
-            path = Path(path)
-            path.mkdir(parents=True, exist_ok=True)
-            header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
-            write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
-            dataset = cls(path)
-        return dataset
+        if dataset is not None:
+            return dataset
+        path = Path(path)
+        with writing(path, KIND):
+            if not (path / "dataset.json").is_file():
+                header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
+                write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
+        return cls.create(path, robot)
 
     @classmethod
     def peek(cls, path: str | Path, robot: RobotSpec) -> Dataset | None:
@@ -108,11 +118,17 @@ class Dataset:
             dataset = cls(path)
             dataset.require_robot(robot)
             return dataset
-        if path.is_dir() and any(not child.name.startswith(".") for child in path.iterdir()):
-            raise DatasetError(f"{path}: exists, holds files and is not a dataset; choose an empty folder")
-        if path.exists() and not path.is_dir():
-            raise DatasetError(f"{path}: is a file; choose a folder for the dataset")
+        require_ours(path, KIND)
         return None
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Be the only writer, with all that other processes have appended; FolderError while another one is."""
+        with writing(self.path, KIND):
+            journal = self.path / JOURNAL
+            if (journal.stat().st_size if journal.is_file() else 0) != self._end:
+                self._load()
+            yield
 
     def require_robot(self, robot: RobotSpec) -> None:
         """Refuse a robot whose joints are not the dataset's."""
@@ -147,11 +163,16 @@ class Dataset:
 
     def state(self, **fields: str) -> None:
         """Write what only a person can say (licence, source) into dataset.json; an empty text takes it away."""
-        self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
-        write_text(self.path / "dataset.json", json.dumps(self.header, indent=1, ensure_ascii=False) + "\n")
+        with self.writing():
+            self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
+            write_text(self.path / "dataset.json", json.dumps(self.header, indent=1, ensure_ascii=False) + "\n")
 
     def append(self, sequence: Sequence, findings: dict[str, Any] | None = None) -> Entry:
         """Add a sequence; one with the same content is refused with its name."""
+        with self.writing():
+            return self._append(sequence, findings or {})
+
+    def _append(self, sequence: Sequence, findings: dict[str, Any]) -> Entry:
         digest = sequence.content_hash()
         twin = self.find(digest)
         if twin is not None:
@@ -168,16 +189,20 @@ class Dataset:
             rows=len(sequence),
             channels=tuple(c for c in ARRAYS if getattr(sequence, c) is not None),
             meta=m,
-            findings=findings or {},
+            findings=findings,
         )
         columns = {c: getattr(sequence, c) for c in entry.channels}
         self._file(entry).parent.mkdir(exist_ok=True)
         _write_table(self._file(entry), columns, sequence.dt, self.joint_names)
-        line = json.dumps(asdict(entry), ensure_ascii=False, allow_nan=False) + "\n"
-        with (self.path / "sequences.jsonl").open("a", encoding="utf-8") as journal:
+        line = (json.dumps(asdict(entry), ensure_ascii=False, allow_nan=False) + "\n").encode()
+        with (self.path / JOURNAL).open("ab") as journal:
+            journal.truncate(self._end)  # a line cut short by a crash or a full disk goes
             journal.write(line)
             journal.flush()
             os.fsync(journal.fileno())
+        if not self._end:
+            sync(self.path)
+        self._end += len(line)
         self.entries.append(entry)
         self._by_hash[digest] = entry
         return entry
@@ -202,8 +227,9 @@ class Dataset:
         """Store the simulated twin of a sequence, replacing an earlier one of the same model."""
         columns = {"qpos": twin.qpos, "qvel": twin.qvel, "tau": twin.tau}
         file = self._twin_file(entry, twin.model_hash)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        _write_table(file, columns, entry.dt, self.joint_names)
+        with self.writing():
+            file.parent.mkdir(parents=True, exist_ok=True)
+            _write_table(file, columns, entry.dt, self.joint_names)
 
     def pair(self, entry: Entry, model: str) -> Pair:
         """A sequence with its simulated twin."""
@@ -222,17 +248,15 @@ class Dataset:
         return self.path / "twins" / model / f"{entry.id}.parquet"
 
     def _journal(self) -> Iterator[Entry]:
-        journal = self.path / "sequences.jsonl"
+        journal = self.path / JOURNAL
         if not journal.is_file():
             return
-        text = journal.read_text(encoding="utf-8")
-        complete, cut = text[: text.rfind("\n") + 1], text[text.rfind("\n") + 1 :]
-        if cut:  # a crash while appending: the sequence was never listed
-            write_text(journal, complete)
+        content = journal.read_bytes()
+        self._end = content.rfind(b"\n") + 1  # what follows is being written, or was cut short by a crash
         folder = self.path / "sequences"
         files = set(os.listdir(folder)) if folder.is_dir() else set()  # one look, not one for each of 11,000 files
         listed: dict[str, str] = {}  # content hash → id
-        for number, line in enumerate(complete.split("\n")[:-1], 1):
+        for number, line in enumerate(content[: self._end].split(b"\n")[:-1], 1):
             where = f"{journal}:{number}"
             entry = parse_json(Entry, line, where, DatasetError, "delete the line and import that log again")
             if f"{entry.id}.parquet" not in files:
@@ -245,16 +269,6 @@ class Dataset:
 def dataset_hash(entries: list[Entry]) -> str:
     """Identity of a set of recordings, in any order; 12 hex digits."""
     return hashlib.sha256("".join(sorted(e.hash for e in entries)).encode()).hexdigest()[:12]
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _write_table(path: Path, columns: dict[str, np.ndarray], dt: float, joint_names: tuple[str, ...]) -> None:
@@ -271,13 +285,9 @@ def _write_table(path: Path, columns: dict[str, np.ndarray], dt: float, joint_na
         arrays.append(pa.FixedSizeListArray.from_arrays(flat, type=vector))
     units = json.dumps({c: UNITS[c] for c in ["time", *columns]})
     table = pa.table(arrays, schema=pa.schema(fields, {"joint_names": ",".join(joint_names), "units": units}))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with whole(path) as temporary:
         # Against zstd alone: 6 % larger, read in half the time (552 rows of 27 joints, 7 channels: 1.5 ms).
         pq.write_table(table, temporary, compression="lz4", use_dictionary=False, use_byte_stream_split=True)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict[str, np.ndarray]:

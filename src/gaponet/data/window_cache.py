@@ -12,15 +12,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import os
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, JointMismatchError
+from gaponet.files import MARK, writing
 
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 
@@ -44,7 +46,7 @@ def window_cache(dataset: Dataset, joints: tuple[str, ...], progress: Progress |
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     place = dataset.path / "cache" / cache_key(dataset, joints)
     if not _complete(place, dataset, joints):
-        with _alone(place.parent):
+        with writing(place.parent, "cache", wait=math.inf):
             if not _complete(place, dataset, joints):  # another process may have made it meanwhile
                 _make(place, dataset, joints, progress)
     return place / "frames.f32"
@@ -66,8 +68,7 @@ def _complete(place: Path, dataset: Dataset, joints: tuple[str, ...]) -> bool:
 
 def _make(place: Path, dataset: Dataset, joints: tuple[str, ...], progress: Progress | None) -> None:
     columns = [dataset.joint_names.index(name) for name in joints]
-    temporary = place.with_name(f".{place.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)  # of a process that was killed
+    temporary = place.with_name(f"{MARK}-{os.getpid()}-{place.name}")
     temporary.mkdir()
     try:
         with (temporary / "frames.f32").open("wb") as file:
@@ -93,14 +94,3 @@ def _remove_others(place: Path, joints: tuple[str, ...]) -> None:
     for index in place.parent.glob("*/index.json"):
         if index.parent != place and tuple(json.loads(index.read_text(encoding="utf-8"))["joint_names"]) == joints:
             shutil.rmtree(index.parent)
-
-
-@contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """One maker at a time; another waits. The lock ends with its process."""
-    import fcntl
-
-    folder.mkdir(exist_ok=True)
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.data.store import Dataset, write_text
+from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError
 from gaponet.eval.page import facts_table, figure, page, table
+from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
 

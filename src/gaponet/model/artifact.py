@@ -67,7 +67,7 @@ def recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, lis
 
 def write_card(path: Path, card: dict[str, Any]) -> None:
     """JSON at full precision, written whole or not at all."""
-    from gaponet.data.store import write_text
+    from gaponet.files import write_text
 
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 

@@ -25,6 +25,14 @@ def pair_dataset(
     dataset.require_robot(robot)
     digest = model_hash(robot)
     todo = sorted((e for e in entries or dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
+    if not todo:
+        return 0
+    with dataset.writing():
+        _pair(dataset, robot, todo, progress, lock_idle)
+    return len(todo)
+
+
+def _pair(dataset: Dataset, robot: RobotSpec, todo: list[Entry], progress: Progress | None, lock_idle: bool) -> None:
     total, done = sum(e.rows - 1 for e in todo), 0
     for start in range(0, len(todo), BATCH):
         part = todo[start : start + BATCH]
@@ -37,4 +45,3 @@ def pair_dataset(
         for entry, twin in zip(part, twins, strict=True):
             dataset.write_twin(entry, twin)
         done += sum(e.rows - 1 for e in part)
-    return len(todo)

@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 
 from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset, write_text
+from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose
+from gaponet.files import write_text
 from gaponet.gap import Run, runs, summary
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.data.json_file import write_json
-from gaponet.data.store import write_text
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval import page as html_page
+from gaponet.files import write_text
 from gaponet.plot.style import save
 from gaponet.study.result import Result, fact_rows
 from gaponet.study.table import Table, to_csv

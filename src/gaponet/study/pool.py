@@ -23,8 +23,9 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NoReturn
 
-from gaponet.data.store import Dataset, dataset_hash, write_text
+from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError
+from gaponet.files import write_text
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash

@@ -27,8 +27,9 @@ import torch
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import require_same_gains
 from gaponet.data.split import split_entries
-from gaponet.data.store import Dataset, dataset_hash, write_text
+from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
+from gaponet.files import write_text
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
 from gaponet.model.backends import FunctionNetwork
 from gaponet.model.baselines import delay_offset

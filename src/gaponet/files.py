@@ -1,0 +1,179 @@
+"""Writing where a user said: files whole or not at all, one writer to a folder, nothing into somebody else's folder.
+
+A folder that gaponet writes into holds `.gaponet`: its first line says what the folder is, and the file is the lock of
+whoever writes (flock: it ends with its process, whatever ends that). A file being written is `.gaponet-PROCESS-NAME`
+beside its place; those of a killed process are removed by the next that writes there. Nothing else is ever removed.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from gaponet.errors import FolderError
+
+MARK = ".gaponet"
+# What tells folders that were written before there was a mark.
+EARLIER = {"dataset": "dataset.json", "run": "split.json", "comparison": "cells/*/setup.json",
+           "experiments": "cells/*/setup.json", "model": "card.json", "cache": "lock"}  # fmt: skip
+
+_held: set[tuple[str, int]] = set()  # folders of this process's threads
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Give a name beside path to write to; what is there when the block ends well takes path's place, on the disk.
+
+    Raises:
+        OSError: It could not be written; path is as it was.
+    """
+    temporary = path.with_name(f"{MARK}-{os.getpid()}-{path.name}")
+    try:
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
+        sync(path.parent)
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def sync(path: Path) -> None:
+    """Return when a file's content, or a folder's list of names, is on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def require_ours(folder: Path, kind: str) -> None:
+    """Refuse a folder that holds anything, dot files too, and was not written by gaponet as this kind of folder.
+
+    Raises:
+        FolderError: It is somebody else's, another kind of folder, or a file.
+    """
+    if not folder.is_dir():
+        if folder.exists() or folder.is_symlink():
+            raise FolderError(f"{folder}: is no folder; choose another place")
+        return
+    mark = folder / MARK
+    found = mark.read_text(encoding="utf-8", errors="replace").split()[:1] if mark.is_file() else []
+    if found and found[0] != kind:
+        raise FolderError(f"{folder}: holds gaponet's {found[0]}, not {kind}; choose another folder")
+    if found or any(folder.glob(EARLIER.get(kind, MARK))):
+        return
+    strangers = sorted(child.name for child in folder.iterdir() if not child.name.startswith(MARK))
+    if strangers:
+        more = f" and {len(strangers) - 3} more" if len(strangers) > 3 else ""
+        raise FolderError(
+            f"{folder}: holds {', '.join(strangers[:3])}{more}, so it is no {kind} of gaponet; choose an empty folder"
+        )
+
+
+@contextmanager
+def writing(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
+    """Be the only one that writes into a folder, which is made if missing; again within itself, it changes nothing.
+
+    A folder or mark made here goes again if the block fails before anything was written into it.
+
+    Args:
+        folder: The user's.
+        kind: What the folder is, in one word: dataset, run, model, …
+        wait: For another writer to end, s.
+
+    Raises:
+        FolderError: It is somebody else's, or another process writes into it.
+    """
+    key = (os.path.realpath(folder), threading.get_ident())
+    if key in _held:
+        yield
+        return
+    made = [p for p in (folder, *folder.parents) if not p.exists()]
+    new, line = not (folder / MARK).exists(), f"{kind}\n".encode()
+    descriptor = _sole(folder, kind, wait)
+    _held.add(key)
+    done = False
+    try:
+        if not os.pread(descriptor, 1, 0):
+            os.pwrite(descriptor, line, 0)
+        elif os.fstat(descriptor).st_size > len(line):  # the second line says who writes: that one was killed
+            _clear(folder)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), len(line))
+        yield
+        done = True
+    finally:
+        if not done and new and [p.name for p in folder.iterdir()] == [MARK]:
+            (folder / MARK).unlink()
+            with suppress(OSError):  # somebody else put something there
+                for path in made:
+                    path.rmdir()
+        elif os.fstat(descriptor).st_size > len(line):
+            os.ftruncate(descriptor, len(line))
+        _held.discard(key)
+        os.close(descriptor)
+
+
+def _sole(folder: Path, kind: str, wait: float) -> int:
+    """Lock the folder's mark; returns the file descriptor that holds the lock."""
+    deadline = time.monotonic() + wait
+    while True:
+        require_ours(folder, kind)
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = lock(folder / MARK)
+        if descriptor is not None:
+            return descriptor
+        if time.monotonic() >= deadline:
+            who = (folder / MARK).read_text(encoding="utf-8", errors="replace").split()[1:2]
+            process = f" (process {who[0]})" if who else ""
+            raise FolderError(f"{folder}: another gaponet{process} is writing here; wait for it or stop it")
+        time.sleep(0.05)
+
+
+def lock(path: Path) -> int | None:
+    """Lock a file, made if missing, against other processes; returns its descriptor, None where another has it."""
+    import fcntl
+
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        except FileNotFoundError:
+            pass
+        os.close(descriptor)  # the file that was locked has been removed meanwhile
+
+
+def _clear(folder: Path) -> None:
+    """Remove what a killed writer had half written, here and below; not what another process is still writing."""
+    for path in folder.rglob(f"{MARK}-*"):
+        owner = path.name.removeprefix(f"{MARK}-").split("-")[0]
+        if owner.isdigit() and not _alive(int(owner)):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # another user's
+        pass
+    return True
