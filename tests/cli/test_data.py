@@ -76,10 +76,10 @@ def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
     assert capsys.readouterr().err.strip().endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
 
 
-def test_importing_twice_is_refused_by_name(logs, tmp_path, capsys):
+def test_the_same_command_again_says_what_was_there(logs, tmp_path, capsys):
     assert import_so101(logs, tmp_path / "data") == 0
-    assert import_so101(logs, tmp_path / "data") == 2
-    assert "is 'wave-lab-0kg-r0-" in capsys.readouterr().err
+    assert import_so101(logs, tmp_path / "data") == 0
+    assert "1 there already, 0 added" in capsys.readouterr().out
     assert len(Dataset(tmp_path / "data")) == 1
 
 
