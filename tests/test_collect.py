@@ -209,7 +209,7 @@ def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
     with pytest.raises(UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"):
         load_recipe(file)
     file.write_text('motions = ["*"]\nunits = ["virtual-1"]\n')
-    with pytest.raises(UsageError, match=r"mine.toml: 'payloads' is missing; add payloads = \[\.\.\.\]"):
+    with pytest.raises(UsageError, match=r"mine.toml: payloads: is missing; fields are name, payloads"):
         load_recipe(file)
 
 

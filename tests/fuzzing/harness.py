@@ -144,7 +144,7 @@ class _Crew:
                 found.append(self._lost("hang", f"no answer after {4 * HANG_S:g} s", counts))
             return found
         try:
-            while self.busy and self.pipe.poll(0):
+            while self.busy and self.process and self.pipe.poll(0):
                 found += self._report(self.pipe.recv(), counts)
         except (EOFError, OSError):
             self.process.join()

@@ -1,6 +1,7 @@
 """A slice of make fuzz: changed files end in one clear error, or in data that a robot can have recorded."""
 
 import pytest
+
 from fuzzing import readers
 from fuzzing.harness import run
 

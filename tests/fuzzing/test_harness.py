@@ -36,7 +36,9 @@ def absurd(source: Path, out: Path) -> None:
 
 
 def two_lines(source: Path, out: Path) -> None:
-    raise LogError("bad\nfile")
+    error = LogError("")
+    error.args = ("bad\nfile",)
+    raise error
 
 
 def die(source: Path, out: Path) -> None:
@@ -70,7 +72,9 @@ def test_an_error_of_two_lines_is_not_one_clear_line():
     assert {f.kind for f in run([target(only_when_changed(two_lines))], 3).failures} == {"traceback"}
 
 
-def test_a_clear_refusal_is_no_fault(tmp_path):
+def test_a_clear_refusal_is_no_fault_and_used_up_workers_are_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(harness, "RENEW", 4)
+
     def use(source: Path, out: Path) -> None:
         out.mkdir()
         (out / "kept").write_text("x")
