@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import functools
 import math
+import struct
+import tokenize
 import tomllib
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
+import numpy as np
 from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import PydanticSerializationError, to_json
 from typing_extensions import TypedDict
@@ -21,6 +26,7 @@ from gaponet.errors import GAPONetError
 
 T = TypeVar("T")
 LARGEST = 64 << 20  # bytes of a document that is read at once; ours have kilobytes
+LARGEST_ARRAYS = 512 << 20  # bytes of the arrays of one file
 
 
 def _name(text: str) -> str:
@@ -103,6 +109,37 @@ def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = 
     except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
         raise error(_line(path, f"not valid TOML: {found}", hint)) from None
     return validated(kind, table, path, error, hint, more)
+
+
+def read_npz(path: Path, error: type[GAPONetError], hint: str = "") -> dict[str, np.ndarray]:
+    """The arrays of an .npz file, by name; nothing pickled is ever loaded."""
+    if not path.is_file():
+        raise error(_line(path, "is missing, or not a file", hint))
+    try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(part.file_size for part in packed.infolist()) > LARGEST_ARRAYS:
+                raise error(_line(path, f"unpacks to more than {LARGEST_ARRAYS >> 20} MiB", hint))
+        with np.load(path, allow_pickle=False) as file:
+            return {name: np.asarray(file[name]) for name in file.files}
+    # NumPy reads a header as Python text; zipfile raises what zlib and struct do.
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        EOFError,
+        MemoryError,
+        SyntaxError,
+        TypeError,
+        NotImplementedError,
+        OverflowError,
+        RuntimeError,
+        tokenize.TokenError,
+        struct.error,
+        zlib.error,
+        zipfile.BadZipFile,
+    ) as found:
+        reason = " ".join(str(found).split())[:120] or type(found).__name__
+        raise error(_line(path, f"not readable ({reason})", hint)) from None
 
 
 def _content(path: Path, error: type[GAPONetError], hint: str) -> bytes:

@@ -92,3 +92,58 @@ def test_a_damaged_artifact_says_what_to_do(artifact, tmp_path, damage):
         (folder / "model.onnx").write_bytes(b"nothing")
     with pytest.raises(ModelError, match=r"give a run folder|restore it|upgrade|train or copy it again"):
         GapModel.load(folder)
+
+
+@pytest.fixture
+def copied(artifact, tmp_path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for file in artifact[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"qpos_range": [[float("nan"), 1.0], [-1.0, 1.0]]}, r"qpos_range\[0\]\[0\]: should be a finite number"),
+        ({"qpos_range": [[-1.0, 1.0]]}, "qpos_range: should have one entry for each of 2 joints"),
+        ({"qpos_range": [[1.0, -1.0], [-1.0, 1.0]]}, "is no range"),
+        ({"joint_names": "ab"}, "joint_names: should be"),
+        ({"dt": [0]}, r"dt\[0\]: should be greater than"),
+        ({"payload_seen": []}, "payload_seen: "),
+        ({"model": {"history": 1e9}}, "history: should be a valid integer"),
+        ({"model": {"history": 10**9}}, "history: should be less than or equal to 1000"),
+        ({"model": {"branch_hidden": [10**9]}}, r"branch_hidden\[0\]: should be less"),
+        ({"model": {"colour": "red"}}, "colour: is not a known field"),
+        ({"model": {"transformer_width": 3, "transformer_heads": 2}}, "cannot be shared by 2 heads"),
+        ({"model": {"history": 3}}, "does not fit its card"),
+        ({"model": {"delta_max": 1e-9}}, "does not fit its card"),
+        ({"joint_names": ["a"], "kp": [1.0], "kd": [1.0], "qpos_range": [[-1, 1]]}, "does not fit its card"),
+    ],
+)
+@pytest.mark.parametrize("backend", ["onnxruntime", "numpy"])
+def test_a_card_that_asks_for_another_network_is_refused_with_file_and_field(copied, changed, said, backend):
+    card = json.loads((copied / "card.json").read_text())
+    model = card["model"] | changed.get("model", {})
+    (copied / "card.json").write_text(json.dumps(card | changed | {"model": model}))
+    with pytest.raises(ModelError, match=said) as error:
+        GapModel.load(copied, backend)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("damage", ["shape", "nan", "absent", "text", "pickle", "cut"])
+def test_weights_that_do_not_fit_are_refused_before_anything_is_corrected(copied, damage):
+    file = copied / "weights.npz"
+    with np.load(file) as found:
+        weights = {name: found[name] for name in found.files}
+    changes = {"shape": np.zeros((3, 3), np.float32), "nan": np.full_like(weights["bias"], np.nan),
+               "text": np.array("x"), "pickle": np.array([{}], object)}  # fmt: skip
+    weights |= {"bias": changes[damage]} if damage in changes else {}
+    if damage == "absent":
+        del weights["relative"]
+    np.savez(file, **weights)
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(ModelError, match=r"weights\.npz: (does not fit its card|not readable)"):
+        GapModel.load(copied, "numpy")

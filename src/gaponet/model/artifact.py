@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
 
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError
@@ -21,6 +23,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
+from gaponet.structure import Json, Name, read_format, read_json, validated
 
 Array = np.ndarray
 
@@ -72,6 +75,70 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
+class Card(TypedDict):
+    """The fields of a card.json that something is decided by; others stand beside them."""
+
+    format: int
+    robot: Name
+    joint_names: Annotated[tuple[Name, ...], Len(1, 500)]
+    kp: tuple[float, ...]
+    kd: tuple[float, ...]
+    simulator_hash: str
+    model: dict[str, Json]
+    qpos_range: NotRequired[tuple[tuple[float | None, float | None], ...]]
+    dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
+    payload_seen: NotRequired[Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(1)]]
+    units: NotRequired[tuple[str, ...]]
+    virtual: NotRequired[bool]
+    simulator_only: NotRequired[bool]
+    interrupted: NotRequired[bool]
+    dataset_hash: NotRequired[str]
+    seed: NotRequired[int]
+    hours: NotRequired[float]
+    steps: NotRequired[int]
+    seconds: NotRequired[float]
+    excess_delay: NotRequired[float]
+    parity_rad: NotRequired[float]
+    motions: NotRequired[dict[str, tuple[str, ...]]]
+    val_mpjae: NotRequired[dict[str, float]]
+    versions: NotRequired[dict[str, str]]
+
+
+def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
+    """A card as it stands in the file, every field of a sensible type and size, and the shape of its model.
+
+    Raises:
+        ModelError: Damaged, or written by a newer version.
+    """
+    mend = "restore it or train again"
+    read_format(Card, file, FORMAT, ModelError, mend)
+    card = read_json(dict[str, Any], file, ModelError, mend)
+    config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
+    n = len(card["joint_names"])
+    for name in ("kp", "kd", "qpos_range"):
+        if len(card.get(name, card["kp"])) != n:
+            raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
+    for low, high in card.get("qpos_range", []):
+        if low is not None and high is not None and not low < high:
+            raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
+    return card, config
+
+
+def require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
+    """Refuse a network that does not answer (k, width) numbers with (k, *shape) finite ones up to `largest` (rad)."""
+    try:
+        bound = network.bind(1)
+        bound.run()
+        answers = [bound.delta, network(np.zeros((2, width), np.float32))]
+        fits = bound.x.shape == (1, width) and all(a.shape == (k, *shape) for k, a in enumerate(answers, 1))
+        fits = fits and all(np.isfinite(a).all() and np.abs(a).max() <= largest + 1e-3 for a in answers)
+        reason = f"{width} numbers in do not give {shape} finite ones up to {largest:g} rad out"
+    except Exception as error:  # whatever a stranger's network does
+        fits, reason = False, f"it does not run: {' '.join(str(error).split())[:120]}"
+    if not fits:
+        raise ModelError(f"{file}: does not fit its card ({reason}); copy or train the model again")
+
+
 @dataclass(frozen=True)
 class GapModel:
     """A delta-action model and its card.
@@ -102,18 +169,12 @@ class GapModel:
         for name in (CARD, *([WEIGHTS] if backend == "onnxruntime" else [])):
             if not (folder / name).is_file():
                 raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
-        try:
-            card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-            known = {f.name for f in fields(ModelConfig)}
-            shape: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in card["model"].items()}
-            version = int(card["format"])
-        except (json.JSONDecodeError, KeyError, ValueError, AttributeError) as error:
-            raise ModelError(f"{folder / CARD}: damaged ({error}); restore it or train again") from None
-        if version > FORMAT or not set(shape) <= known:
-            raise ModelError(f"{folder / CARD}: written by a newer gaponet; upgrade to read it")
+        card, config = read_card(folder / CARD)
         numpy = backend == "numpy"
         network = NumpyNetwork(folder / fused.FILE) if numpy else OnnxNetwork(folder / WEIGHTS, threads)
-        return cls(folder, card, ModelConfig(**shape), network)
+        width, n = config.input_dim(len(card["joint_names"])), len(card["joint_names"])
+        require_answer(network, width, (n,), config.delta_max, folder / (fused.FILE if numpy else WEIGHTS))
+        return cls(folder, card, config, network)
 
     @property
     def qpos_range(self) -> Array:
@@ -162,7 +223,11 @@ class GapModel:
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
         """For sim.replay and the aligned simulator; refuses a robot the model was not trained on."""
         self.require(robot)
-        points = OnnxNetwork(self.path / WEIGHTS, output="offsets") if self.config.learns_points else None
+        points = None
+        if self.config.learns_points:
+            points, n = OnnxNetwork(self.path / WEIGHTS, output="offsets"), len(self.card["joint_names"])
+            shape = (self.config.num_probes, n)
+            require_answer(points, self.config.input_dim(n), shape, self.config.probe_large, self.path / WEIGHTS)
         return DeltaCorrector(self.infer, self.config, robot, points)
 
     def weights_hash(self) -> str:

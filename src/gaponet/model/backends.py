@@ -63,7 +63,6 @@ class OnnxNetwork:
         self.output = output
         try:
             import onnxruntime as ort
-            from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
         except ImportError:
             raise ModelError(
                 "onnxruntime is not installed; run: pip install 'gaponet[deploy]', or load with backend='numpy'"
@@ -72,12 +71,11 @@ class OnnxNetwork:
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads leave the core alone
-        damaged = (ort_errors.InvalidProtobuf, ort_errors.InvalidGraph, ort_errors.Fail, ort_errors.NoSuchFile)
         try:
             self.session: Any = ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-        except damaged as error:
+        except Exception as error:  # onnxruntime's errors have no base of their own
             raise ModelError(
-                f"{path}: not a readable ONNX file ({str(error).splitlines()[0]}); train or copy it again"
+                f"{path}: not a readable ONNX file ({' '.join(str(error).split())[:120]}); train or copy it again"
             ) from None
         self.rows = ROWS if threads == 1 else ROWS_SHARED
         self.value = ort.OrtValue.ortvalue_from_numpy  # on the CPU it shares the array's memory

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
 
 Kind = Literal["gaponet", "mlp", "transformer", "fno", "inverse"]
+Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
     "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max", "delta_hold", "sensor_hold",
@@ -23,9 +26,9 @@ class ModelConfig:
     """gaponet: the operator. mlp: a plain network on [observation, action], the ASAP form. transformer: attention over
     the past frames and the present. fno: Fourier neural operator over the same time axis. inverse: the mlp fitted once
     to the inverse labels on the recorded motions, without roll-outs of its own and without PPO."""
-    history: int = 4
+    history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
-    stride: int = 1
+    stride: Annotated[int, Interval(ge=1, le=1000)] = 1
     """Control periods between past frames."""
     payload_input: bool = True
     """Whether the payload mass is observed."""
@@ -33,17 +36,17 @@ class ModelConfig:
     """Whether the trunk is asked at the payload as well as at the action, where it is observed."""
     payload_predictor: bool = True
     """Whether the sensor predictor sees the payload, where it is observed."""
-    payload_max: float = 3.0
+    payload_max: Annotated[float, Interval(gt=0, le=100)] = 3.0
     """Mass that counts as 1 at the input, kg."""
-    delta_max: float = 0.3
+    delta_max: Annotated[float, Interval(gt=0, le=10)] = 0.3
     """Largest correction, rad."""
-    delta_hold: int = 1
+    delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """Control periods that a correction is held; the reward of a decision is the mean over them."""
-    num_probes: int = 20
+    num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
     """m, how many targets the simulator is asked about."""
-    probe_small: float = 0.05
+    probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
     """Probe that reads gains and friction, rad."""
-    probe_large: float = 0.4
+    probe_large: Annotated[float, Interval(ge=0, le=10)] = 0.4
     """Probe that reads inertia, payload and saturation, rad."""
     sensors: Literal["predicted", "oracle", "learned", "off"] = "predicted"
     """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only. oracle: the
@@ -51,7 +54,7 @@ class ModelConfig:
     the simulator's whole state and m more simulations: to compare with, of no use on a robot."""
     sensor_target: Literal["delta", "absolute"] = "delta"
     """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
-    sensor_hold: int = 1
+    sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh. With
     delta_hold they are refreshed at the next decision."""
     branch_history: bool = True
@@ -62,29 +65,29 @@ class ModelConfig:
     lead them astray (docs/log.md). full: the paper's, every joint sees every joint. The mlp is always full."""
     branch: Literal["unstacked", "stacked"] = "unstacked"
     """unstacked: one branch net emits all p features. stacked: p nets of the same hidden layers emit one each."""
-    num_basis: int = 16
+    num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
-    branch_hidden: tuple[int, ...] = (64, 64)
+    branch_hidden: Layers = (64, 64)
     """Hidden layers of the branch net; the paper's full coupling has 256 256 256."""
-    trunk_hidden: tuple[int, ...] = (32, 32)
+    trunk_hidden: Layers = (32, 32)
     """Hidden layers of the trunk net; the paper's full coupling has 128 128 128."""
-    sensor_hidden: tuple[int, ...] = (128, 64)
+    sensor_hidden: Layers = (128, 64)
     """Hidden layers of the sensor predictor; 256 256 predict no better (docs/log.md)."""
-    mlp_hidden: tuple[int, ...] = (512, 256, 128)
+    mlp_hidden: Layers = (512, 256, 128)
     """Hidden layers of the MLP baseline (ASAP's size)."""
     mlp_match: bool = False
     """Widen or narrow mlp_hidden, in its proportions, until the MLP has as many parameters as the operator would."""
-    transformer_width: int = 64
+    transformer_width: Annotated[int, Interval(ge=1, le=4096)] = 64
     """Numbers per token of the transformer."""
-    transformer_layers: int = 2
+    transformer_layers: Annotated[int, Interval(ge=1, le=64)] = 2
     """Blocks of attention and MLP."""
-    transformer_heads: int = 4
+    transformer_heads: Annotated[int, Interval(ge=1, le=256)] = 4
     """Attention heads; they share the width."""
-    fno_width: int = 32
+    fno_width: Annotated[int, Interval(ge=1, le=4096)] = 32
     """Channels of the Fourier neural operator."""
-    fno_layers: int = 3
+    fno_layers: Annotated[int, Interval(ge=1, le=64)] = 3
     """Spectral layers."""
-    fno_modes: int = 4
+    fno_modes: Annotated[int, Interval(ge=1, le=1024)] = 4
     """Lowest frequencies kept, the mean included; at most history + 2 exist."""
 
     def __post_init__(self) -> None:

@@ -13,7 +13,6 @@ that ends in b + t and b − t: Σ b t = ¼ Σ (b + t)² − (b − t)². model/
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.errors import ModelError
+from gaponet.structure import read_npz
 
 Array = np.ndarray
 Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out)
@@ -33,11 +33,7 @@ JOINT_WISE = ("joint", "pair")  # kinds whose rows are joints of one simulation 
 
 def read_weights(path: Path) -> dict[str, Array]:
     """Arrays of a weights.npz; no pickle is ever loaded."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            weights = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ModelError(f"{path}: not readable ({error}); write it again with gaponet export RUN") from None
+    weights = read_npz(path, ModelError, "write it again with gaponet export RUN")
     if "offset" not in weights:
         raise ModelError(f"{path}: written by an earlier gaponet; write it again with gaponet export RUN")
     return weights
