@@ -3,8 +3,8 @@
     python benchmarks/dataset_scale.py WORK [--sequences 11198] [--hours 28.46]
 
 Writes the dataset into WORK/data once (about 6 GB; samples are noise around sines, of no other use), then measures each
-number in a fresh process: opening, reading a sequence at random, a batch of 4096 windows, peak resident memory. Prints
-one JSON object. Delete WORK afterwards.
+number in a fresh process: opening, reading a sequence at random, peak resident memory. Prints one JSON
+object. Delete WORK afterwards.
 """
 
 from __future__ import annotations
@@ -21,11 +21,7 @@ import numpy as np
 
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.data.store import Dataset
-from gaponet.data.windows import Windows
 from gaponet.robot import load_robot
-
-BATCH = 4096
-LENGTHS = (8, 32)  # rows of a window
 
 
 def generate(path: Path, sequences: int, hours: float) -> None:
@@ -71,40 +67,6 @@ def reading(path: Path) -> dict[str, Any]:
     return {"sequence_ms": float(np.median(taken)), "sequence_p95_ms": float(np.percentile(taken, 95))}
 
 
-def caching(path: Path) -> dict[str, Any]:
-    """Seconds to make the window cache of the operated joints, its size, and seconds to open it."""
-    start = time.perf_counter()
-    windows = Windows(Dataset(path), load_robot("h1_2").operated)
-    made = time.perf_counter() - start
-    start = time.perf_counter()
-    Windows(Dataset(path), load_robot("h1_2").operated)
-    size = sum(f.stat().st_size for f in (path / "cache").rglob("frames.f32"))
-    return {
-        "cache_s": made, "cache_gb": size / 1e9, "cache_open_s": time.perf_counter() - start,
-        "windows": windows.count(LENGTHS[0]),
-    }  # fmt: skip
-
-
-def batches(path: Path, resident: int = 1 << 30) -> dict[str, Any]:
-    """Milliseconds a batch of 4096 windows of the operated joints; enough of them to have read most of the cache."""
-    windows = Windows(Dataset(path), load_robot("h1_2").operated, resident=resident)
-    rng, out = np.random.default_rng(2), {}
-    for length in LENGTHS:
-        taken = []
-        for _ in range(100):
-            start = time.perf_counter()
-            windows.batch(rng, BATCH, length)
-            taken.append((time.perf_counter() - start) * 1e3)
-        out[f"batch_{length}_rows_ms"] = float(np.median(taken))
-        out[f"batch_{length}_rows_p95_ms"] = float(np.percentile(taken, 95))
-    return out
-
-
-def batches_unmapped(path: Path) -> dict[str, Any]:
-    """The same as for a cache too large to map."""
-    return batches(path, resident=0)
-
-
 def memory() -> dict[str, float]:
     """Peak of this process, GiB, and its parts at the end: file pages, shared with the system's cache, and its own."""
     lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
@@ -112,13 +74,7 @@ def memory() -> dict[str, float]:
     return {ours: int(lines[theirs].split()[0]) / 2**20 for ours, theirs in names.items()}
 
 
-MEASUREMENTS = {
-    "opening": opening,
-    "reading": reading,
-    "caching": caching,
-    "batches": batches,
-    "batches_unmapped": batches_unmapped,
-}
+MEASUREMENTS = {"opening": opening, "reading": reading}
 
 
 def measure(work: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from arm import commands, record, recordings, write_arm
 
 import gaponet.sim.batch
 from gaponet.data.pair import require_disjoint
-from gaponet.data.split import split_entries
+from gaponet.data.split import split_entries, write_split
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
@@ -53,6 +53,17 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
     assert result["unseen"]
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
     assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
+    data, _, _ = trained
+    parts = split_entries(data)
+    other = {"train": parts["train"], "val": parts["test"], "test": parts["val"]}
+    path = write_split(data, other, "motion", ("swapped",))
+    config = replace(SMALL, split=str(path))
+    assert Trainer(data, robot, tmp_path / "run", config, STEPS).parts == other
+    with pytest.raises(UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"):
+        Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
 @pytest.mark.parametrize("kind", ["mlp", "transformer", "fno", "inverse"])
@@ -197,7 +208,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_sensors_that_answer(sensors,
     trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
-    assert (trainer.sensor_r2 is None) == (sensors == "off")
+    assert (trainer.kept.sensor_r2 is None) == (sensors == "off")
     if sensors == "predicted":
         assert model.card["sensor_r2"]["mean"] > 0.3
 

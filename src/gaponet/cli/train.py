@@ -45,7 +45,7 @@ def train(
         model: gaponet, or a baseline: mlp, transformer, fno, inverse.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
-        fast: Networks half as wide and PPO with one pass over each batch, whatever the fields below say.
+        fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
         robot: Robot name or folder, if not the package's robot of the dataset.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.

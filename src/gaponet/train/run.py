@@ -26,10 +26,10 @@ import torch
 
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import require_same_gains
-from gaponet.data.split import split_entries
+from gaponet.data.split import Parts, read_split, split_entries
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
-from gaponet.files import write_text
+from gaponet.files import whole, write_text
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
 from gaponet.model.backends import FunctionNetwork
 from gaponet.model.baselines import delay_offset
@@ -75,6 +75,28 @@ class Status:
         return self.steps / max(self.seconds, 1e-9)
 
 
+@dataclass
+class Kept:
+    """What a run remembers: with the network and the random numbers, its checkpoint."""
+
+    best_state: State
+    trained_state: State
+    best: float = float("inf")
+    trained: float = float("inf")
+    """Of the best that was fitted, with gain 1."""
+    val: float = float("nan")
+    steps: int = 0
+    seconds: float = 0.0
+    """Trained up to the last checkpoint."""
+    rounds_done: int = 0
+    updates: int = 0
+    sensor_r2: Report | None = None
+    runner: State | None = None
+    env: State | None = None
+    """Of PPO's environments."""
+    warm: State | None = None
+
+
 class Trainer:
     """Holds one run; `run()` does it. Ctrl-C ends training and still exports the best model so far."""
 
@@ -96,15 +118,9 @@ class Trainer:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
             raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
-        self.dataset, self.robot, self.out, self.config, self.budget, self.show = (
-            dataset,
-            robot,
-            out,
-            config,
-            budget,
-            show,
-        )
-        self.parts = split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
+        self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
+        self.budget, self.show = budget, show
+        self.parts = _parts(dataset, config, holdout_units)
         if not config.mixed_gains:
             together = (e.meta for part in self.parts.values() for e in part)
             require_same_gains(together, dataset.joint_names, robot.operated)
@@ -114,14 +130,9 @@ class Trainer:
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, self.n)
-        self.best_state, self.best = copy.deepcopy(self.net.state_dict()), float("inf")
-        self.trained_state, self.trained = self.best_state, float("inf")  # the best that was fitted, with gain 1
-        self.steps, self.earlier, self.rounds_done, self.updates = 0, 0.0, 0, 0
-        self.reward = self.val = self.nominal = float("nan")
-        self.sensor_r2: Report | None = None
-        self.runner_state: State | None = None
-        self.env_state: State | None = None  # of PPO's environments
-        self.warm_state: State | None = None
+        untrained = copy.deepcopy(self.net.state_dict())
+        self.kept = Kept(untrained, untrained)
+        self.reward = self.nominal = float("nan")
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
@@ -137,11 +148,11 @@ class Trainer:
             self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
-            if not np.isfinite(self.best):
+            if not np.isfinite(self.kept.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
-            if recipe(self.config).rounds > self.rounds_done:
+            if recipe(self.config).rounds > self.kept.rounds_done:
                 self._warm_start()
-            elif not recipe(self.config).rounds and self.runner_state is None:
+            elif not recipe(self.config).rounds and self.kept.runner is None:
                 self._cold_start()
             self._ppo()
             self._shrink()
@@ -157,25 +168,25 @@ class Trainer:
         limit = 0.99 * self.config.model.delta_max
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed, self.config.threads)
-        warm.report = self.sensor_r2
+        warm.report = self.kept.sensor_r2
         rounds: list[State] = []
-        if self.rounds_done == 0:
+        if self.kept.rounds_done == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
             warm.begin()
         self.stage = "warm start"
-        if self.warm_state is not None and self._spent() < 1:
-            rounds = self.warm_state["rounds"]
-            restore_warm(warm, self.warm_state)
+        if self.kept.warm is not None and self._spent() < 1:
+            rounds = self.kept.warm["rounds"]
+            restore_warm(warm, self.kept.warm)
             torch.set_rng_state(self.rng)
         while warm.done < config.rounds and self._spent() < 1:
             before = round_state(warm)
             warm.round(self._tick)
             warm.refresh_sensors()
-            self.sensor_r2 = warm.report
+            self.kept.sensor_r2 = warm.report
             rounds.append(before)
-            self.rounds_done, self.warm_state = warm.done, warm_state(warm, rounds)
-            self.steps += config.num_envs * config.steps
+            self.kept.rounds_done, self.kept.warm = warm.done, warm_state(warm, rounds)
+            self.kept.steps += config.num_envs * config.steps
             self._consider()
 
     def _cold_start(self) -> None:
@@ -184,10 +195,10 @@ class Trainer:
         self._tick()
         env = self._env(self.config.warm_start.num_envs, 10**9, self.config.seed)
         x = env.get_observations()["actor"]
-        self.sensor_r2 = fit_inputs(
+        self.kept.sensor_r2 = fit_inputs(
             self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.config.threads
         )
-        self.trained_state = copy.deepcopy(self.net.state_dict())
+        self.kept.trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
         ppo = self.config.ppo
@@ -196,40 +207,40 @@ class Trainer:
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
         env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        self.net.load_state_dict(self.trained_state)
+        self.net.load_state_dict(self.kept.trained_state)
         runner = make_runner(env, self.net, ppo)
-        if self.runner_state is not None:
-            runner.alg.load(self.runner_state, None, True)
-        if self.env_state is not None:
-            restore_env(env, self.env_state)
+        if self.kept.runner is not None:
+            runner.alg.load(self.kept.runner, None, True)
+        if self.kept.env is not None:
+            restore_env(env, self.kept.env)
             torch.set_rng_state(self.rng)
-        self.warm_state, self.net = None, trained_by(runner)
+        self.kept.warm, self.net = None, trained_by(runner)
         env.loop.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
         while self._spent() < 1:
             for p in trained:  # first let the critic learn what the policy is worth
-                p.requires_grad_(self.updates >= ppo.critic_warmup)
+                p.requires_grad_(self.kept.updates >= ppo.critic_warmup)
             update(runner)
-            self.updates += 1
-            self.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
+            self.kept.updates += 1
+            self.kept.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
             self.reward = env.mean_reward()
             self._tick()
-            if self.updates % self.config.validate_every == 0:
-                self.runner_state, self.env_state = runner.alg.save(), env_state(env)
+            if self.kept.updates % self.config.validate_every == 0:
+                self.kept.runner, self.kept.env = runner.alg.save(), env_state(env)
                 self._consider()
-        self.runner_state, self.env_state = runner.alg.save(), env_state(env)
+        self.kept.runner, self.kept.env = runner.alg.save(), env_state(env)
         self._consider()
 
     def _shrink(self) -> None:
         """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
-        if not np.isfinite(self.trained):
+        if not np.isfinite(self.kept.trained):
             return
         self.stage = "gain"
         self._tick()
         with torch.random.fork_rng():
             net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.trained_state)
-        if choose_gain(net, lambda: self.validate(net), self.trained) < 1.0:
+        net.load_state_dict(self.kept.trained_state)
+        if choose_gain(net, lambda: self.validate(net), self.kept.trained) < 1.0:
             self._consider(net)
 
     def finish(self) -> GapModel:
@@ -237,7 +248,7 @@ class Trainer:
         self.stage = "export"
         self._tick()
         net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.best_state)
+        net.load_state_dict(self.kept.best_state)
         net.eval()
         env = self._env(max(64, len(self._conditions())), 10, seed=0)
         self.loggers.close()
@@ -271,14 +282,14 @@ class Trainer:
     def _consider(self, shrunk: DeltaNet | None = None) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
         net = shrunk or self.net
-        self.val = self.validate(net)
-        if self.val < self.best:
-            self.best, self.best_state = self.val, copy.deepcopy(net.state_dict())
-        if self.stage in ("warm start", "ppo") and self.val < self.trained:
-            self.trained, self.trained_state = self.val, copy.deepcopy(net.state_dict())
+        self.kept.val = self.validate(net)
+        if self.kept.val < self.kept.best:
+            self.kept.best, self.kept.best_state = self.kept.val, copy.deepcopy(net.state_dict())
+        if self.stage in ("warm start", "ppo") and self.kept.val < self.kept.trained:
+            self.kept.trained, self.kept.trained_state = self.kept.val, copy.deepcopy(net.state_dict())
         line = {
-            "stage": self.stage, "steps": self.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
-            "val_mpjae": self.val, "nominal_mpjae": self.nominal,
+            "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
+            "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
         with (self.out / "progress.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({k: v if v == v else None for k, v in line.items()}) + "\n")
@@ -288,45 +299,37 @@ class Trainer:
 
     def seconds(self) -> float:
         """Trained so far, earlier parts of a resumed run included."""
-        return self.earlier + time.monotonic() - self.began
+        return self.kept.seconds + time.monotonic() - self.began
 
     def _spent(self) -> float:
-        return self.budget.spent(self.seconds(), self.steps)
+        return self.budget.spent(self.seconds(), self.kept.steps)
 
     def _tick(self) -> float:
         """Show where the run stands; returns the share of the budget spent."""
+        k, spent = self.kept, self._spent()
         self.show(
-            Status(self.stage, min(self._spent(), 1.0), self.steps, self.seconds(), self.reward, self.val, self.best,
-                   self.nominal)
-        )  # fmt: skip
-        return self._spent()
+            Status(
+                self.stage, min(spent, 1.0), kept.steps, self.seconds(), self.reward, kept.val, kept.best, self.nominal
+            )
+        )
+        return spent
 
     def _save(self) -> None:
-        state = {
-            "net": self.net.state_dict(), "best_state": self.best_state, "best": self.best, "val": self.val,
-            "trained_state": self.trained_state, "trained": self.trained,
-            "steps": self.steps, "seconds": self.seconds(), "rounds_done": self.rounds_done, "updates": self.updates,
-            "sensor_r2": self.sensor_r2,
-            "runner": self.runner_state, "env": self.env_state, "warm": self.warm_state, "rng": torch.get_rng_state(),
-        }  # fmt: skip
-        temporary = self.out / ".checkpoint.pt.tmp"
-        torch.save(state, temporary)
-        os.replace(temporary, self.out / "checkpoint.pt")
+        self.kept.seconds, self.began = self.seconds(), time.monotonic()
+        state = vars(self.kept) | {"net": self.net.state_dict(), "rng": torch.get_rng_state()}
+        with whole(self.out / "checkpoint.pt") as temporary:
+            torch.save(state, temporary)
 
     def _load(self) -> None:
         try:
             state = torch.load(self.out / "checkpoint.pt", weights_only=True)
-            self.net.load_state_dict(state["net"])
-            self.trained_state, self.trained = state["trained_state"], state["trained"]
-            self.env_state, self.warm_state, self.rng = state["env"], state["warm"], state["rng"]
-        except (RuntimeError, KeyError, EOFError, ValueError) as error:
+            self.net.load_state_dict(state.pop("net"))
+            self.rng = state.pop("rng")
+            self.kept = Kept(**state)
+        except (RuntimeError, KeyError, EOFError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0]
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
-        self.best_state, self.best, self.val = state["best_state"], state["best"], state["val"]
-        self.steps, self.earlier = state["steps"], state["seconds"]
-        self.rounds_done, self.updates = state["rounds_done"], state["updates"]
-        self.sensor_r2 = report_of(state["sensor_r2"])
-        self.runner_state = state["runner"]
+        self.kept.sensor_r2 = report_of(self.kept.sensor_r2)
         torch.set_rng_state(self.rng)
 
     def _write_config(self, holdout_units: tuple[str, ...]) -> None:
@@ -358,17 +361,29 @@ class Trainer:
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
-            val_mpjae={"model": self.best, "nominal": self.nominal},
-            sensor_r2=self.sensor_r2,
+            val_mpjae={"model": self.kept.best, "nominal": self.nominal},
+            sensor_r2=self.kept.sensor_r2,
             seed=self.config.seed,
-            gain=self.best_state["bounded.gain"].item(),
+            gain=self.kept.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
-            steps=self.steps,
+            steps=self.kept.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch", "rsl-rl-lib")}
             | {"python": platform.python_version()},
         )
+
+
+def _parts(dataset: Dataset, config: TrainConfig, holdout_units: tuple[str, ...]) -> Parts:
+    """By the split file, where one is given, else by the fixed rule."""
+    if not config.split:
+        return split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
+    if holdout_units or config.holdout_payloads or config.rates or config.train_share != 1:
+        raise UsageError(
+            f"--split {config.split} says already who is for training: leave out --holdout-units, --holdout-payloads, "
+            "--rates and --train-share, or make another split with gaponet data split"
+        )
+    return read_split(config.split, dataset)
 
 
 def torch_infer(net: torch.nn.Module) -> Callable[[Array], Array]:
