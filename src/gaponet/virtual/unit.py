@@ -130,14 +130,18 @@ class VirtualRobot:
         self.events: list[list[Event]] = [[] for _ in seeds]
         self._reported = np.zeros((2, *target.shape), bool)
 
-    def set_gains(self, kp: Array, kd: Array) -> None:
+    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None) -> None:
         """Gains told to the drives instead of the robot's, (n) or (N, n); they deliver their share of them.
+
+        A torque limit (n) N·m, too, where given.
 
         Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles by those it finds.
         """
         p, at = self.physics, self.active
         self._kp = np.broadcast_to(np.asarray(kp, float)[..., at] * p.kp_scale, self._kp.shape)
         self._kd = np.broadcast_to(np.asarray(kd, float)[..., at] * p.kd_scale, self._kd.shape)
+        if effort is not None:
+            self._effort = np.asarray(effort, float)[at]
 
     def _settle(self, target: Array) -> None:
         """Where PD and gravity balance, and a little off it: friction keeps a joint where it happened to stop."""

@@ -2,7 +2,7 @@
 
 A packet is FF FF id length instruction parameters… checksum; a reply has a status byte in place of the instruction.
 Numbers are little-endian; velocity and load are sign and magnitude. From Feetech's public memory table (STS3215) and
-protocol manual. Tested against a bus that answers by the same document; not against servos.
+protocol manual. Tested against buses that answer by the same documents, well and badly; not against servos.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from gaponet.deploy.driver import DriverError
 
 PING, READ, WRITE, SYNC_READ, SYNC_WRITE = 1, 2, 3, 0x82, 0x83
 BROADCAST = 0xFE
-ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits, from the lowest
+ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits; bit 4: torque is on
+FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
+RETRIES = 2  # what LeRobot's num_read_retries is
+CHATTER = 4  # times the bytes that were asked for: a bus that says more is not listened to
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,20 @@ class Register:
 
 
 MODEL = Register(3, 2)
+MIN_POSITION = Register(9, 2)  # goals are cut to these two
+MAX_POSITION = Register(11, 2)
+MAX_TORQUE = Register(16, 2)  # 0.1 %; of TORQUE_LIMIT at power-up
+P = Register(21, 1)
+D = Register(22, 1)
+I = Register(23, 1)  # noqa: E741
+PROTECTION_CURRENT = Register(28, 2)  # 6.5 mA
+HOMING_OFFSET = Register(31, 2, 11)  # position = encoder − this
 MODE = Register(33, 1)  # 0: position
 TORQUE_ENABLE = Register(40, 1)
+ACCELERATION = Register(41, 1)  # of the servo's own path to a goal, 100 steps/s²; 0: none
 GOAL_POSITION = Register(42, 2, 15)
+GOAL_VELOCITY = Register(46, 2, 15)  # of that path, steps/s; 0: none
+TORQUE_LIMIT = Register(48, 2)  # 0.1 %
 PRESENT_POSITION = Register(56, 2, 15)
 PRESENT_VELOCITY = Register(58, 2, 15)
 PRESENT_LOAD = Register(60, 2, 10)  # 0.1 % of full drive
@@ -81,73 +95,98 @@ def packet(servo: int, code: int, parameters: bytes = b"") -> bytes:
 
 
 class ServoBus:
-    """Talks to servos; every reply is checked."""
+    """Talks to servos; every reply is checked, and what it says of the servo's health is kept."""
 
-    def __init__(self, stream: Stream, timeout: float = 0.01) -> None:
+    def __init__(self, stream: Stream, timeout: float = 0.01, retries: int = RETRIES) -> None:
         """
         Args:
             stream: An open port.
-            timeout: Longest wait for one servo's reply, s.
+            timeout: Silence after which missing replies are given up, s.
+            retries: How often those are asked for again.
         """
-        self.stream, self.timeout = stream, timeout
+        self.stream, self.timeout, self.retries = stream, timeout, retries
         self.refused = 0  # replies with a wrong checksum
+        self.errors: dict[int, int] = {}  # servo → error bits of all its replies so far
+        self._owed = False  # replies were asked for that have not come; they may come late
 
     def ping(self, servo: int) -> bool:
         """Whether it answers."""
-        self._send(packet(servo, PING))
-        return self._reply(servo, 0) is not None
+        return bool(self._ask(PING, [servo], b"", 0))
 
     def read(self, servo: int, register: Register) -> int:
         """One register.
 
         Raises:
-            DriverError: No answer, or a damaged one.
+            DriverError: No answer, or damaged ones only.
         """
-        self._send(packet(servo, READ, bytes([register.address, register.size])))
-        data = self._reply(servo, register.size)
-        if data is None:
+        found = self._ask(READ, [servo], bytes([register.address, register.size]), register.size)
+        if not found:
             raise DriverError(f"servo {servo} does not answer; is it powered and is its number {servo}?")
-        return register.decode(data)
-
-    def write(self, servo: int, register: Register, value: int) -> None:
-        """One register, acknowledged."""
-        self._send(packet(servo, WRITE, bytes([register.address]) + register.encode(value)))
-        if self._reply(servo, 0) is None:
-            raise DriverError(f"servo {servo} does not acknowledge; is it powered?")
+        return register.decode(found[servo])
 
     def sync_read(self, servos: Iterable[int], block: Register) -> dict[int, bytes]:
-        """The same block of several servos in one exchange; those that did not answer well are missing."""
-        servos = list(servos)
-        self._send(packet(BROADCAST, SYNC_READ, bytes([block.address, block.size, *servos])))
-        replies = ((servo, self._reply(servo, block.size)) for servo in servos)
-        return {servo: data for servo, data in replies if data is not None}
+        """The same block of several servos in one exchange; those that never answered well are missing."""
+        return self._ask(SYNC_READ, list(servos), bytes([block.address, block.size]), block.size)
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """One register of several servos; nobody acknowledges."""
         parameters = b"".join(bytes([servo]) + register.encode(value) for servo, value in values.items())
-        self._send(packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters))
+        self.stream.write(packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters))
 
-    def _send(self, data: bytes) -> None:
-        self.stream.reset_input_buffer()
-        self.stream.write(data)
+    def broadcast(self, register: Register, value: int) -> None:
+        """One register of every servo there is, whatever its number; nobody acknowledges."""
+        self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
 
-    def _reply(self, servo: int, size: int) -> bytes | None:
-        """Parameters of the next reply, or None after the time-out or where it is damaged."""
-        deadline = time.monotonic() + self.timeout
-        head = self._bytes(4, deadline)
-        while head and head[:2] != b"\xff\xff":  # noise before a packet
-            more = self._bytes(1, deadline)
-            head = head[1:] + more if more else b""
-        if len(head) < 4 or head[3] < 2:
-            return None
-        rest = self._bytes(head[3], deadline)
-        if len(rest) != head[3] or checksum(head[2:] + rest[:-1]) != rest[-1] or head[2] != servo:
-            self.refused += 1
-            return None
-        return rest[1:-1] if len(rest) - 2 == size else None
+    def _ask(self, instruction: int, servos: list[int], parameters: bytes, size: int) -> dict[int, bytes]:
+        """Replies by servo; those that are missing after a silence are asked for again."""
+        if self._owed:
+            self._drain()
+        found: dict[int, bytes] = {}
+        for _ in range(1 + self.retries):
+            missing = [servo for servo in servos if servo not in found]
+            if missing:
+                several = instruction == SYNC_READ
+                self.stream.reset_input_buffer()
+                self.stream.write(
+                    packet(BROADCAST, instruction, parameters + bytes(missing)) if several
+                    else packet(missing[0], instruction, parameters)
+                )  # fmt: skip
+                found |= self._replies(missing, size)
+                self._owed |= not found.keys() >= set(missing)
+        return found
 
-    def _bytes(self, count: int, deadline: float) -> bytes:
-        data = b""
-        while len(data) < count and time.monotonic() < deadline:
-            data += self.stream.read(count - len(data))
-        return data if len(data) == count else b""
+    def _replies(self, servos: list[int], size: int) -> dict[int, bytes]:
+        """Whole replies of these servos, in any order, until all are there or nothing more comes."""
+        found: dict[int, bytes] = {}
+        length, data = size + 6, b""
+        patience = CHATTER * length * len(servos)  # bytes
+        silent = time.monotonic() + self.timeout
+        while len(found) < len(servos) and patience > 0:
+            more = self.stream.read(max(1, (len(servos) - len(found)) * length - len(data)))
+            if more:
+                silent = time.monotonic() + self.timeout
+            elif time.monotonic() >= silent:
+                break
+            data, patience = data + more, patience - len(more)
+            while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + length:
+                reply = data[start : start + length]
+                if reply[3] != size + 2 or checksum(reply[2:-1]) != reply[-1]:
+                    self.refused += reply[2] in servos
+                    data = data[start + 1 :]  # the next packet may begin within what looked like one
+                    continue
+                data = data[start + length :]
+                self.errors[reply[2]] = self.errors.get(reply[2], 0) | reply[4]
+                if reply[2] in servos:
+                    found[reply[2]] = reply[5:-1]
+        return found
+
+    def _drain(self) -> None:
+        """Wait until late replies have come, so that they are not taken for those to what is asked next."""
+        patience, silent = 8192, time.monotonic() + self.timeout
+        while patience > 0:
+            more = self.stream.read(256)
+            if more:
+                silent, patience = time.monotonic() + self.timeout, patience - len(more)
+            elif time.monotonic() >= silent:
+                break
+        self._owed = False

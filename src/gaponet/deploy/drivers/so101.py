@@ -1,38 +1,56 @@
 """SO101Driver: an SO-101 arm, six Feetech STS3215 servos on a serial bus.
 
 Units: 4096 encoder steps a turn; velocity in steps/s; current in 6.5 mA. tau is current times a constant, signed by the
-load: the constant makes the stall current the effort limit; it was not calibrated. Zero of a joint is the middle of its
-calibrated range (LeRobot's convention), or step 2048 without a calibration; it is not exactly the MJCF's zero.
+load: the constant makes the stall current the effort limit; it was not calibrated. so101_calibration.py says where a
+joint's 0 rad is.
 
 The servos cannot damp: `damp` switches their torque off and the gears brake. They keep their last target when commands
-cease. Not checked on a real arm: everything was tested against a bus that answers by Feetech's document.
+cease, so a run without fault ends held. Not checked on a real arm: everything was tested against buses that answer by
+Feetech's documents, well and badly.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import time
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from gaponet.deploy.driver import DriverError, End, State
+from gaponet.deploy.driver import DriverError, Fault, State
 from gaponet.deploy.drivers import feetech as reg
+from gaponet.deploy.drivers.so101_calibration import SPEAK, STEP, Row, numbered, read_calibration, settle
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
+
+try:
+    from termios import error as termios_error
+except ImportError:  # Windows
+    LOST: tuple[type[Exception], ...] = (OSError,)
+else:
+    LOST = (OSError, termios_error)  # pyserial's own errors are OSErrors; a port that is gone also raises the other
 
 if TYPE_CHECKING:
     from serial import Serial
 
 Array = np.ndarray
 
-STEPS = 4096
-STEP = 2 * np.pi / STEPS  # rad
 STALL_CURRENT = 2.7 / 0.0065  # steps: 2.7 A at 12 V (Feetech's data sheet of the STS3215)
 BAUD = 1_000_000
-SPEAK = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")  # servo 1 to 6
+STIFFNESS = 17.8 / 32  # N·m/rad of an STS3215 for each unit of its P; robot.toml of the so101 says whence
+FULL = 1000  # of TORQUE_LIMIT, 0.1 %
+FACTS = {
+    "p": reg.P, "i": reg.I, "d": reg.D, "max_torque": reg.MAX_TORQUE, "torque_limit": reg.TORQUE_LIMIT,
+    "protection_current": reg.PROTECTION_CURRENT, "acceleration": reg.ACCELERATION, "goal_velocity": reg.GOAL_VELOCITY,
+    "voltage": reg.PRESENT_VOLTAGE,
+}  # fmt: skip
+HELD = {"homing_offset": reg.HOMING_OFFSET, "range_min": reg.MIN_POSITION, "range_max": reg.MAX_POSITION}
+READINGS = {
+    "qpos": reg.PRESENT_POSITION, "qvel": reg.PRESENT_VELOCITY, "load": reg.PRESENT_LOAD,
+    "current": reg.PRESENT_CURRENT, "temperature": reg.PRESENT_TEMPERATURE,
+}  # fmt: skip
 
 
 class SO101Driver:
@@ -40,32 +58,59 @@ class SO101Driver:
 
     virtual = False
     noisy = False  # a resting encoder reads the same for ever
-    at_end: End = "hold"
+    at_end: Literal["hand_over", "hold", "damp"] = "hold"
 
     def __init__(
-        self, robot: RobotSpec, port: str = "/dev/ttyACM0", calibration: str | Path | None = None, timeout: float = 0.01
+        self,
+        robot: RobotSpec,
+        port: str = "/dev/ttyACM0",
+        calibration: str | Path | None = None,
+        timeout: float = 0.01,
+        silent: bool = False,
     ) -> None:
         """
         Args:
             robot: so101.
             port: Serial port.
-            calibration: JSON file that LeRobot's calibration wrote.
-            timeout: Longest wait for a servo's reply, s.
+            calibration: JSON file that LeRobot's calibration wrote; default what the servos hold of it.
+            timeout: Longest silence of the bus while replies are awaited, s.
+            silent: `connect` leaves the port alone: for the guard, because a bus has one speaker. `damp` opens it.
         """
         if set(robot.joint_names) != set(SPEAK):
             raise UsageError(f"the so101 driver is for the joints {', '.join(SPEAK)}; {robot.name} has others")
         self.robot, self.port, self.calibration = robot, port, calibration
-        self.timeout = timeout
+        self.timeout, self.silent = timeout, silent
         self.address = port
         self.joint_names = self.commanded = robot.joint_names
-        self.servos, self.middle, self.sign = read_calibration(calibration, robot)
+        self.given = read_calibration(calibration, robot) if calibration else None
+        self.steps = self.given or numbered(robot)
         self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
         self.facts: dict[str, Any] = {}
         self._serial: Serial | None = None
+        self._state: State | None = None
         self._enabled = False
 
     def connect(self) -> None:
-        """Open the port and see that every servo is there and is an STS3215 in position mode; nothing moves."""
+        """Open the port, ask every servo what it is, how it is set and how it is; nothing moves, nothing is written."""
+        if self.silent:
+            return
+        try:
+            self._open()
+            with self._bus_errors():
+                self._meet()
+            self._state = None
+            deadline = time.monotonic() + 1.0
+            while self._state is None:
+                self._poll()
+                if self._state is None and time.monotonic() > deadline:
+                    raise DriverError(f"{self.port}: the servos' readings do not arrive whole; check the cable")
+            if self._state.fault:
+                raise DriverError(f"{self.port}: {self._state.fault.text}")
+        except BaseException:
+            self._shut()
+            raise
+
+    def _open(self) -> None:
         try:
             import serial
         except ImportError:
@@ -74,109 +119,144 @@ class SO101Driver:
             self._serial = serial.Serial(self.port, BAUD, timeout=0.002, write_timeout=0.1)
         except (serial.SerialException, ValueError, OSError) as error:
             raise DriverError(f"{self.port}: {error}; is the arm plugged in, and may you use the port?") from None
-        self._lost = serial.SerialException
         self._bus = reg.ServoBus(self._serial, self.timeout)
-        for joint, servo in zip(self.joint_names, self.servos, strict=True):
-            if not self._bus.ping(servo):
+
+    def _meet(self) -> None:
+        """Number, model and mode of each servo; then its gains, limits and calibration."""
+        bus, servos = self._bus, self.steps.servos
+        for joint, servo in zip(self.joint_names, servos, strict=True):
+            if not bus.ping(servo):
                 raise DriverError(f"{self.port}: servo {servo} ({joint}) does not answer; check power and cable")
-            model, mode = self._bus.read(servo, reg.MODEL), self._bus.read(servo, reg.MODE)
+            model, mode = bus.read(servo, reg.MODEL), bus.read(servo, reg.MODE)
             if model != reg.STS3215 or mode != 0:
                 raise DriverError(
                     f"{self.port}: servo {servo} ({joint}) is model {model} in mode {mode}; the driver needs an "
                     f"STS3215 ({reg.STS3215}) in position mode (0)"
                 )
-        self._state: State | None = None
-        deadline = time.monotonic() + 1.0
-        while self._state is None and time.monotonic() < deadline:
-            self._poll()
-        if self._state is None:
-            raise DriverError(f"{self.port}: the servos' readings do not arrive whole; check the cable")
+        numbers = dict(zip(self.joint_names, servos, strict=True))
+        held = {
+            joint: Row(id=servo, drive_mode=0, **{name: bus.read(servo, r) for name, r in HELD.items()})
+            for joint, servo in numbers.items()
+        }
+        self.steps = settle(self.given, held, self.robot, self.port)
+        servo_facts = {name: [bus.read(servo, r) for servo in servos] for name, r in FACTS.items()}
+        self.kp = STIFFNESS * np.array(servo_facts["p"], float)
+        self.facts = {
+            "servos": servo_facts,
+            "calibration": {joint: asdict(row) for joint, row in held.items()},
+            "notes": self._notes(servo_facts),
+        }
+
+    def _notes(self, facts: dict[str, list[int]]) -> list[str]:
+        """How the servos are set otherwise than the robot says, in sentences."""
+        notes, said = [], (self.robot.nominal or self.robot).kp
+        odd = [(j, p, kp, k) for j, p, kp, k in zip(self.joint_names, facts["p"], self.kp, said, strict=True)
+               if abs(kp - k) > 0.01 * k]  # fmt: skip
+        if odd:
+            joints = "all joints" if len(odd) == len(said) else ", ".join(j for j, *_ in odd)
+            _, p, kp, k = odd[0]
+            notes.append(
+                f"P of {joints} is {p}, about {kp:.3g} N·m/rad, robot.toml says {k:.3g}; "
+                "limits and recordings use what the servos have"
+            )
+        for name, usual, what in (
+            ("i", 0, "I is not 0: an integrator of which limits and simulator know nothing"),
+            ("torque_limit", FULL, "the torque limit is below 100 %"),
+            ("goal_velocity", 0, "the servo limits its speed"),
+        ):
+            joints = ", ".join(j for j, x in zip(self.joint_names, facts[name], strict=True) if x != usual)
+            notes += [f"{joints}: {what}"] if joints else []
+        return notes
+
+    @property
+    def qpos_range(self) -> Array:
+        """Where the calibrated range of each joint ends, (n, 2) rad; commands stay within."""
+        return self.steps.qpos_range
 
     def read(self) -> State:
         """Ask all servos; the last state again where one did not answer."""
-        self._poll()
+        with self._bus_errors():
+            self._poll()
         assert self._state is not None
         return self._state
 
     def _poll(self) -> None:
         now = time.monotonic()
-        try:
-            blocks = self._bus.sync_read(self.servos, reg.PRESENT)
-        except self._lost as error:
-            raise DriverError(f"{self.port}: {error}") from None
-        old = self._state
-        if len(blocks) < len(self.servos):
+        servos, old = self.steps.servos, self._state
+        blocks = self._bus.sync_read(servos, reg.PRESENT)
+        if len(blocks) < len(servos):
             if old is not None:
-                self._state = State(old.time, old.qpos, old.qvel, old.tau, old.temperature, self._bus.refused)
+                self._state = State(
+                    old.time, old.qpos, old.qvel, old.tau, old.temperature, self._bus.refused, fault=self._fault()
+                )
             return
-        values = {
-            name: np.array([field.decode(_cut(blocks[s], field)) for s in self.servos], float)
-            for name, field in (
-                ("q", reg.PRESENT_POSITION), ("v", reg.PRESENT_VELOCITY), ("load", reg.PRESENT_LOAD),
-                ("i", reg.PRESENT_CURRENT), ("t", reg.PRESENT_TEMPERATURE),
-            )
-        }  # fmt: skip
-        tau = np.abs(values["i"]) / STALL_CURRENT * self.robot.effort_limit * np.sign(values["load"]) * self.sign
-        qpos = (values["q"] - self.middle) * STEP * self.sign
-        self._state = State(now, qpos, values["v"] * STEP * self.sign, tau, values["t"], self._bus.refused)
+        raw = {
+            name: np.array([field.decode(_cut(blocks[s], field)) for s in servos], float)
+            for name, field in READINGS.items()
+        }
+        sign = self.steps.sign
+        tau = np.abs(raw["current"]) / STALL_CURRENT * self.robot.effort_limit * np.sign(raw["load"]) * sign
+        self._state = State(
+            now, self.steps.qpos(raw["qpos"]), raw["qvel"] * STEP * sign, tau, raw["temperature"], self._bus.refused,
+            fault=self._fault(),
+        )  # fmt: skip
+
+    def _fault(self) -> Fault | None:
+        """What the servos have said is wrong with them, in any reply."""
+        numbers = dict(zip(self.steps.servos, self.joint_names, strict=True))
+        said = [
+            f"servo {servo} ({joint}): " + ", ".join(w for bit, w in enumerate(reg.ERRORS) if w and errors >> bit & 1)
+            for servo, joint in numbers.items() if (errors := self._bus.errors.get(servo, 0) & reg.FAULTY)
+        ]  # fmt: skip
+        return Fault("robot", "; ".join(said) + "; look at load, supply and cables") if said else None
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        """Goal positions of all servos in one packet; torque comes on with the first one."""
-        steps = np.rint(np.asarray(ctrl) / (STEP * self.sign) + self.middle).astype(int)
-        goal = dict(zip(self.servos, np.clip(steps, 0, STEPS - 1).tolist(), strict=True))
-        self._sync(reg.GOAL_POSITION, goal)
-        if not self._enabled:
-            self._sync(reg.TORQUE_ENABLE, dict.fromkeys(self.servos, 1))
-            self._enabled = True
+        """Goal positions of all servos in one packet, within the calibrated range; torque comes on with the first."""
+        goal = dict(zip(self.steps.servos, self.steps.steps(np.asarray(ctrl)).tolist(), strict=True))
+        with self._bus_errors():
+            self._bus.sync_write(reg.GOAL_POSITION, goal)
+            if not self._enabled:
+                self._bus.sync_write(reg.TORQUE_ENABLE, dict.fromkeys(goal, 1))
+                self._enabled = True
 
     def damp(self, weight: float = 1.0) -> None:
-        """Torque off, said again every period: a lost packet must not matter."""
+        """Torque off, to every servo on the bus, asking none; said every period: a lost packet must not matter."""
         self._enabled = False
-        if self._serial is not None:
-            self._sync(reg.TORQUE_ENABLE, dict.fromkeys(self.servos, 0))
+        if self._serial is None:
+            self._open()
+        with self._bus_errors():
+            self._bus.broadcast(reg.TORQUE_ENABLE, 0)
+            self._bus.sync_write(reg.TORQUE_ENABLE, dict.fromkeys(self.steps.servos, 0))
 
-    def _sync(self, register: reg.Register, values: dict[int, int]) -> None:
+    @contextlib.contextmanager
+    def _bus_errors(self) -> Any:
+        """A lost port becomes a DriverError, and is opened again by the next `damp`."""
         try:
-            self._bus.sync_write(register, values)
-        except self._lost as error:
-            raise DriverError(f"{self.port}: {error}") from None
+            yield
+        except LOST as error:
+            self._shut()
+            raise DriverError(f"{self.port}: {error}; is the cable in?") from None
 
     def close(self, hold: bool = False) -> None:
-        """Torque off, or as it is, and port closed."""
-        if self._serial is None:
-            return
-        with contextlib.suppress(DriverError):
-            if not hold:
+        """Torque off unless it shall hold, port closed."""
+        if self._serial is not None and not hold:
+            with contextlib.suppress(DriverError):
                 self.damp()
-        self._serial.close()
+        self._shut()
+
+    def _shut(self) -> None:
+        if self._serial is not None:
+            with contextlib.suppress(*LOST):
+                self._serial.close()
         self._serial = None
 
     def guard(self) -> dict[str, object] | None:
-        """Opens the port only when this process is gone: a bus has one speaker."""
+        """Opens the port only when this process is gone or hangs: a bus has one speaker."""
         calibration = str(self.calibration) if self.calibration else None
         return {
-            "kind": "so101", "robot": str(self.robot.mjcf.parent), "early": False, "port": self.port,
-            "calibration": calibration,
+            "kind": "so101", "robot": str(self.robot.mjcf.parent), "early": True, "port": self.port,
+            "calibration": calibration, "silent": True,
         }  # fmt: skip
-
-
-def read_calibration(path: str | Path | None, robot: RobotSpec) -> tuple[list[int], Array, Array]:
-    """Servo number, encoder step at 0 rad and sign of each joint, in the robot's order.
-
-    Raises:
-        UsageError: The file is not a calibration, or lacks a joint.
-    """
-    if path is None:
-        return [SPEAK.index(j) + 1 for j in robot.joint_names], np.full(6, STEPS / 2), np.ones(6)
-    try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
-        rows = [table[joint] for joint in robot.joint_names]
-        servos = [int(row["id"]) for row in rows]
-        middle = np.array([(row["range_min"] + row["range_max"]) / 2 for row in rows], float)
-        sign = np.array([-1.0 if row["drive_mode"] else 1.0 for row in rows])
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UsageError(f"{path}: not a calibration of LeRobot for {', '.join(SPEAK)} ({error!r})") from None
-    return servos, middle, sign
 
 
 def _cut(block: bytes, field: reg.Register) -> bytes:

@@ -1,4 +1,8 @@
-"""A VIRTUAL SO-101 on a pseudo-terminal: servos that answer like STS3215, hidden physics in real time behind them."""
+"""A VIRTUAL SO-101: servos that answer like STS3215, hidden physics behind them, on a pseudo-terminal in real time.
+
+Registers that act: torque enable, goal, P (stiffness), position limits, torque limit. The others are kept and read
+back. Its calibration is the one that LeRobot would have written into the servos of an arm with the MJCF's limits.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,8 @@ import numpy as np
 
 from gaponet.deploy.clock import uncollected
 from gaponet.deploy.drivers import feetech as reg
-from gaponet.deploy.drivers.so101 import SPEAK, STALL_CURRENT, STEP, STEPS
+from gaponet.deploy.drivers.so101 import FULL, STALL_CURRENT, STIFFNESS
+from gaponet.deploy.drivers.so101_calibration import GRIPPER, SPEAK, STEP, STEPS, TURNS, Calibration, Row
 from gaponet.deploy.drivers.virtual import LiveUnit
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
@@ -41,6 +46,7 @@ class VirtualSO101:
         self.robot = robot
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(SPEAK)  # servo number − 1 → joint
+        self.calibration = Calibration(_as_calibrated(robot), robot)
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.port, self._slave = os.ttyname(slave), slave
@@ -50,12 +56,18 @@ class VirtualSO101:
                 link.unlink()
             link.symlink_to(self.port)
         self.memory = [bytearray(128) for _ in SPEAK]
-        for memory in self.memory:
-            memory[reg.MODEL.address : reg.MODEL.address + 2] = reg.MODEL.encode(reg.STS3215)
-            memory[reg.PRESENT_VOLTAGE.address] = 120
+        for joint, memory in zip(SPEAK, self.memory, strict=True):
+            row = self.calibration.rows[joint]
+            for register, value in (
+                (reg.MODEL, reg.STS3215), (reg.MIN_POSITION, row.range_min), (reg.MAX_POSITION, row.range_max),
+                (reg.HOMING_OFFSET, row.homing_offset), (reg.MAX_TORQUE, FULL), (reg.TORQUE_LIMIT, FULL),
+                (reg.P, 32), (reg.D, 32), (reg.PROTECTION_CURRENT, 500), (reg.PRESENT_VOLTAGE, 120),
+            ):  # fmt: skip
+                _put(memory, register, value)
         self.deaf: set[int] = set()  # servos that do not answer
         self.damaged = False  # replies have a wrong checksum
-        self._buffer = b""
+        self.status = [0] * len(SPEAK)  # error bits in replies
+        self._buffer = self._said = b""
         self._apply()
 
     def run(self, seconds: float = np.inf) -> None:
@@ -70,7 +82,7 @@ class VirtualSO101:
             due = start + self.live.steps * PERIOD
             readable, _, _ = select.select([self._master], [], [], min(max(0.0, due - time.monotonic()), PERIOD))
             if readable:
-                self._hear(os.read(self._master, 4096))
+                os.write(self._master, self.hear(os.read(self._master, 4096)))
             now = time.monotonic()
             if now - due > BEHIND:
                 start += now - due
@@ -85,18 +97,20 @@ class VirtualSO101:
         if self._link is not None and self._link.is_symlink():
             self._link.unlink()
 
-    def _hear(self, data: bytes) -> None:
-        self._buffer += data
+    def hear(self, data: bytes) -> bytes:
+        """What the bus carries to the servos; returns what they answer."""
+        self._buffer, self._said = self._buffer + data, b""
         while (start := self._buffer.find(b"\xff\xff")) >= 0:
             packet = self._buffer[start:]
             if len(packet) < 4 or len(packet) < 4 + packet[3]:
                 self._buffer = packet
-                return
+                return self._said
             end = 4 + packet[3]
             body, self._buffer = packet[2:end], packet[end:]
             if reg.checksum(body[:-1]) == body[-1]:
                 self._do(body[0], body[2], body[3:-1])
         self._buffer = self._buffer[-1:] if self._buffer.endswith(b"\xff") else b""
+        return self._said
 
     def _do(self, servo: int, instruction: int, parameters: bytes) -> None:
         if instruction == reg.PING:
@@ -105,7 +119,8 @@ class VirtualSO101:
             self._refresh()
             self._answer(servo, self._bytes(servo, parameters[0], parameters[1]))
         elif instruction == reg.WRITE:
-            self._store(servo, parameters[0], parameters[1:])
+            for one in range(1, len(SPEAK) + 1) if servo == reg.BROADCAST else (servo,):
+                self._store(one, parameters[0], parameters[1:])
             self._answer(servo, b"")
         elif instruction == reg.SYNC_READ:
             self._refresh()
@@ -120,8 +135,8 @@ class VirtualSO101:
     def _answer(self, servo: int, data: bytes) -> None:
         if not 1 <= servo <= len(SPEAK) or servo in self.deaf:
             return
-        reply = reg.packet(servo, 0, data)
-        os.write(self._master, reply[:-1] + bytes([reply[-1] ^ self.damaged]))
+        reply = reg.packet(servo, self.status[servo - 1], data)
+        self._said += reply[:-1] + bytes([reply[-1] ^ self.damaged])
 
     def _bytes(self, servo: int, address: int, size: int) -> bytes:
         return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(SPEAK) else b""
@@ -132,28 +147,53 @@ class VirtualSO101:
 
     def _refresh(self) -> None:
         """Readings into the registers."""
-        qpos, qvel, tau, temperature = (values[self._order] for values in self.live.read())
-        current = tau / self.robot.effort_limit[self._order] * STALL_CURRENT
-        for i, memory in enumerate(self.memory):
-            for register, value in (
-                (reg.PRESENT_POSITION, np.clip(round(qpos[i] / STEP) + STEPS // 2, 0, STEPS - 1)),
-                (reg.PRESENT_VELOCITY, round(qvel[i] / STEP)),
-                (
-                    reg.PRESENT_LOAD,
-                    np.clip(round(1000 * tau[i] / self.robot.effort_limit[self._order[i]]), -1000, 1000),
-                ),
-                (reg.PRESENT_CURRENT, round(current[i])),
-                (reg.PRESENT_TEMPERATURE, round(temperature[i])),
-            ):
-                memory[register.address : register.address + register.size] = register.encode(int(value))
+        order = self._order
+        qpos, qvel, tau, temperature = self.live.read()
+        steps = np.rint(qpos / (STEP * self.calibration.sign) + self.calibration.zero)[order]  # beyond the limits, too
+        share = (tau / self.robot.effort_limit)[order]
+        values = {
+            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS - 1),
+            reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP),
+            reg.PRESENT_LOAD: np.clip(np.rint(1000 * share), -1000, 1000),
+            reg.PRESENT_CURRENT: np.rint(share * STALL_CURRENT),
+            reg.PRESENT_TEMPERATURE: np.rint(temperature[order]),
+        }
+        for register, numbers in values.items():
+            for memory, value in zip(self.memory, numbers, strict=True):
+                _put(memory, register, int(value))
 
     def _apply(self) -> None:
-        """Registers into targets and gains."""
-        kp, kd = self.robot.kp.copy(), self.robot.kd.copy()
+        """Registers into targets, gains and torque limits."""
+        kp, kd, effort = self.robot.kp.copy(), self.robot.kd.copy(), self.robot.effort_limit.copy()
+        goals = self.calibration.steps(self.live.ctrl)
         for joint, memory in zip(self._order, self.memory, strict=True):
-            if not memory[reg.TORQUE_ENABLE.address]:
+            kp[joint] = STIFFNESS * _get(memory, reg.P)
+            effort[joint] *= min(_get(memory, reg.TORQUE_LIMIT), FULL) / FULL
+            if not _get(memory, reg.TORQUE_ENABLE):
                 kp[joint], kd[joint] = 0.0, FREE_DAMPING
                 continue
-            at = reg.GOAL_POSITION.address
-            self.live.ctrl[joint] = (reg.GOAL_POSITION.decode(bytes(memory[at : at + 2])) - STEPS / 2) * STEP
-        self.live.set_gains(kp, kd)
+            goals[joint] = np.clip(
+                _get(memory, reg.GOAL_POSITION), _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
+            )
+            self.live.ctrl[joint] = self.calibration.qpos(goals)[joint]
+        self.live.set_gains(kp, kd, effort)
+
+
+def _as_calibrated(robot: RobotSpec) -> dict[str, Row]:
+    """What LeRobot's calibration finds on an arm whose joints stop where the MJCF's do."""
+    rows = {}
+    for number, joint in enumerate(SPEAK, 1):
+        low, high = robot.qpos_range[robot.index([joint])[0]]
+        half = (STEPS - 1) / 2 if joint == TURNS else (high - low) / 2 / STEP
+        middle = STEPS / 2 - (0.5 if joint == TURNS else 300 if joint == GRIPPER else 0)
+        ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
+        rows[joint] = Row(id=number, drive_mode=0, homing_offset=17 * number, **ends)
+    return rows
+
+
+def _put(memory: bytearray, register: reg.Register, value: int) -> None:
+    memory[register.address : register.address + register.size] = register.encode(value)
+
+
+def _get(memory: bytearray, register: reg.Register) -> int:
+    return register.decode(bytes(memory[register.address : register.address + register.size]))

@@ -46,14 +46,15 @@ class LiveUnit:
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = np.array(robot.qpos_home if start is None else start, float)
         self.unit.reset(self.ctrl[None], [seed])
-        self.kp, self.kd = robot.kp, robot.kd
+        self._told = [robot.kp, robot.kd, robot.effort_limit]
         self.steps = 0
 
-    def set_gains(self, kp: Array, kd: Array) -> None:
-        """(n) N·m/rad and N·m·s/rad, if they differ from those that hold."""
-        if not (np.array_equal(kp, self.kp) and np.array_equal(kd, self.kd)):
-            self.kp, self.kd = np.array(kp, float), np.array(kd, float)
-            self.unit.set_gains(self.kp, self.kd)
+    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None) -> None:
+        """(n) N·m/rad, N·m·s/rad, and torque limits N·m (default the robot's), if they differ from those that hold."""
+        told = [np.array(x, float) for x in (kp, kd, self.robot.effort_limit if effort is None else effort)]
+        if not all(np.array_equal(a, b) for a, b in zip(told, self._told, strict=True)):
+            self._told = told
+            self.unit.set_gains(*told)
 
     def step(self) -> None:
         """Let one period pass under the present command and gains."""
