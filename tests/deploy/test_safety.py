@@ -160,3 +160,10 @@ def test_a_coarse_encoder_may_rest_but_not_while_the_command_moves_on():
     kind, period = watched(change, noisy=False, periods=60)
     assert kind == "frozen"
     assert period in (39, 40)  # 0.3 rad at 0.01 rad a period
+
+
+def test_where_the_real_joints_end_earlier_commands_do(arm):
+    limits = Limits.of(arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=np.array([[-0.5, 9.0], [-9.0, 0.4]]))
+    mjcf = arm.qpos_range
+    np.testing.assert_allclose(limits.low, [-0.4, mjcf[1, 0] + 0.1])
+    np.testing.assert_allclose(limits.high, [mjcf[0, 1] - 0.1, 0.3])

@@ -146,7 +146,7 @@ class Controller:
         self.config, self.safety = config or ControlConfig(), safety or SafetyConfig()
         self.clock, self.dt = clock or MonotonicClock(), 1.0 / self.config.rate
         self.joints = robot.index(driver.commanded)
-        self._adopt_gains()
+        self._adopt_servos()
         self.watch = Watch(driver.joint_names, self.joints, self.dt, self.safety, driver.noisy)
         self.stop = StopRequest()
         self.phase = Phase.IDLE
@@ -184,7 +184,7 @@ class Controller:
             stack.callback(lambda: self.driver.close(hold=not self._damped))
             self.driver.connect()
             self.recording.virtual = self.driver.virtual
-            self._adopt_gains()
+            self._adopt_servos()
             gains = {name: getattr(self.driver, name)[self.joints].tolist() for name in ("kp", "kd")}
             self.recording.meta |= gains | self.driver.facts
             self._start_guard(lock, stack)
@@ -194,9 +194,10 @@ class Controller:
             raise self._error
         return self.recording
 
-    def _adopt_gains(self) -> None:
-        gains = (self.driver.kp, self.driver.kd)
-        self.limits = Limits.of(self.robot, self.driver.commanded, self.safety, gains)
+    def _adopt_servos(self) -> None:
+        driver = self.driver
+        gains = (driver.kp, driver.kd)
+        self.limits = Limits.of(self.robot, driver.commanded, self.safety, gains, driver.qpos_range)
 
     def _start_guard(self, lock: int, stack: ExitStack) -> None:
         spec = self.driver.guard() if self._use_guard else None
@@ -208,7 +209,8 @@ class Controller:
 
     def _loop(self, policy: Policy, keys: Keys | None) -> None:
         start, k, due = self.clock.now(), 0, 0  # due: the period that should follow the last one; k, the one that can
-        self._note(start, "", "waiting for fresh states")
+        for text in ("waiting for fresh states", *self.driver.facts.get("notes", ())):
+            self._note(start, "", text)
         self._began = start
         while self.phase is not Phase.STOPPED:
             now = self.clock.wait_until(start + k * self.dt)

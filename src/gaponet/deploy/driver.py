@@ -57,7 +57,9 @@ class Driver(Protocol):
         commanded: The joints that `write` commands; the others are left to whoever commands them.
         noisy: Readings of a working robot are never twice the same, so equal ones mean that it is frozen.
         kp, kd: Gains that the real servos follow under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
-        facts: What a recording keeps about the servos beside (registers, kind of machine); final once connected.
+        qpos_range: Where the real joints end, (n, 2) rad, where the robot itself was told; final once connected.
+        facts: What a recording keeps about the servos beside (registers, kind of machine; notes, sentences for who runs
+            it); final once connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
             takes over), hold (servos keep the last target after `close`), damp (nobody holds it afterwards).
     """
@@ -69,6 +71,7 @@ class Driver(Protocol):
     noisy: bool
     kp: Array
     kd: Array
+    qpos_range: Array | None
     facts: dict[str, Any]
     at_end: End
 

@@ -96,7 +96,12 @@ class Limits:
 
     @classmethod
     def of(
-        cls, robot: RobotSpec, joints: tuple[str, ...], config: SafetyConfig, gains: tuple[Array, Array] | None = None
+        cls,
+        robot: RobotSpec,
+        joints: tuple[str, ...],
+        config: SafetyConfig,
+        gains: tuple[Array, Array] | None = None,
+        qpos_range: Array | None = None,
     ) -> Limits:
         """Limits of a robot's joints, in the order of `joints`.
 
@@ -105,10 +110,12 @@ class Limits:
             joints: Names.
             config: The rest.
             gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
+            qpos_range: Of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
         """
         kp, kd = gains or ((robot.nominal or robot).kp, (robot.nominal or robot).kd)
         at = robot.index(joints)
-        low, high = robot.qpos_range[at, 0] + config.margin, robot.qpos_range[at, 1] - config.margin
+        ranges = np.stack([robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range])[:, at]
+        low, high = ranges[..., 0].max(axis=0) + config.margin, ranges[..., 1].min(axis=0) - config.margin
         if (low > high).any():
             joint = joints[int(np.argmax(low > high))]
             raise UsageError(f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller")

@@ -15,11 +15,11 @@ import contextlib
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.deploy.driver import DriverError, Fault, State
+from gaponet.deploy.driver import DriverError, End, Fault, State
 from gaponet.deploy.drivers import feetech as reg
 from gaponet.deploy.drivers.so101_calibration import SPEAK, STEP, Row, numbered, read_calibration, settle
 from gaponet.errors import UsageError
@@ -58,7 +58,7 @@ class SO101Driver:
 
     virtual = False
     noisy = False  # a resting encoder reads the same for ever
-    at_end: Literal["hand_over", "hold", "damp"] = "hold"
+    at_end: End = "hold"
 
     def __init__(
         self,
@@ -85,6 +85,7 @@ class SO101Driver:
         self.given = read_calibration(calibration, robot) if calibration else None
         self.steps = self.given or numbered(robot)
         self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
+        self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self._serial: Serial | None = None
         self._state: State | None = None
@@ -139,6 +140,7 @@ class SO101Driver:
             for joint, servo in numbers.items()
         }
         self.steps = settle(self.given, held, self.robot, self.port)
+        self.qpos_range = self.steps.qpos_range
         servo_facts = {name: [bus.read(servo, r) for servo in servos] for name, r in FACTS.items()}
         self.kp = STIFFNESS * np.array(servo_facts["p"], float)
         self.facts = {
@@ -167,11 +169,6 @@ class SO101Driver:
             joints = ", ".join(j for j, x in zip(self.joint_names, facts[name], strict=True) if x != usual)
             notes += [f"{joints}: {what}"] if joints else []
         return notes
-
-    @property
-    def qpos_range(self) -> Array:
-        """Where the calibrated range of each joint ends, (n, 2) rad; commands stay within."""
-        return self.steps.qpos_range
 
     def read(self) -> State:
         """Ask all servos; the last state again where one did not answer."""

@@ -82,6 +82,7 @@ class UnitreeDriver:
         first = {"arms": 13, "upper_body": 12, "all": 0}[joints]
         self.robot, self.topic, self.joints = robot, topic, joints
         self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
+        self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self.at_end: End = "hand_over" if topic == "arm_sdk" else "damp"
         self.domain, self.interface, self.sole = domain, interface, sole

@@ -73,6 +73,7 @@ class VirtualDriver:
     virtual = True
     noisy = True
     at_end: End = "hold"
+    qpos_range: Array | None = None
 
     def __init__(
         self,
