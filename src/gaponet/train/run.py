@@ -307,11 +307,8 @@ class Trainer:
     def _tick(self) -> float:
         """Show where the run stands; returns the share of the budget spent."""
         k, spent = self.kept, self._spent()
-        self.show(
-            Status(
-                self.stage, min(spent, 1.0), kept.steps, self.seconds(), self.reward, kept.val, kept.best, self.nominal
-            )
-        )
+        share = min(spent, 1.0)
+        self.show(Status(self.stage, share, k.steps, self.seconds(), self.reward, k.val, k.best, self.nominal))
         return spent
 
     def _save(self) -> None:
