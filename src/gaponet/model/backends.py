@@ -85,7 +85,7 @@ class OnnxNetwork:
 
     def bind(self, batch: int) -> Bound:
         x = np.zeros((batch, self.session.get_inputs()[0].shape[1]), np.float32)
-        delta = np.zeros((batch, self(x[:1]).shape[1]), np.float32)
+        delta = np.zeros((batch, *self(x[:1]).shape[1:]), np.float32)
         bindings = []
         for start in range(0, batch, self.rows):
             binding, rows = self.session.io_binding(), slice(start, start + self.rows)
