@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from gaponet.errors import UsageError
+from gaponet.structure import read_toml
 
 
 def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, dict[str, Any]]:
@@ -26,7 +26,4 @@ def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, 
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
         raise UsageError(f"no {kind} '{name_or_path}': in the package are {known}; or give a .toml file")
-    try:
-        return path, tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not valid TOML: {error}") from None
+    return path, read_toml(dict[str, Any], path, UsageError)

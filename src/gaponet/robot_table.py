@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval, Len
 
-from gaponet.structure import Name
+from gaponet.structure import Angle, Name
 
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
-Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 
 

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from pydantic import AfterValidator, ConfigDict, TypeAdapter, ValidationError
+from annotated_types import Interval
+from pydantic import AfterValidator, AllowInfNan, ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import PydanticSerializationError, to_json
 from typing_extensions import TypedDict
 
@@ -48,6 +49,11 @@ class _Format(TypedDict):
 
 
 Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
+Count = Annotated[int, Interval(ge=0, le=10**15)]
+Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
+Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]  # infinity too, but no NaN
+# What was measured; None, in a file, where there was nothing to measure.
+Number = Annotated[Annotated[float, AllowInfNan(True)] | None, AfterValidator(lambda x: math.nan if x is None else x)]
 Json = Annotated[Any, AfterValidator(_all_finite)]  # whatever JSON can say in finite numbers
 
 

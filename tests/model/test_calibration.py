@@ -1,5 +1,6 @@
 """A unit that differs from those trained on in gain and delay, and a model that corrects nothing."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -82,3 +83,20 @@ def test_recordings_of_two_units_are_refused(model, robot, logs):
     other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
     with pytest.raises(UsageError, match="give those of one unit"):
         calibration.calibrate(model, robot, [logs[1], other])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"servos": {"elbow": {"kp": float("nan")}}}, r"servos\.elbow\.kp: should be a finite number"),
+        ({"servos": {"elbow": {"mass": 1.0}}}, "servos.elbow.mass"),
+        ({"servos": []}, "servos: should be an object"),
+        ({"logs": "abc"}, "logs: should be"),
+        ({"payload_mass": -1}, "payload_mass: "),
+    ],
+)
+def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, changed, said):
+    file = calibration.save(found, tmp_path)
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
+        calibration.load(tmp_path, found.weights)

@@ -1,11 +1,12 @@
 import tomllib
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
+from gaponet.virtual.draw import MARK
 from gaponet.virtual.fleet import FLEETS, draw, load_fleet, to_toml
 from gaponet.virtual.physics import EFFECTS, Physics, neutral
 
@@ -83,6 +84,35 @@ def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(UsageError, match="effect 'magic' is unknown; effects are gain, torque_constant"):
         neutral(2).without("magic")
     file = tmp_path / "bad.toml"
-    file.write_text('[[distribution]]\nname = "charm"\n')
-    with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm'; parameters are kp_scale"):
+    file.write_text('seed = 1\n[[distribution]]\nname = "charm"\nmean = 1\nsource = "none"\n')
+    with pytest.raises(UsageError, match=r"bad.toml: \[\[distribution\]\] names 'charm' twice, or not one of kp_scale"):
+        load_fleet(file, arm)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("seed = 20261", "seed = -1", "seed: should be greater than or equal to 0"),
+        ("mean = 0.89", 'mean = "0.89"', r"distribution\[0\]\.mean: should be a valid number"),
+        ("type_spread = 0.03", "type_spread = nan", r"distribution\[0\]\.type_spread: should be"),
+        ("low = 0.6", "lov = 0.6", r"distribution\[0\]\.lov: is not a known field"),
+        ('name = "kd_scale"', 'name = "kp_scale"', "names 'kp_scale' twice"),
+        ("mean = 0.89", "mean = -5.0\nlow = -9.0", "(already defined|Cannot overwrite|kp_scale is )"),
+    ],
+)
+def test_a_fleet_of_numbers_that_no_robot_has_is_refused_with_file_and_field(arm, tmp_path, old, new, said):
+    file = tmp_path / "mine.toml"
+    file.write_text((FLEETS / "default.toml").read_text(encoding="utf-8").replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(UsageError, match=rf"mine\.toml: .*{said}"):
+        load_fleet(file, arm)
+
+
+@pytest.mark.parametrize(("parameter", "value"), [("delay", 3600.0), ("delay", -0.1), ("drop", 2.0)])
+def test_a_unit_that_cannot_be_is_refused(arm, tmp_path, parameter, value):
+    drawn = load_fleet("default", arm)
+    units = {u: replace(p, **{parameter: np.array([value])}) for u, p in drawn.units.items()}
+    file = tmp_path / "mine.toml"
+    head = (FLEETS / "default.toml").read_text(encoding="utf-8").split(MARK)[0]
+    file.write_text(head + MARK + to_toml(arm, units), encoding="utf-8")
+    with pytest.raises(UsageError, match=rf"mine\.toml: unit 'virtual-1': {parameter} is \[{value}\]"):
         load_fleet(file, arm)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as js
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,8 @@ import tyro
 
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
+from gaponet.eval.run_files import read_config, read_metrics, read_progress
+from gaponet.model.artifact import CARD, read_card
 
 
 def runs(
@@ -45,9 +46,10 @@ def runs(
 
 def _facts(run: Path, folder: Path) -> dict[str, Any]:
     """What the files of a run say; None where they do not say it yet."""
-    config = js.loads((run / "config.json").read_text(encoding="utf-8"))
-    card, metrics = _read(run / "model" / "card.json"), _read(run / "metrics.json")
-    kind, last = config["model"]["kind"], _last(run / "progress.jsonl")
+    config, last = read_config(run), _last(run)
+    kind, file = config["model"]["kind"], run / "model" / CARD
+    card = read_card(file)[0] if file.is_file() else {}
+    metrics = read_metrics(run) if (run / "metrics.json").is_file() else {}
     val = card.get("val_mpjae", {"model": last.get("best"), "nominal": last.get("nominal_mpjae")})
     own = metrics.get("methods", {}).get(kind, {}).get("mpjae")
     virtual = bool(card.get("virtual", False))
@@ -71,15 +73,9 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> dict[str, Any]:
-    return js.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
-def _last(path: Path) -> dict[str, Any]:
+def _last(run: Path) -> dict[str, Any]:
     """The newest line of a training curve, and the best validation so far."""
-    if not path.is_file():
-        return {}
-    lines = [js.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    lines = read_progress(run)
     return (lines[-1] | {"best": min(line["val_mpjae"] for line in lines)}) if lines else {}
 
 

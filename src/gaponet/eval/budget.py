@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
@@ -15,7 +14,6 @@ import numpy as np
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
-from gaponet.errors import ModelError
 from gaponet.eval.evaluate import choose, corrected_robot
 from gaponet.gap import metrics, runs
 from gaponet.model.artifact import GapModel
@@ -56,7 +54,7 @@ def gap_budget(
     sequences = dataset.sequences(entries)
     simulator = corrected_robot(run, nominal)
     steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    fitted = _baseline(run)
+    fitted = DelayOffset.read(run)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
     steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
     if simulator.nominal is not None:
@@ -125,11 +123,3 @@ def encoder_step(recordings: ListOf[Array]) -> float:
 def _mean(values: ListOf[float | None]) -> float | None:
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if len(known) == len(values) else None
-
-
-def _baseline(run: Path) -> DelayOffset:
-    file = run / "delay_offset.json"
-    try:
-        return DelayOffset(**json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError) as error:
-        raise ModelError(f"{file}: cannot be read ({error}); give a complete run folder of gaponet train") from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from gaponet.data.json_file import write_json
 from gaponet.data.pair import Twin
@@ -25,11 +25,20 @@ from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
+from gaponet.structure import read_json
 
 Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
 LEARNED = ("inverse", "mlp", "transformer", "fno", "gaponet")  # kinds of model
 ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
+
+
+class RunSplit(TypedDict):
+    """split.json of a run: {sequence id: content hash} of each part."""
+
+    train: dict[str, str]
+    val: dict[str, str]
+    test: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -120,11 +129,8 @@ def choose(run: Path, dataset: Dataset, motions: tuple[str, ...]) -> tuple[list[
 
 def read_split(run: Path) -> dict[str, dict[str, str]]:
     """{part: {sequence id: content hash}} of a run."""
-    file = run / "split.json"
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
-        raise ModelError(f"{file}: cannot be read ({error}); give a run folder of gaponet train") from None
+    hint = "give a run folder of gaponet train"
+    return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
 def save(evaluation: Evaluation, run: Path) -> None:
@@ -165,8 +171,7 @@ def _methods(
     yield "nominal", nominal, None
     file = run / "delay_offset.json"
     if file.is_file():
-        fitted = DelayOffset(**json.loads(file.read_text(encoding="utf-8")))
-        yield "delay_offset", nominal, fitted.corrector(nominal)
+        yield "delay_offset", nominal, DelayOffset.read(run).corrector(nominal)
     identified = {model_hash(r): r for r in robots.values() if r.nominal is not None}
     if len(identified) > 1:
         raise UsageError("the runs start from different identified simulators; compare those of one identification")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError
 from gaponet.eval.page import facts_table, figure, page, table
+from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
@@ -41,14 +41,11 @@ def write_report(
     spec = load_robot(robot or model.card["robot"])
     if dataset is not None or also or not (run / "trajectories.npz").is_file():
         _evaluate(run, dataset, also, spec, progress)
-    metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
-    with np.load(run / "trajectories.npz") as file:
-        arrays = {k: file[k] for k in file.files}
-    config = _json(run / "config.json")
-    lines = (run / "progress.jsonl").read_text(encoding="utf-8").splitlines()
-    curve = [json.loads(line) for line in lines if line.strip()]
+    metrics = read_metrics(run)
+    arrays = read_trajectories(run, metrics, len(spec.operated))
+    config, curve, budget = read_config(run), read_progress(run), read_budget(run)
+    _require_complete(model, metrics, curve)
     progress("drawing", 0, 1)
-    budget = _json(run / "budget.json") if (run / "budget.json").is_file() else None
     text = _page(model.card, config, metrics, arrays, curve, spec, budget)
     path = run / "report.html"
     write_text(path, text)
@@ -59,7 +56,7 @@ def write_report(
 def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec, progress: Tell) -> None:
     from gaponet.eval.evaluate import evaluate, save
 
-    place = dataset or run / _json(run / "config.json")["dataset"]
+    place = dataset or run / read_config(run)["dataset"]
     try:
         data = Dataset(place)
     except DatasetError as error:
@@ -67,11 +64,14 @@ def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: Ro
     save(evaluate([run, *also], data, robot, progress=progress), run)
 
 
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, json.JSONDecodeError) as error:
-        raise ModelError(f"{path}: cannot be read ({error}); give a complete run folder of gaponet train") from None
+def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict[str, Any]]) -> None:
+    """Refuse a run of which something that a report says is not known."""
+    told = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad", "motions")
+    missing = [name for name in (*told, "versions", "dataset_hash") if name not in model.card]
+    missing += [] if model.config.kind in metrics["methods"] else [f"an evaluation of {model.config.kind}"]
+    missing += [] if curve else ["progress.jsonl"]
+    if missing or {"train", "val"} - set(model.card["motions"]):
+        raise ModelError(f"{model.path}: {', '.join(missing) or 'motions'} is missing; {MEND}")
 
 
 def _page(

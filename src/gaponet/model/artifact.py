@@ -9,7 +9,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any, Literal, NotRequired
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -23,7 +23,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
-from gaponet.structure import Json, Name, read_format, read_json, validated
+from gaponet.structure import Json, Name, Number, read_format, read_json, validated
 
 Array = np.ndarray
 
@@ -75,6 +75,13 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
+class SensorR2(TypedDict):
+    """How well the sensor predictor explains what it was not fitted to."""
+
+    mean: Number
+    by_joint: dict[str, Number]
+
+
 class Card(TypedDict):
     """The fields of a card.json that something is decided by; others stand beside them."""
 
@@ -100,7 +107,8 @@ class Card(TypedDict):
     excess_delay: NotRequired[float]
     parity_rad: NotRequired[float]
     motions: NotRequired[dict[str, tuple[str, ...]]]
-    val_mpjae: NotRequired[dict[str, float]]
+    val_mpjae: NotRequired[dict[Literal["model", "nominal"], Number]]
+    sensor_r2: NotRequired[SensorR2 | Number]
     versions: NotRequired[dict[str, str]]
 
 

@@ -8,12 +8,14 @@ one does alone. If nobody weighed what the unit carried, its mass is fitted with
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from annotated_types import Interval
 
 from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
@@ -21,8 +23,10 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import WINDOW, identify
+from gaponet.structure import read_json
 
-FIELDS = ("kp", "damping", "frictionloss", "offset", "delay")
+Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
+FIELDS: tuple[Field, ...] = get_args(Field)
 PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together (docs/log.md, 2026-11-21)
 EVALUATIONS = 8
 
@@ -43,17 +47,17 @@ class Calibration:
 
     unit_id: str
     weights: str
-    servos: dict[str, dict[str, float]]
+    servos: dict[str, dict[Field, Annotated[float, Interval(ge=-1e6, le=1e6)]]]
     logs: tuple[str, ...]
     seconds: float
     before: float
     after: float
-    payload_mass: float | None = None
+    payload_mass: Annotated[float, Interval(ge=0, le=100)] | None = None
     payload_std: float | None = None
 
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """The simulator of this unit."""
-        return simulator.with_servos(self.servos)
+        return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
 
 
 def calibrate(
@@ -110,11 +114,7 @@ def load(run: Path, weights: str) -> dict[str, Calibration]:
     """Unit → calibration of this model; those of an earlier model in the same folder are refused."""
     found = {}
     for path in sorted((run / "calibration").glob("*.json")):
-        try:
-            raw = json.loads(path.read_text(encoding="utf-8"))
-            one = Calibration(**raw | {"logs": tuple(raw["logs"])})
-        except (ValueError, TypeError, KeyError) as error:
-            raise ModelError(f"{path}: damaged ({error}); run gaponet calibrate again") from None
+        one = read_json(Calibration, path, ModelError, "run gaponet calibrate again")
         if one.weights != weights:
             raise ModelError(
                 f"{path}: made for another model ({one.weights}); delete it or run gaponet calibrate again"

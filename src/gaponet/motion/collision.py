@@ -7,18 +7,44 @@ A robot without that file is not checked.
 from __future__ import annotations
 
 import itertools
-import tomllib
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import mujoco
 import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
 
 from gaponet.errors import RobotError
 from gaponet.robot import RobotSpec
+from gaponet.structure import read_toml
 
 Array = np.ndarray
 
+Metres = Annotated[float, Interval(ge=-100, le=100)]
+Point = tuple[Metres, Metres, Metres]
 CLEARANCE = 0.03  # m kept between shells: a loaded arm sags by centimetres below what it is told
+
+
+Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Metres})
+
+
+@dataclass(frozen=True)
+class Box:
+    """Half lengths along the axes of the body, for looking at only."""
+
+    body: str
+    pos: Point
+    size: Point
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """collision.toml, or look.toml, which may hold boxes too."""
+
+    capsule: Annotated[tuple[Capsule, ...], Len(0, 1000)] = ()
+    same_limb: tuple[str, ...] = ()
+    box: Annotated[tuple[Box, ...], Len(0, 1000)] = ()
 
 
 class Collision:
@@ -83,22 +109,16 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     return np.sqrt((gap * gap).sum(-1))
 
 
-def _read(robot: RobotSpec, model: mujoco.MjModel) -> tuple[list[dict[str, Any]], list[list[str]]]:
+def _read(robot: RobotSpec, model: mujoco.MjModel) -> tuple[list[Capsule], list[list[str]]]:
     path = robot.mjcf.parent / "collision.toml"
     if not path.is_file():
         return [], []
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RobotError(f"{path}: not valid TOML: {error}") from None
+    table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
     bodies = [model.body(b).name for b in range(model.nbody)]
-    for capsule in table.get("capsule", []):
-        missing = {"body", "from", "to", "radius"} - set(capsule)
-        if missing:
-            raise RobotError(f"{path}: a capsule lacks {', '.join(sorted(missing))}: {capsule}")
+    for capsule in table.capsule:
         if capsule["body"] not in bodies:
             raise RobotError(f"{path}: capsule names body '{capsule['body']}', the MJCF has: {', '.join(bodies)}")
-    return table.get("capsule", []), [g.split() for g in table.get("same_limb", [])]
+    return list(table.capsule), [g.split() for g in table.same_limb]
 
 
 def _grouped(a: str, b: str, groups: list[list[str]]) -> bool:

@@ -7,7 +7,6 @@ is said of the units trained on is not mixed with what is said of a unit never s
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,7 +55,7 @@ def evaluate_baselines(
     run: Path, dataset: Dataset, nominal: RobotSpec, identified: RobotSpec | None, holdout: tuple[str, ...]
 ) -> Result:
     """The same of the nominal simulator, of delay + offset as kept in a run, and of the identified simulator."""
-    fitted = DelayOffset(**json.loads((run / "delay_offset.json").read_text(encoding="utf-8")))
+    fitted = DelayOffset.read(run)
     sequences = dataset.sequences(choose(run, dataset, ())[0])
     out = {
         "nominal": _grouped(sequences, nominal, None, holdout),

@@ -172,7 +172,7 @@ def _fitted_beside(folder: Path) -> DelayOffset | None:
 
     for other in sorted(folder.parent.glob("*/delay_offset.json")):
         if same(other.parent):
-            return DelayOffset(**json.loads(other.read_text(encoding="utf-8")))
+            return DelayOffset.read(other.parent)
     return None
 
 

@@ -7,15 +7,16 @@ collision.toml.
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from gaponet.errors import UsageError
+from gaponet.errors import RobotError, UsageError
+from gaponet.motion.collision import Shapes
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
+from gaponet.structure import read_toml
 from gaponet.view.side_by_side import Motion, SideBySide
 
 Array = np.ndarray
@@ -211,15 +212,17 @@ def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) 
     for name, share in (("look.toml", 1.0), ("collision.toml", 0.85)):
         path = robot.mjcf.parent / name
         if path.is_file():
-            table = tomllib.loads(path.read_text(encoding="utf-8"))
-            for c in table.get("capsule", []):
+            table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
+            for part in (*(c["body"] for c in table.capsule), *(b.body for b in table.box)):
+                if spec.body(part) is None:
+                    raise RobotError(f"{path}: names body '{part}', which {robot.mjcf.name} lacks")
+            for c in table.capsule:
                 ends = [*c["from"], *c["to"]]
                 _add(spec.body(c["body"]), mujoco.mjtGeom.mjGEOM_CAPSULE, ends, share * c["radius"], rgba)
-            for b in table.get("box", []):
-                spec.body(b["body"]).add_geom(
-                    type=mujoco.mjtGeom.mjGEOM_BOX, pos=b["pos"], size=b["size"], mass=0, contype=0, conaffinity=0,
-                    rgba=rgba,
-                )  # fmt: skip
+            for b in table.box:
+                spec.body(b.body).add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_BOX, pos=b.pos, size=b.size, mass=0, contype=0, conaffinity=0, rgba=rgba
+                )
             return
 
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 import sys
 import tomllib
 
+from gaponet.errors import UsageError
 from gaponet.robot import load_robot
-from gaponet.virtual.fleet import FLEETS, UNITS, draw, header, to_toml
+from gaponet.structure import validated
+from gaponet.virtual.fleet import FLEETS, UNITS, Table, complete, draw, to_toml
 
 MARK = "\n# ---- drawn units ----\n"
 
@@ -18,7 +20,8 @@ def main(fleet: str, robot_name: str) -> None:
     """Keep everything above the mark, replace everything below."""
     path = FLEETS / f"{fleet}.toml"
     head = path.read_text(encoding="utf-8").split(MARK)[0]
-    seed, laws = header(tomllib.loads(head), path)
+    table = validated(Table, tomllib.loads(head), path, UsageError)
+    seed, laws = table["seed"], complete(table["distribution"], path)
     robot = load_robot(robot_name)
     units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
     path.write_text(head + MARK + to_toml(robot, units), encoding="utf-8")

@@ -11,13 +11,16 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, NotRequired
 
 import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
 
 from gaponet.errors import UsageError
 from gaponet.packaged import load_toml
 from gaponet.robot import RobotSpec
+from gaponet.structure import Extended, Name, validated
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
@@ -25,6 +28,12 @@ Array = np.ndarray
 FLEETS = Path(__file__).parent / "fleets"
 UNITS = 4
 DIGITS = 6  # significant, of a saved number
+LATEST = 1.0  # s: a link with a longer delay is none; also of the share of commands that it drops
+LARGEST = 1e6  # of any other parameter; infinity where that is how an effect is switched off
+SIGNED = ("friction_asymmetry", "cable_angle", "cogging_phase", "tilt_roll", "tilt_pitch", "com_x", "com_y", "com_z",
+          "zero_offset", "current_offset")  # fmt: skip
+Spread = Annotated[float, Interval(ge=0, le=LARGEST)]
+UnitTable = dict[str, Extended | dict[str, dict[str, Extended]]]
 
 
 @dataclass(frozen=True)
@@ -32,14 +41,24 @@ class Distribution:
     """How one parameter is drawn: mean + three normal deviations, clipped to [low, high]."""
 
     name: str
-    mean: float
+    mean: Extended
     source: str
-    type_spread: float = 0.0
-    unit_spread: float = 0.0
-    joint_spread: float = 0.0
-    low: float = -np.inf
-    high: float = np.inf
+    type_spread: Spread = 0.0
+    unit_spread: Spread = 0.0
+    joint_spread: Spread = 0.0
+    low: Extended = -np.inf
+    high: Extended = np.inf
     of_effort: bool = False  # in parts of the joint's torque limit
+
+
+class Table(TypedDict):
+    """A fleet file; robot: robot → unit → parameter, or the parameters of each joint."""
+
+    seed: Annotated[int, Interval(ge=0, le=2**63)]
+    distribution: Annotated[tuple[Distribution, ...], Len(1, 1000)]
+    name: NotRequired[Name]
+    virtual: NotRequired[bool]
+    robot: NotRequired[dict[str, Annotated[dict[Name, UnitTable], Len(1, 1000)]]]
 
 
 @dataclass(frozen=True)
@@ -74,33 +93,29 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     Raises:
         UsageError: No such fleet, or the file is not one; with the file and what is wrong.
     """
-    path, table = load_toml("fleet", FLEETS, name_or_path)
-    seed, laws = header(table, path)
+    path, loaded = load_toml("fleet", FLEETS, name_or_path)
+    table = validated(Table, loaded, path, UsageError)
+    seed, laws = table["seed"], complete(table["distribution"], path)
     saved = table.get("robot", {}).get(robot.name)
     if saved is None:
         units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
+        for unit_id, unit in units.items():
+            _require_possible(unit, f"{path}: unit '{unit_id}', drawn from the distributions")
     else:
         units = {unit_id: _physics(unit_id, unit, robot, path) for unit_id, unit in saved.items()}
-    return Fleet(str(table.get("name", path.stem)), robot.name, seed, laws, units)
+    return Fleet(table.get("name", path.stem), robot.name, seed, laws, units)
 
 
-def header(table: dict[str, Any], path: Path) -> tuple[int, tuple[Distribution, ...]]:
-    """Seed and distributions of a fleet file's parsed text; path is for messages."""
-    known = [f.name for f in fields(Physics)]
-    laws = []
-    for entry in table.get("distribution", []):
-        if entry.get("name") not in known:
-            raise UsageError(f"{path}: [[distribution]] names '{entry.get('name')}'; parameters are {', '.join(known)}")
-        try:
-            laws.append(Distribution(**entry))
-        except TypeError as error:
-            raise UsageError(f"{path}: [[distribution]] {entry['name']}: {error}") from None
-    missing = set(known) - {law.name for law in laws}
+def complete(laws: tuple[Distribution, ...], path: Path) -> tuple[Distribution, ...]:
+    """The same; refuses a parameter that is unknown, missing or there twice. path is for messages."""
+    known, named = [f.name for f in fields(Physics)], [law.name for law in laws]
+    for name in named:
+        if name not in known or named.count(name) > 1:
+            raise UsageError(f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(known)}")
+    missing = set(known) - set(named)
     if missing:
         raise UsageError(f"{path}: no [[distribution]] for {', '.join(sorted(missing))}")
-    if not isinstance(table.get("seed"), int):
-        raise UsageError(f"{path}: seed is missing; add seed = <whole number>")
-    return table["seed"], tuple(laws)
+    return laws
 
 
 def draw(robot: RobotSpec, laws: tuple[Distribution, ...], seed: int, unit: int) -> Physics:
@@ -127,18 +142,30 @@ def draw(robot: RobotSpec, laws: tuple[Distribution, ...], seed: int, unit: int)
     return Physics(**values)
 
 
-def _physics(unit_id: str, unit: dict[str, Any], robot: RobotSpec, path: Path) -> Physics:
+def _physics(unit_id: str, unit: UnitTable, robot: RobotSpec, path: Path) -> Physics:
     joints = unit.get("joint", {})
     values = {}
     for f in fields(Physics):
         try:
             if f.metadata["scope"] == "unit":
-                values[f.name] = np.array([float(unit[f.name])])
+                values[f.name] = np.array([float(unit[f.name])])  # type: ignore[arg-type]
             else:
-                values[f.name] = np.array([float(joints[name][f.name]) for name in robot.joint_names])
-        except KeyError as error:
+                values[f.name] = np.array([joints[name][f.name] for name in robot.joint_names])  # type: ignore[index]
+        except (KeyError, TypeError) as error:
             raise UsageError(f"{path}: unit '{unit_id}': {f.name}: {error} is missing; draw the fleet again") from None
-    return Physics(**values)
+    physics = Physics(**values)
+    _require_possible(physics, f"{path}: unit '{unit_id}'")
+    return physics
+
+
+def _require_possible(unit: Physics, where: str) -> None:
+    """Refuse parameters that no robot can have."""
+    for f in fields(Physics):
+        value = getattr(unit, f.name)
+        most = LATEST if f.name in ("delay", "jitter", "drop") else LARGEST
+        good = (value <= most) & (value >= (-most if f.name in SIGNED else 0.0))
+        if not (good | ((value == np.inf) & (f.metadata["neutral"] == np.inf))).all():
+            raise UsageError(f"{where}: {f.name} is {value.tolist()}; draw the fleet again")
 
 
 def to_toml(robot: RobotSpec, units: dict[str, Physics]) -> str:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from gaponet.data.sequence import Sequence
+from gaponet.errors import ModelError
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import Progress, replay
+from gaponet.structure import Angle, read_json
 
 Array = np.ndarray
 
@@ -23,8 +27,18 @@ FRAMES = 10_000  # frames fitted on at most
 class DelayOffset:
     """Fitted values by operated joint: delay s, offset rad."""
 
-    delay: dict[str, float]
-    offset: dict[str, float]
+    delay: dict[str, Annotated[float, Interval(ge=0, le=1)]]
+    offset: dict[str, Angle]
+
+    @classmethod
+    def read(cls, run: Path) -> DelayOffset:
+        """As kept in a run folder, in delay_offset.json.
+
+        Raises:
+            ModelError: Missing or damaged.
+        """
+        hint = "give a complete run folder of gaponet train"
+        return read_json(cls, run / "delay_offset.json", ModelError, hint)
 
     def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
         """For sim.replay."""
@@ -41,6 +55,9 @@ class DelayOffsetCorrector:
     def __init__(self, values: DelayOffset, robot: RobotSpec) -> None:
         self.op = robot.operated_index
         self.range = robot.qpos_range[self.op]
+        for joint in robot.operated:
+            if joint not in values.delay or joint not in values.offset:
+                raise ModelError(f"delay and offset of joint '{joint}' are not known (delay_offset.json); train again")
         self.delay = np.array([values.delay[j] for j in robot.operated])
         self.offset = np.array([values.offset[j] for j in robot.operated])
 
