@@ -48,7 +48,7 @@ def test_absent_numbers_are_nan_and_unknown_fields_are_kept(tmp_path):
         (changed("methods", value={"gaponet": SCORES}), "methods: nominal is missing"),
         (
             changed("methods", "gaponet", "by_joint", value={"elbow": {}}),
-            "methods.gaponet.by_joint.elbow.mpjae: is missing",
+            ".*by_joint.elbow.mpjae: is missing",
         ),
         (changed("sequences", value="<b>7</b>"), "sequences: should be a valid integer"),
         (changed("simulator_hash", value=None), "simulator_hash: should be a valid string"),
