@@ -1,49 +1,93 @@
-"""One progress bar for all commands, on stderr, so that stdout stays for results."""
+"""One progress bar for all commands, on stderr, so that stdout stays for results; in a file or a pipe, a line now and
+then."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+EVERY = 10.0  # s between two lines where there is no terminal
+
+
+Running = dict[str, tuple[float, str]]  # name of a part → share done, note
+Show = Callable[[Running, float, float, str], None]  # parts running, done, total, note
 
 
 @contextmanager
 def bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
     """Yields update(done, total, note)."""
-    columns = (
-        TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), transient=False) as progress:
-        task = progress.add_task(title, total=None, note="")
+    with _progress(title) as show:
 
         def update(done: float, total: float, note: str = "") -> None:
-            progress.update(task, completed=done, total=total, note=note)
+            show({}, done, total, note)
 
         yield update
 
 
 @contextmanager
-def bars(title: str, total: int) -> Iterator[Callable[[dict[str, tuple[float, str]], int], None]]:
-    """Yields show(running, done): a bar over all, with time left, and one per part that is running (share, note)."""
-    columns = (
+def bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
+    """Yields show(running, done): a bar over all, with time left, and one per part that is running."""
+    with _progress(title) as show:
+        yield lambda running, done: show(
+            running, done + sum(share for share, _ in running.values()), total, f"{done} of {total} done"
+        )
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Show]:
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _lines(title, console)
+        return
+    columns: tuple[ProgressColumn, ...] = (
         TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=600) as progress:
-        whole = progress.add_task(title, total=total, note="")
+    with Progress(*columns, console=console, speed_estimate_period=600) as progress:
+        whole = progress.add_task(escape(title), total=None, note="")
         shown: dict[str, TaskID] = {}
 
-        def show(running: dict[str, tuple[float, str]], done: int) -> None:
+        def show(running: Running, done: float, total: float, note: str = "") -> None:
             for name in shown.keys() - running.keys():
                 progress.remove_task(shown.pop(name))
-            for name, (share, note) in running.items():
+            for name, (share, said) in running.items():
                 if name not in shown:
-                    shown[name] = progress.add_task(f"  {name}", total=1.0, note="")
-                progress.update(shown[name], completed=share, note=note)
-            together = done + sum(share for share, _ in running.values())
-            progress.update(whole, completed=together, note=f"{done} of {total} done")
+                    shown[name] = progress.add_task(f"  {escape(name)}", total=1.0, note="")
+                progress.update(shown[name], completed=share, note=escape(said))
+            progress.update(whole, completed=done, total=total, note=escape(note))
 
         yield show
+
+
+def _lines(title: str, console: Console) -> Show:
+    """The same as lines, the first when there is something to say, then at most one every EVERY seconds."""
+    began = time.monotonic()
+    last = began - EVERY
+
+    def show(running: Running, done: float, total: float, note: str = "") -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last < EVERY and done < total:
+            return
+        last = now
+        parts = [note, *(f"{name} {100 * share:.0f} % {said}".rstrip() for name, (share, said) in running.items())]
+        share = f"{100 * done / total:.0f} %" if total else ""
+        said = "; ".join(part for part in parts if part)
+        console.print(
+            f"{title}: {share}, {now - began:.0f} s{', ' + said if said else ''}", markup=False, soft_wrap=True
+        )
+
+    return show

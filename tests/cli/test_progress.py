@@ -1,0 +1,25 @@
+"""Progress where there is no terminal."""
+
+import time
+
+from gaponet.cli import progress
+
+
+def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(capfd, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with progress.bar("importing [all]") as update:
+        for k in range(1, 101):
+            now[0] += 0.4
+            update(k, 100, f"motion-{k}")
+    lines = capfd.readouterr().err.splitlines()
+    assert lines[0] == "importing [all]: 1 %, 0 s, motion-1"
+    assert lines[1] == "importing [all]: 26 %, 10 s, motion-26"
+    assert lines[-1] == "importing [all]: 100 %, 40 s, motion-100"
+    assert len(lines) == 5
+
+
+def test_parts_that_run_side_by_side_are_told_together(capfd):
+    with progress.bars("runs", 4) as show:
+        show({"mlp seed 0": (0.5, "round 3"), "gaponet seed 0": (0.25, "")}, 1)
+    assert capfd.readouterr().err == "runs: 44 %, 0 s, 1 of 4 done; mlp seed 0 50 % round 3; gaponet seed 0 25 %\n"
