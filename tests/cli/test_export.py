@@ -7,8 +7,8 @@ import pytest
 import torch
 from arm import write_arm
 
+from gaponet.bench import latency
 from gaponet.cli.main import main
-from gaponet.deploy import latency
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network

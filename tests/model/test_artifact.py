@@ -1,5 +1,6 @@
 """What ships answers as what was trained, and refuses what it was not made for."""
 
+import copy
 import dataclasses
 import json
 
@@ -46,7 +47,20 @@ def test_export_refuses_to_write_what_differs(artifact, robot, tmp_path, monkeyp
     monkeypatch.setattr("gaponet.model.export.PARITY", -1.0)
     with pytest.raises(ModelError, match="ONNX and torch differ by"):
         export(net, tmp_path / "out", {}, samples)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_of_two_exports_are_not_taken_for_one_model(artifact, robot, tmp_path):
+    """An export that was killed between its files."""
+    folder, net, samples, _ = artifact
+    card = json.loads((folder / "card.json").read_text())
+    other = copy.deepcopy(net)
+    torch.nn.init.zeros_(other.trunk[-1].weight)
+    export(other, tmp_path / "out", card, samples)
+    (tmp_path / "out" / "card.json").write_text(json.dumps(card))
+    for backend in ("onnxruntime", "numpy"):
+        with pytest.raises(ModelError, match=r"is not of its card\.json: an export was cut short"):
+            GapModel.load(tmp_path / "out", backend)
 
 
 def test_a_corrected_replay_applies_the_artifacts_corrections(artifact, robot):

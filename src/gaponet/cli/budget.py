@@ -33,15 +33,16 @@ def budget(
     """
     from gaponet.eval.budget import gap_budget
     from gaponet.eval.budget_figure import waterfall
-    from gaponet.files import write_text
+    from gaponet.files import write_text, writing
     from gaponet.plot.style import save
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
     with bar("budget") as update:
         found = gap_budget(run, data, spec, names(motions), lambda step, done, total: update(done, total, step))
-    write_text(run / "budget.json", js.dumps(found, indent=1) + "\n")
-    save(waterfall(found), run / "budget")
+    with writing(run, "run"):
+        write_text(run / "budget.json", js.dumps(found, indent=1) + "\n")
+        save(waterfall(found), run / "budget")
     steps = list(found["left"])
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"

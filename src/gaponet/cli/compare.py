@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.progress import bar, bars
 from gaponet.errors import ModelError, UsageError
 from gaponet.robot import RobotSpec, load_robot
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gaponet.study.pool import Cell
 
 
+@writes("comparison")
 def compare(
     dataset: tyro.conf.Positional[Path],
     out: Path,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
 import time
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from gaponet.cli.gap import gap
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.progress import bar
 from gaponet.cli.train import evaluate, run_training
 from gaponet.errors import UsageError
@@ -22,6 +21,7 @@ from gaponet.train.config import TrainConfig, WarmStartConfig
 QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
 
 
+@writes("demo")
 def demo(
     data: Path | None = None,
     robot: str = "h1_2",
@@ -35,7 +35,7 @@ def demo(
     Args:
         data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
         robot: Robot name or folder.
-        out: Folder for dataset, runs and report; an earlier demo's there is replaced.
+        out: Folder for dataset, runs and report; a demo that was interrupted there is finished.
         budget: Training time of GAPONet.
         mlp_budget: Training time of the MLP baseline.
         json: One JSON object on stdout.
@@ -44,31 +44,17 @@ def demo(
     from gaponet.eval.report import write_report
 
     screen, began = Out(json), time.monotonic()
-    _clear(out)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         holdout = _make_dataset(out / "dataset", data, robot, screen)
         dataset = Dataset(out / "dataset")
         gap(out / "dataset", robot)
     for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
-        run_training(
-            dataset, load_robot(robot), out / model.kind, TrainConfig(model, warm_start=QUICK), limit, False, holdout
-        )
+        run, resume = out / model.kind, (out / model.kind / "checkpoint.pt").is_file()
+        run_training(dataset, load_robot(robot), run, TrainConfig(model, warm_start=QUICK), limit, resume, holdout)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))
     screen.say(f"\nreport: [bold]{path}[/]  ({time.monotonic() - began:.0f} s in all)")
-
-
-def _clear(out: Path) -> None:
-    """Remove an earlier demo; refuse a folder that is something else."""
-    if not out.exists():
-        return
-    strangers = {p.name for p in out.iterdir()} - {"dataset", "gaponet", "mlp"}
-    if strangers:
-        raise UsageError(
-            f"{out}: holds {', '.join(sorted(strangers)[:3])}, so it is no earlier demo; choose another --out"
-        )
-    shutil.rmtree(out)
 
 
 def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import tyro
 
 from gaponet.cli.experiment_unit import delivery, tracking
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out, show_result
+from gaponet.cli.out import Out, show_result, writes
 from gaponet.cli.progress import bars
 from gaponet.study.options import Options
 
@@ -23,6 +23,7 @@ Shared = Annotated[Options, tyro.conf.arg(name="")]
 MODELS = ("gaponet", "mlp:mlp_match=on")
 
 
+@writes("experiments")
 def ablation(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
@@ -50,6 +51,7 @@ def ablation(
     _carry_out(study, cells, lambda show: table2.run(study, bound_seeds, show), options)
 
 
+@writes("experiments")
 def payload(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
@@ -75,6 +77,7 @@ def payload(
     _carry_out(study, experiment.cells(study, asked), lambda show: experiment.run(study, asked, show), options)
 
 
+@writes("experiments")
 def unit(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
@@ -96,6 +99,7 @@ def unit(
     _carry_out(study, cells, lambda show: experiment.run(study, models, show), options)
 
 
+@writes("experiments")
 def data(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out, show_result
+from gaponet.cli.out import Out, show_result, writes
 from gaponet.cli.progress import bar
 from gaponet.errors import UsageError
 from gaponet.study.options import Options
@@ -41,6 +41,7 @@ class Played:
     """kg in each hand; default those trained on, with --quick the lightest and the heaviest of them."""
 
 
+@writes("experiments")
 def tracking(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],
@@ -92,6 +93,7 @@ def tracking(
     )
 
 
+@writes("experiments")
 def delivery(
     dataset: tyro.conf.Positional[Path],
     out: tyro.conf.Positional[Path],

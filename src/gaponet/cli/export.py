@@ -31,24 +31,26 @@ def export(
         out: Folder for onnx, file for torchscript; default the run's model folder. Not for inverse.
         json: One JSON object on stdout.
     """
-    from gaponet.model.artifact import GapModel
+    from gaponet.model.artifact import CARD, GapModel, read_card
     from gaponet.model.export import drawn_states, trained_network
     from gaponet.model.export import export as write
     from gaponet.model.torchscript import FILE, export_torchscript
 
-    screen, model = Out(json), GapModel.load(run)
+    screen = Out(json)
     if to == "inverse":
         if out is not None:
             raise UsageError("--out: a compensator looks for the inverse beside its model; leave --out away")
-        _inverse(screen, run, model)
+        _inverse(screen, run, GapModel.load(run))
         return
     if to == "torchscript":
+        model = GapModel.load(run)
         path = out or model.path / FILE
         difference = export_torchscript(model, run, path)
     else:
-        path = out or model.path
-        net = trained_network(run, model.config, len(model.card["joint_names"]))
-        difference = write(net, path, model.card, drawn_states(net))
+        path = out or run / "model"
+        card, config = read_card(run / "model" / CARD)
+        net = trained_network(run, config, len(card["joint_names"]))
+        difference = write(net, path, card, drawn_states(net))
     screen.say(f"{path}: differs by {difference:.1e} rad from what was trained")
     screen.result({"path": str(path), "to": to, "parity_rad": difference})
 

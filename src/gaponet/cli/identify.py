@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from gaponet.cli.gap import mrad
 from gaponet.cli.inputs import open_dataset
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.progress import bar
 
 COLUMNS = {  # field → heading, factor from SI
@@ -24,6 +24,7 @@ COLUMNS = {  # field → heading, factor from SI
 }
 
 
+@writes("robot")
 def identify(
     dataset: tyro.conf.Positional[Path],
     out: Path,

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from gaponet.data.json_file import finite
+from gaponet.files import writing
 
 if TYPE_CHECKING:
     from gaponet.study.result import Result
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
@@ -69,3 +75,20 @@ def show_result(result: Result, out: Path, screen: Out) -> None:
     screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
                    "sentences": list(result.sentences), "files": [str(f) for f in files],
                    "tables": {t.name: {"columns": t.columns, "rows": t.records()} for t in result.tables}})  # fmt: skip
+
+
+def writes(kind: str) -> Callable[[Command], Command]:
+    """Decorator of a command: it holds its --out from the start, so that a wrong folder costs no work and no motion."""
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def held(*args: Any, **kwargs: Any) -> Any:
+            given = inspect.signature(command).bind(*args, **kwargs)
+            given.apply_defaults()
+            out = given.arguments["out"]
+            with nullcontext() if out is None else writing(out, kind):
+                return command(*args, **kwargs)
+
+        return cast("Command", held)
+
+    return decorate

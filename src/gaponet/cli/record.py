@@ -8,13 +8,14 @@ from typing import Any, Literal
 
 import tyro
 
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.run import Reach, Request, perform, tracking
 from gaponet.deploy.controller import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
 from gaponet.errors import UsageError
 
 
+@writes("dataset")
 def record(
     motion: str,
     out: Path,
@@ -73,7 +74,7 @@ def record(
             == (played.name, unit_id, payload_mass, payload_side)
         ]  # fmt: skip
         stem = f"{played.name}-{unit_id}-{payload_mass:g}kg-{len(same)}"
-        recording.save(out / "recordings", stem)
+        stem = recording.save(out / "recordings", stem).stem
         if recording.fault:
             raise UsageError(
                 f"'{played.name}' was stopped ({recording.fault.text}); it was not added to {out}, its recording is "

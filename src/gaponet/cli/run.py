@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import tyro
 
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.deploy.controller import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
@@ -66,6 +66,7 @@ class Request:
     compensation: CompensatorConfig = field(default_factory=CompensatorConfig)
 
 
+@writes("recordings")
 def run(
     motion: str,
     driver: Literal["virtual", "unitree", "so101"] = "virtual",

@@ -10,8 +10,9 @@ import tyro
 
 from gaponet.cli.gap import mrad, show_methods
 from gaponet.cli.inputs import names, open_dataset
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, writes
 from gaponet.cli.progress import bar
+from gaponet.files import writing
 from gaponet.model.config import Kind
 from gaponet.robot import RobotSpec
 from gaponet.train.config import TrainConfig
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from gaponet.model.artifact import GapModel
 
 
+@writes("run")
 def train(
     dataset: tyro.conf.Positional[Path],
     out: Path,
@@ -92,8 +94,8 @@ def run_training(
             best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
             update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
 
-        trainer = Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show, log)
-        return trainer.run()
+        with writing(out, "run"):
+            return Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show, log).run()
 
 
 def evaluate(

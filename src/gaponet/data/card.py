@@ -70,8 +70,9 @@ def make_card(dataset: Dataset, progress: Progress | None = None) -> dict[str, A
 
 def write_card(dataset: Dataset, card: dict[str, Any], text: str) -> None:
     """card.json and CARD.md in the dataset folder."""
-    write_text(dataset.path / "card.json", json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    write_text(dataset.path / "CARD.md", text)
+    with dataset.writing():
+        write_text(dataset.path / "card.json", json.dumps(card, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+        write_text(dataset.path / "CARD.md", text)
 
 
 def count(entries: list[Entry]) -> dict[str, float]:

@@ -126,9 +126,10 @@ def fit_offsets(holds: dict[Condition, Holds], robot: RobotSpec, gravity: Gravit
 def record_offsets(dataset: Dataset, unit_id: str, offsets: UnitOffsets, simulator: str) -> Path:
     """Write offsets.json, keeping what it says of other units. simulator: hash of the model whose gravity was used."""
     file = dataset.path / FILE
-    content = read_offsets(dataset)
-    content["units"][unit_id] = asdict(offsets) | {"simulator": simulator}
-    write_text(file, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    with dataset.writing():
+        content = read_offsets(dataset)
+        content["units"][unit_id] = asdict(offsets) | {"simulator": simulator}
+        write_text(file, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return file
 
 

@@ -164,7 +164,6 @@ def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...
     """Write splits/<by>[-<held out>].json in the dataset folder; the same call writes the same file."""
     name = re.sub(r"[^A-Za-z0-9_.-]", "_", "-".join([by, *holdout]))[:100]
     path = dataset.path / "splits" / f"{name}.json"
-    path.parent.mkdir(exist_ok=True)
     record: dict[str, Any] = {
         "format": FORMAT,
         "robot": dataset.robot_name,
@@ -174,7 +173,9 @@ def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...
         "virtual": any(e.meta.virtual for e in dataset.entries),
         "parts": {part: {e.id: e.hash for e in parts[part]} for part in PARTS},
     }
-    write_text(path, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
+    with dataset.writing():
+        path.parent.mkdir(exist_ok=True)
+        write_text(path, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
     return path
 
 

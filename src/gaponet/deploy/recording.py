@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from gaponet.data.log import Channel, Log
 from gaponet.deploy.driver import State
 from gaponet.errors import LogError
+from gaponet.files import whole, write_text, writing
 
 Array = np.ndarray
 
@@ -108,12 +110,20 @@ class Recording:
         }
 
     def save(self, folder: Path, name: str) -> Path:
-        """NAME.parquet for gaponet import (if the run was reached), NAME.json, and all periods in NAME.cycles.npz."""
+        """NAME.parquet for gaponet import (if the run was reached), NAME.json, and all periods in NAME.cycles.npz.
+
+        Where there is a recording of that name, this one is NAME-2, and so on. Returns the path of NAME.parquet.
+        """
+        with writing(folder, "recordings"):
+            return self._save(folder, name)
+
+    def _save(self, folder: Path, name: str) -> Path:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.json").write_text(json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n", "utf-8")
+        taken = {file.name.split(".json")[0] for file in folder.glob("*.json")}
+        name = next(n for k in itertools.count(1) if (n := f"{name}-{k}" if k > 1 else name) not in taken)
+        write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
         full = lambda x: np.full(len(self.joint_names), np.nan) if x is None else x  # noqa: E731
         states = {n: np.array([getattr(r.state, n) for r in self.rows]) for n in ("qpos", "qvel", "tau", "temperature")}
         everything = states | {
@@ -124,14 +134,16 @@ class Recording:
             "target": np.array([full(r.target) for r in self.rows]),
             "ctrl": np.array([full(r.ctrl) for r in self.rows]),
         }
-        np.savez_compressed(folder / f"{name}.cycles.npz", **everything)  # type: ignore[arg-type]
+        with whole(folder / f"{name}.cycles.npz") as temporary:
+            np.savez_compressed(temporary, **everything)  # type: ignore[arg-type]
         path = folder / f"{name}.parquet"
         if sum(r.phase == "run" for r in self.rows) >= 2:
             log = self.log(str(path))
             columns = {"time": log.channels["ctrl"].time}
             for channel, (_, values) in log.channels.items():
                 columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
-            pq.write_table(pa.table(columns), path)
+            with whole(path) as temporary:
+                pq.write_table(pa.table(columns), temporary)
         return path
 
 

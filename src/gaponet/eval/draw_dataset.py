@@ -14,6 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
+from gaponet.files import writing
 from gaponet.plot.style import save
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
@@ -47,7 +48,11 @@ def draw_all(
     dataset.require_robot(robot)
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-    out.mkdir(parents=True, exist_ok=True)
+    with writing(out, "figures"):
+        return _draw(dataset, robot, out, progress)
+
+
+def _draw(dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress) -> tuple[list[Path], dict[str, str]]:
     written: list[Path] = []
     left_out: dict[str, str] = {}
     for i, (name, make) in enumerate(PICTURES.items()):

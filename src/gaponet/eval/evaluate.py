@@ -18,6 +18,7 @@ from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, ModelError, UsageError
+from gaponet.files import whole, writing
 from gaponet.gap import Run, runs, summary
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
@@ -152,10 +153,10 @@ def save(evaluation: Evaluation, run: Path) -> None:
             arrays[f"{row}/{name}"] = part[i].qpos_sim
         for name, delta in evaluation.deltas.items():
             arrays[f"{row}/delta/{name}"] = delta[i]
-    temporary = run / ".trajectories.npz"
-    np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})
-    temporary.replace(run / "trajectories.npz")
-    write_json(run / "metrics.json", result)
+    with writing(run, "run"):
+        with whole(run / "trajectories.npz") as temporary:
+            np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})
+        write_json(run / "metrics.json", result)
 
 
 def corrected_robot(run: Path, nominal: RobotSpec) -> RobotSpec:

@@ -110,6 +110,7 @@ class Card(TypedDict):
     val_mpjae: NotRequired[dict[Literal["model", "nominal"], Number]]
     sensor_r2: NotRequired[SensorR2 | Number]
     versions: NotRequired[dict[str, str]]
+    sha256: NotRequired[dict[str, str]]
 
 
 def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
@@ -179,9 +180,12 @@ class GapModel:
                 raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
         card, config = read_card(folder / CARD)
         numpy = backend == "numpy"
-        network = NumpyNetwork(folder / fused.FILE) if numpy else OnnxNetwork(folder / WEIGHTS, threads)
+        file = folder / (fused.FILE if numpy else WEIGHTS)
+        network = NumpyNetwork(file) if numpy else OnnxNetwork(file, threads)
         width, n = config.input_dim(len(card["joint_names"])), len(card["joint_names"])
-        require_answer(network, width, (n,), config.delta_max, folder / (fused.FILE if numpy else WEIGHTS))
+        require_answer(network, width, (n,), config.delta_max, file)
+        if card.get("sha256", {}).get(file.name, digest := sha256(file)) != digest:
+            raise ModelError(f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again")
         return cls(folder, card, config, network)
 
     @property
@@ -240,4 +244,9 @@ class GapModel:
 
     def weights_hash(self) -> str:
         """12 hex digits of model.onnx."""
-        return hashlib.sha256((self.path / WEIGHTS).read_bytes()).hexdigest()[:12]
+        return sha256(self.path / WEIGHTS)[:12]
+
+
+def sha256(file: Path) -> str:
+    """Of a file's content, 64 hex digits."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()

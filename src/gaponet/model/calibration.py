@@ -20,6 +20,7 @@ from annotated_types import Interval
 from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
 from gaponet.errors import ModelError, UsageError
+from gaponet.files import writing
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import WINDOW, identify
@@ -105,8 +106,9 @@ def calibrate(
 def save(calibration: Calibration, run: Path) -> Path:
     """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
     path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', calibration.unit_id)}.json"
-    path.parent.mkdir(exist_ok=True)
-    write_json(path, asdict(calibration))
+    with writing(run, "run"):
+        path.parent.mkdir(exist_ok=True)
+        write_json(path, asdict(calibration))
     return path
 
 

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from gaponet.errors import ModelError
+from gaponet.files import whole, writing
 from gaponet.model import fused
-from gaponet.model.artifact import CARD, WEIGHTS, write_card
+from gaponet.model.artifact import CARD, WEIGHTS, sha256, write_card
 from gaponet.model.backends import OnnxNetwork
 from gaponet.model.deeponet import build_network
 from gaponet.model.fuse import FusedNet, fuse
@@ -52,29 +53,28 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
     Raises:
         ModelError: The difference is above 1e-5 rad; nothing is written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder, "model"):
+        return _export(net, folder, card, samples)
+
+
+def _export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
     frozen = copy.deepcopy(net).eval()
     weights, names = fuse(frozen), ["delta", "offsets"][: 1 + net.config.learns_points]
-    temporary = {name: folder / f".{name}.tmp" for name in (WEIGHTS, fused.FILE)}
-    try:
-        write_onnx(Ships(frozen) if weights is None else FusedNet(weights), temporary[WEIGHTS], samples[:2], names)
+    with whole(folder / WEIGHTS) as onnx:
+        write_onnx(Ships(frozen) if weights is None else FusedNet(weights), onnx, samples[:2], names)
         with torch.inference_mode():
             expected = [y.numpy() for y in Ships(frozen)(torch.from_numpy(samples))]
-        answers = [OnnxNetwork(temporary[WEIGHTS], output=name)(samples) for name in names]
+        answers = [OnnxNetwork(onnx, output=name)(samples) for name in names]
         difference = max(_require(folder, "ONNX", *pair) for pair in zip(answers, expected, strict=True))
         if weights is not None:
             answer = fused.FusedForward(weights, len(samples))(samples)
             difference = max(difference, _require(folder, "numpy", answer, expected[0]))
-            with open(temporary[fused.FILE], "wb") as file:
-                np.savez(file, **weights)  # type: ignore[arg-type]
-            temporary[fused.FILE].replace(folder / fused.FILE)
+            with whole(folder / fused.FILE) as npz:
+                np.savez(npz, **weights)  # type: ignore[arg-type]
         else:
             (folder / fused.FILE).unlink(missing_ok=True)
-        temporary[WEIGHTS].replace(folder / WEIGHTS)
-        write_card(folder / CARD, card | {"parity_rad": difference})
-    finally:
-        for path in temporary.values():
-            path.unlink(missing_ok=True)
+    files = {name: sha256(folder / name) for name in (WEIGHTS, fused.FILE) if (folder / name).is_file()}
+    write_card(folder / CARD, card | {"parity_rad": difference, "sha256": files})
     return difference
 
 

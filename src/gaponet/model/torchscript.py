@@ -8,6 +8,7 @@ m.joint_names, m.dt                           # order of the columns, trained co
 
 # No postponed annotations here: TorchScript reads those of DeltaModule.
 
+import io
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from gaponet.errors import ModelError
+from gaponet.files import whole
 from gaponet.model.artifact import CARD, GapModel
 from gaponet.model.export import PARITY, trained_network
 from gaponet.model.fuse import FusedNet
@@ -111,21 +113,21 @@ def export_torchscript(model: GapModel, run: Path, path: Path) -> float:
             "with sensors predicted or off, sensor_hold 1 and delta_hold 1"
         )
     net = traced(torch_network(model, run), model.config.observation_dim(n) + n)
-    temporary = path.with_name(f".{path.name}.tmp")
+    content = io.BytesIO()  # torch ends the process when it meets a full disk itself
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript is what these simulators load today
+        torch.jit.save(torch.jit.script(DeltaModule(net, model)), content)
     path.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with whole(path) as temporary:
+        temporary.write_bytes(content.getvalue())
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # TorchScript is what these simulators load today
-            torch.jit.script(DeltaModule(net, model)).save(str(temporary))
+            warnings.simplefilter("ignore", DeprecationWarning)
             difference = compare(torch.jit.load(str(temporary)), model)
         if not difference <= PARITY:
             raise ModelError(
                 f"{path}: TorchScript and {model.path / CARD} differ by {difference:.2e} rad; not written. "
                 "Write the artifact again with gaponet export RUN"
             )
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return difference
 
 

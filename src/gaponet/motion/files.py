@@ -15,6 +15,7 @@ import numpy as np
 from gaponet.data.formats import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.errors import LogError
+from gaponet.files import whole, write_text
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
 
@@ -65,7 +66,8 @@ def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
     """Write a motion: .txt at 50 Hz as SAGE reads it, .csv and .npz at the motion's own period."""
     path = Path(path)
     if path.suffix == ".npz":
-        np.savez(path, joint_names=np.array(robot.joint_names), ctrl=motion.ctrl, dt=motion.dt)
+        with whole(path) as temporary:
+            np.savez(temporary, joint_names=np.array(robot.joint_names), ctrl=motion.ctrl, dt=motion.dt)
         return
     if path.suffix not in SUFFIXES:
         raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
@@ -75,7 +77,7 @@ def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
     else:
         names, ctrl = ["time", *names], np.column_stack([np.arange(len(ctrl)) * motion.dt, ctrl])
     lines = [",".join(names), *(",".join(f"{v:.9g}" for v in row) for row in ctrl)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def level_of(ctrl: Array, robot: RobotSpec) -> str:

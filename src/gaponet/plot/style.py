@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
+
+from gaponet.files import whole
 
 STYLE = {
     "font.size": 9,
@@ -50,10 +51,6 @@ def save(fig: Figure, path: Path) -> list[Path]:
     how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
     with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):  # type: ignore[arg-type]
         for file, options in zip(files, how, strict=True):
-            temporary = file.with_name(f".{os.getpid()}.{file.name}")
-            try:
+            with whole(file) as temporary:
                 fig.savefig(temporary, **options)
-                os.replace(temporary, file)
-            finally:
-                temporary.unlink(missing_ok=True)
     return files

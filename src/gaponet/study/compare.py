@@ -19,7 +19,7 @@ from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose
-from gaponet.files import write_text
+from gaponet.files import whole, write_text
 from gaponet.gap import Run, runs, summary
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
@@ -209,7 +209,7 @@ def write(result: Result, out: Path) -> list[Path]:
     from gaponet.plot.style import save
 
     write_json(out / "compare.json", result)
-    with (out / "compare.csv").open("w", newline="", encoding="utf-8") as file:
+    with whole(out / "compare.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)
         writer.writerows(_lines(result))

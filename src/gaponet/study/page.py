@@ -15,14 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.data.json_file import write_json
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError
 from gaponet.eval import page as html_page
-from gaponet.files import write_text
+from gaponet.files import write_text, writing
 from gaponet.plot.style import save
 from gaponet.study.result import Result, fact_rows
 from gaponet.study.table import Table, to_csv
 
 FORMAT = "gaponet experiment 1"
+KIND = "experiments"
 
 
 def write(result: Result, folder: Path) -> list[Path]:
@@ -32,11 +33,13 @@ def write(result: Result, folder: Path) -> list[Path]:
         All files written, the report last.
 
     Raises:
-        UsageError: folder is a file.
+        FolderError: folder is somebody else's, or another process writes into it.
     """
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder}: is a file; choose a folder for the results")
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(folder, KIND):
+        return _write(result, folder)
+
+
+def _write(result: Result, folder: Path) -> list[Path]:
     files: list[Path] = []
     for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
         files.append(folder / f"{stem}.csv")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import time
 import traceback
@@ -25,7 +24,7 @@ from typing import Any, NoReturn
 
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError
-from gaponet.files import write_text
+from gaponet.files import write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
@@ -39,6 +38,7 @@ Running = dict[str, tuple[float, str]]  # the same of each running cell, by name
 SETUP, RESULT = "setup.json", "cell.json"
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 TELL_EVERY = 0.3  # s
+PATIENCE = 60.0  # s; the cells of a comparison that was killed notice it at their next step
 
 
 @dataclass(frozen=True)
@@ -135,21 +135,19 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)
     card = _card(cell.folder)
     if not card or card["interrupted"]:
-        resume = (cell.folder / "checkpoint.pt").is_file()
-        if cell.folder.exists() and not resume:
-            shutil.rmtree(cell.folder)
         data = Dataset(cell.dataset)
-        cell.folder.mkdir(parents=True, exist_ok=True)
-        write_text(cell.folder / SETUP, json.dumps(cell.setup(data), indent=1) + "\n")
 
         def show(s: Status) -> None:
             held = "" if s.val_mpjae != s.val_mpjae else f", held-out {s.best_mpjae / s.nominal_mpjae:.2f} of nominal"
             tell(s.fraction, f"{s.stage}{held}, {s.throughput:,.0f} steps/s")
 
         budget = Budget.parse(cell.budget)
-        trainer = Trainer(data, cell.robot, cell.folder, config, budget, resume, cell.holdout_units, show)
-        trainer.baseline = _fitted_beside(cell.folder)
-        trainer.run()
+        with writing(cell.folder, "run", wait=PATIENCE):
+            resume = (cell.folder / "checkpoint.pt").is_file()
+            write_text(cell.folder / SETUP, json.dumps(cell.setup(data), indent=1) + "\n")
+            trainer = Trainer(data, cell.robot, cell.folder, config, budget, resume, cell.holdout_units, show)
+            trainer.baseline = _fitted_beside(cell.folder)
+            trainer.run()
         card = _card(cell.folder)
         if card["interrupted"]:
             raise KeyboardInterrupt
@@ -260,7 +258,7 @@ def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, par
     except Exception as error:
         file = cell.folder.with_name(cell.folder.name + ".error.txt")
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(traceback.format_exc(), encoding="utf-8")
+        write_text(file, traceback.format_exc())
         pipe.send(f"{type(error).__name__}: {error} (see {file})")
 
 

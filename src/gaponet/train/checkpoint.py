@@ -7,17 +7,28 @@ roll out again.
 
 from __future__ import annotations
 
+import io
 import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from gaponet.files import whole
 from gaponet.train.env import DeltaEnv
 from gaponet.train.warm_start import WarmStart
 
 State = dict[str, Any]
 ROWS = ("row", "first", "last", "previous", "now")  # of each environment
+
+
+def write_state(path: Path, state: State) -> None:
+    """Write a checkpoint whole or not at all; OSError where there is no room for it."""
+    content = io.BytesIO()  # torch does not say which error it met on a disk
+    torch.save(state, content)
+    with whole(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 def rng_text(rng: np.random.Generator) -> str:

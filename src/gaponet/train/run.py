@@ -16,7 +16,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from gaponet.data.sequence import require_same_gains
 from gaponet.data.split import Parts, read_split, split_entries
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
-from gaponet.files import whole, write_text
+from gaponet.files import write_text, writing
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
 from gaponet.model.backends import FunctionNetwork
 from gaponet.model.baselines import delay_offset
@@ -41,7 +41,7 @@ from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
 from gaponet.train.budget import Budget
-from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state
+from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state, write_state
 from gaponet.train.config import TrainConfig
 from gaponet.train.env import DeltaEnv
 from gaponet.train.gain import choose_gain
@@ -95,6 +95,10 @@ class Kept:
     env: State | None = None
     """Of PPO's environments."""
     warm: State | None = None
+    progress: list[dict[str, Any]] = field(default_factory=list)
+    """Lines of progress.jsonl."""
+    dataset: str = ""
+    """Hash of its recordings."""
 
 
 class Trainer:
@@ -114,7 +118,7 @@ class Trainer:
     ) -> None:
         """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
         dataset.require_robot(robot)
-        if (out / "config.json").exists() and not resume:
+        if not resume and any((out / name).exists() for name in ("checkpoint.pt", "model/card.json")):
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
             raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
@@ -131,18 +135,27 @@ class Trainer:
         torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, self.n)
         untrained = copy.deepcopy(self.net.state_dict())
-        self.kept = Kept(untrained, untrained)
+        self.kept = Kept(untrained, untrained, dataset=dataset_hash(dataset.entries))
         self.reward = self.nominal = float("nan")
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
-        if resume:
-            self._load()
-        self._write_config(holdout_units)
+        with writing(out, "run"):
+            if resume:
+                self._load()
+            self._write_config(holdout_units, resume)
         self.loggers = Loggers(log, out, asdict(config))
 
     def run(self) -> GapModel:
-        """Train until the budget is out or Ctrl-C; returns the exported best model."""
+        """Train until the budget is out or Ctrl-C; returns the exported best model.
+
+        Raises:
+            FolderError: Another process writes into the run.
+        """
+        with writing(self.out, "run"):
+            return self._run()
+
+    def _run(self) -> GapModel:
         self.nominal = self.validate(None)
         if self.baseline is None:
             self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
@@ -291,8 +304,7 @@ class Trainer:
             "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
             "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
-        with (self.out / "progress.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps({k: v if v == v else None for k, v in line.items()}) + "\n")
+        self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
         self._save()
         self._tick()
@@ -314,8 +326,11 @@ class Trainer:
     def _save(self) -> None:
         self.kept.seconds, self.began = self.seconds(), time.monotonic()
         state = vars(self.kept) | {"net": self.net.state_dict(), "rng": torch.get_rng_state()}
-        with whole(self.out / "checkpoint.pt") as temporary:
-            torch.save(state, temporary)
+        write_state(self.out / "checkpoint.pt", state)
+        self._write_progress()
+
+    def _write_progress(self) -> None:
+        write_text(self.out / "progress.jsonl", "".join(json.dumps(line) + "\n" for line in self.kept.progress))
 
     def _load(self) -> None:
         try:
@@ -328,18 +343,23 @@ class Trainer:
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
         self.kept.sensor_r2 = report_of(self.kept.sensor_r2)
         torch.set_rng_state(self.rng)
+        if not self.kept.progress:  # of a run from before checkpoints had it
+            text = (self.out / "progress.jsonl").read_text(encoding="utf-8")
+            self.kept.progress = [json.loads(line) for line in text.splitlines()]
+        if self.kept.dataset not in ("", dataset_hash(self.dataset.entries)):
+            raise UsageError(f"{self.out}: was trained on other recordings than {self.dataset.path} holds; train anew")
 
-    def _write_config(self, holdout_units: tuple[str, ...]) -> None:
-        self.out.mkdir(parents=True, exist_ok=True)
+    def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
         config = asdict(self.config) | {
             "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
             "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
-        if self.robot.mjcf.parent.resolve() != (self.out / "robot").resolve():
+        if not resume:
             save_robot(self.robot, self.out / "robot")
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
+        self._write_progress()
 
     def _conditions(self) -> set[tuple[float, str, float]]:
         return {(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.train_set}

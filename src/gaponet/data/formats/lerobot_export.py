@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,7 @@ from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
+from gaponet.files import MARK, sync, writing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
+Group = tuple[float, tuple[str, ...]]  # dt, channels
 
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults
 ROWS = 200  # episodes in a row group of meta/episodes
@@ -65,11 +67,9 @@ def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress | None 
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out}: exists and is not an empty folder; choose a new one")
-    groups: dict[tuple[float, tuple[str, ...]], list[Entry]] = {}
+    groups: dict[Group, list[Entry]] = {}
     for entry in dataset.entries:
         groups.setdefault((entry.dt, entry.channels), []).append(entry)
-    temporary = out.with_name(f".{out.name}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)  # of an export that was killed
     done = 0
 
     def tell(motion: str) -> None:
@@ -78,21 +78,42 @@ def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress | None 
         if progress:
             progress(done, len(dataset), motion)
 
+    temporary = out.with_name(f"{MARK}-{out.name}")
+    with writing(temporary, "export"):
+        _empty(temporary)  # of an export that was killed
+        try:
+            written = _write_sets(dataset, groups, temporary, tell)
+            if out.exists():
+                out.rmdir()
+            temporary.rename(out)
+        except BaseException:
+            _empty(temporary)
+            raise
+        (out / MARK).unlink()
+    return [replace(w, path=out / w.path) for w in written]
+
+
+def _write_sets(
+    dataset: Dataset, groups: dict[Group, list[Entry]], folder: Path, tell: Callable[[str], None]
+) -> list[Written]:
+    """Write each group's set into folder, onto the disk; paths returned are relative to it."""
     written = []
-    try:
-        for (dt, channels), entries in groups.items():
-            part = "" if len(groups) == 1 else _folder(dt, channels, list(groups))
-            frames = _Set(dataset, temporary / part, dt, channels).write(entries, tell)
-            written.append(Written(out / part, len(entries), frames, _fps(dt)))
-        if out.exists():
-            out.rmdir()
-        temporary.rename(out)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    for (dt, channels), entries in groups.items():
+        part = "" if len(groups) == 1 else _folder(dt, channels, list(groups))
+        frames = _Set(dataset, folder / part, dt, channels).write(entries, tell)
+        written.append(Written(Path(part), len(entries), frames, _fps(dt)))
+    for path in folder.rglob("*"):
+        sync(path)
     return written
 
 
-def _folder(dt: float, channels: tuple[str, ...], groups: list[tuple[float, tuple[str, ...]]]) -> str:
+def _empty(folder: Path) -> None:
+    for child in folder.iterdir():
+        if child.name != MARK:
+            shutil.rmtree(child)
+
+
+def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
     """ "50hz"; with the channels behind it where they are what differs."""
     same_rate = [c for other, c in groups if other == dt]
     return f"{_fps(dt):.6g}hz" + ("-" + "-".join(channels) if len(same_rate) > 1 else "")
