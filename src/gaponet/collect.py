@@ -8,24 +8,28 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import KIND, Dataset
-from gaponet.errors import DatasetError
+from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text, writing
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.robot import RobotSpec
 from gaponet.sim.pairing import pair_dataset
 from gaponet.sim.replay import replay
+from gaponet.structure import read_json, validated
 from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.play import Job, library, play
 
@@ -33,6 +37,7 @@ __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
 
 Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
 
+MOST_PROCESSES = 1024
 ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
 
 
@@ -81,6 +86,11 @@ def collect(
         FolderError: `out` is something else, or another process writes into it.
     """
     start = time.monotonic()
+    recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)  # options may have changed it
+    if not 0 <= nproc <= MOST_PROCESSES or not 0 <= seed < 2**63:
+        raise UsageError(
+            f"--nproc {nproc}, --seed {seed}: up to {MOST_PROCESSES} processes, 0 for one per core; seed ≥ 0"
+        )
     for unit in recipe.units:
         fleet.unit(unit)
     wanted = takes(recipe, library(robot, seed, recipe).names(recipe.variants))
@@ -127,7 +137,7 @@ def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, see
         "payload_side": recipe.payload_side,
     }
     if path.is_file():
-        theirs = json.loads(path.read_text(encoding="utf-8"))
+        theirs = read_json(dict[str, Any], path, DatasetError, "restore it or collect into another folder")
         for key, value in mine.items():
             if theirs.get(key) != value:
                 raise DatasetError(
@@ -166,8 +176,23 @@ def _record(jobs: list[Job], nproc: int, twins: bool) -> Iterator[tuple[Sequence
             yield from _played(job, twins)
         return
     with ProcessPoolExecutor(min(nproc, len(jobs)), get_context("spawn"), _leave_with, (os.getpid(),)) as pool:
-        for played in pool.map(partial(_played, twins=twins), jobs):
+        with _ctrl_c_for_us_alone():
+            parts = pool.map(partial(_played, twins=twins), jobs)
+        for played in parts:
             yield from played
+
+
+@contextmanager
+def _ctrl_c_for_us_alone() -> Iterator[None]:
+    """Processes started here ignore it: they end their part, or with this process."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _played(job: Job, twins: bool) -> list[tuple[Sequence, Twin | None]]:

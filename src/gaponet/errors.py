@@ -41,3 +41,20 @@ class ModelError(GAPONetError):
 
 class UsageError(GAPONetError):
     """Options contradict each other or are out of range."""
+
+
+# Modules of optional dependencies → the extra that brings them.
+EXTRAS = {
+    "torch": "train", "rsl_rl": "train", "tensordict": "train", "onnx": "train", "onnxruntime": "deploy",
+    "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
+    "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
+    "tensorboard": "tensorboard", "wandb": "wandb",
+}  # fmt: skip
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install where an optional dependency is missing; None for any other module."""
+    module = (error.name or "").split(".")[0]
+    if module not in EXTRAS:
+        return None
+    return f"{module} is not installed; run: pip install 'gaponet[{EXTRAS[module]}]'"

@@ -88,7 +88,7 @@ def compare(
         with bars("runs", len(todo)) as show:
             failed = run_cells(todo, train_and_evaluate, workers or max(1, (os.cpu_count() or 1) // threads), show)
     for name, reason in failed.items():
-        screen.say(f"[red]failed[/]  {name}: {reason}")
+        screen.say(f"  {name}: {reason}", "failed", "red")
     finished = [c for c in cells if c.done]
     if not finished:
         raise ModelError(f"{out}: every run failed; the first: {next(iter(failed.values()))}")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
@@ -94,7 +93,7 @@ def doctor(
     data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
         diagnosis = diagnose(data, spec, update)
-    out.say(f"[bold]{spec.name}[/], {escape(inventory(data))}")
+    out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
 
@@ -135,14 +134,14 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         out.say(f"{len(report.present)} there already, {len(report.entries)} added")
     out.say(
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
-        f"{robot.name}, unit {escape(units)}, payload {payloads} kg; {escape(str(data.path))} now holds {len(data)}"
+        f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
     lags = {name: fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}
     show_offsets(out, lags, offsets)
     if offsets:
-        out.say(f"Offsets are recorded in {escape(str(data.path))}/offsets.json; nothing was applied to the data.")
-    out.say(f"Next: gaponet doctor {escape(str(data.path))}")
+        out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
+    out.say(f"Next: gaponet doctor {data.path!s}")
     out.result({
         "dataset": str(data.path), "imported": [e.id for e in report.entries],
         "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
@@ -178,7 +177,7 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
     shown = diagnosis.sequences[:MAX_ROWS]
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
     out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
-        [escape(r["motion"]), f"{r['payload_mass']:g}", f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}",
+        [r["motion"], f"{r['payload_mass']:g}", f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}",
          f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}", span(list(r["fast_lag_s"].values()))]
         for r in shown
     ])  # fmt: skip
@@ -191,9 +190,8 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
         for r in diagnosis.joints
     ])  # fmt: skip
     for finding in diagnosis.findings:
-        colour = COLOURS[finding.level]
-        out.say(f"[{colour}]{finding.level:>7}[/]  [bold]{finding.check}[/]: {escape(finding.message)}")
-    out.say(f"[bold]{diagnosis.verdict}[/]")
+        out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
+    out.say("", diagnosis.verdict)
 
 
 def fast_lags(entries: list[Entry], joint: str) -> list[float]:

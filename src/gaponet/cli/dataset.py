@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
@@ -39,7 +38,7 @@ def card(
         made = make_card(data, update)
     write_card(data, made, card_text(made))
     show_card(out, made)
-    out.say(f"written: {escape(str(dataset / 'CARD.md'))}, {escape(str(dataset / 'card.json'))}")
+    out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
     out.result(made)
 
 
@@ -68,12 +67,12 @@ def split(
     rows: dict[str, dict[str, Any]] = {part: count(entries) | members(entries) for part, entries in parts.items()}
     columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
     virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
-    out.table(f"{escape(data.path.name)} by {by}{virtual}; parts share no recording", columns, [
+    out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
         [part, f"{r['sequences']:,}", f"{r['hours']:.2f}", f"{r['frames']:,}", str(r["motions"]),
-         escape(some(r["units"])), some(r["payloads_kg"])]
+         some(r["units"]), some(r["payloads_kg"])]
         for part, r in rows.items()
     ])  # fmt: skip
-    out.say(f"written: {escape(str(path))}")
+    out.say(f"written: {path!s}")
     out.result({"split": str(path), "by": by, "parts": rows})
 
 
@@ -100,9 +99,9 @@ def figures(
     with bar("drawing") as update:
         written, left_out = draw_all(data, spec, out, update)
     for path in written:
-        screen.say(f"written: {escape(str(path))}")
+        screen.say(f"written: {path!s}")
     for name, reason in left_out.items():
-        screen.say(f"[yellow]left out[/]  {name}: {escape(reason)}")
+        screen.say(f"  {name}: {reason}", "left out", "yellow")
     screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
@@ -125,10 +124,10 @@ def export(
     screen, data = Out(json), Dataset(dataset)
     with bar("exporting") as update:
         sets = export_lerobot(data, out, update)
-    screen.table(f"{escape(str(out))}: LeRobotDataset v3.0", ["set", "episodes", "frames", "fps"], [
-        [escape(str(s.path)), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in sets
+    screen.table(f"{out!s}: LeRobotDataset v3.0", ["set", "episodes", "frames", "fps"], [
+        [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in sets
     ])  # fmt: skip
-    screen.say(f"Back: gaponet import {escape(str(out))} --format lerobot --robot {data.robot_name} --out NEW")
+    screen.say(f"Back: gaponet import {out!s} --format lerobot --robot {data.robot_name} --out NEW")
     screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
 
 
@@ -150,10 +149,10 @@ def show_card(out: Out, made: dict[str, Any]) -> None:
     from gaponet.data.card import NOT_STATED
     from gaponet.data.card_text import TITLES, headline, number
 
-    out.say(f"[bold]{escape(headline(made))}[/]")
+    out.say("", headline(made))
     for name, shares in made["shares"].items():
         out.table("", [TITLES[name], "sequences", "hours", "frames", "motions"], [
-            [escape(key), f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", str(c["motions"])]
+            [key, f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", str(c["motions"])]
             for key, c in shares.items()
         ])  # fmt: skip
     repeated = made["repeatability"]
@@ -166,7 +165,7 @@ def show_card(out: Out, made: dict[str, Any]) -> None:
         out.say("repeatability: no motion was repeated with the same command, unit and payload")
     for name in ("licence", "source"):
         ask = f"; set it with gaponet data card DIR --{name} …" if made[name] == NOT_STATED else ""
-        out.say(f"{name}: {escape(made[name])}{ask}")
+        out.say(f"{name}: {made[name]}{ask}")
 
 
 def members(entries: list[Any]) -> dict[str, list[str]]:

@@ -54,7 +54,7 @@ def demo(
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))
-    screen.say(f"\nreport: [bold]{path}[/]  ({time.monotonic() - began:.0f} s in all)")
+    screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
 
 
 def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
@@ -68,8 +68,6 @@ def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tup
         raise UsageError(f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR")
     from gaponet.cli.collect import collect
 
-    screen.say(
-        "No --data given: collecting from [bold]VIRTUAL[/] H1-2 robots; nothing below says anything about real ones."
-    )
+    screen.say("No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones.")
     collect(robot=robot, fleet="default", recipe="demo", out=path)
     return ("virtual-4",)

@@ -77,8 +77,8 @@ def show_methods(out: Out, result: dict[str, Any], robot: RobotSpec) -> None:
     methods = result["methods"]
     kind = "VIRTUAL robot" if result["virtual"] else "real robot"
     out.say(
-        f"[bold]{result['robot']}[/], {kind}, {result['sequences']} sequences, whole-motion free run; "
-        f"simulator {result['simulator_hash']}"
+        f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
+        result["robot"],
     )
     base = methods["nominal"]["mpjae"]
     columns = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static", "dynamic", "≥ 0.05 rad"]

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.gap import mrad
 from gaponet.cli.inputs import open_dataset
@@ -89,7 +88,7 @@ def identify(
         [j, *(f"{v * COLUMNS[f][1]:.3g}" for f, v in values[j].items())] for j in spec.operated
     ])  # fmt: skip
     for warning in found.warnings:
-        screen.say(f"[yellow]warning[/]  {escape(warning)}")
+        screen.say(f"  {warning}", "warning", "yellow")
     screen.say(
         f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions: nominal "
         f"{mrad(error['nominal'])}, identified {mrad(error['identified'])} mrad "

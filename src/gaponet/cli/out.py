@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from gaponet.data.json_file import finite
 from gaponet.files import writing
+from gaponet.text import plain
 
 if TYPE_CHECKING:
     from gaponet.study.result import Result
@@ -26,30 +27,37 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
 
+class _Console(Console):
+    def on_broken_pipe(self) -> None:
+        raise
+
+
 class Out:
     """People read stdout; with json they read stderr, and stdout carries one object."""
 
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
-        self.console = Console(stderr=as_json, highlight=False)
+        self.console = _Console(stderr=as_json, highlight=False)
 
-    def say(self, text: str) -> None:
-        """A line for people."""
-        self.console.print(text, soft_wrap=True)
+    def say(self, text: str, start: str = "", style: str = "bold") -> None:
+        """A line for people; `start` stands before the text, in this style. Neither is markup, whatever it holds."""
+        self.console.print(Text.assemble((plain(start), style), plain(text)), soft_wrap=True)
 
     def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
         """A table for people; the first column is text, the others are right-aligned numbers, which are never cut."""
-        lines = list(rows)
-        table = Table(title=title, title_justify="left", title_style="bold")
+        lines = [[plain(cell) for cell in row] for row in rows]
+        table = Table(title=Text(plain(title)), title_justify="left", title_style="bold")
         for i, column in enumerate(columns):
-            cells = [str(line[i]) for line in lines]
+            cells = [line[i] for line in lines]
             if i == 0:
-                table.add_column(column, overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL)
+                table.add_column(Text(plain(column)), overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL)
             else:
                 words = [len(word) for cell in cells for word in cell.split()]
-                table.add_column(column, overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER))
+                table.add_column(
+                    Text(plain(column)), overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER)
+                )
         for line in lines:
-            table.add_row(*line)
+            table.add_row(*map(Text, line))
         self.console.print(table)
 
     def result(self, value: dict[str, Any]) -> None:
@@ -64,14 +72,15 @@ def show_result(result: Result, out: Path, screen: Out) -> None:
     from gaponet.study.page import write
 
     files = write(result, out)
-    screen.say(f"[bold]{escape(result.title)}[/]\n{escape(result.virtual)}")
+    screen.say("", result.title)
+    screen.say(result.virtual)
     for table in result.tables:
-        screen.table("", [escape(c) for c in table.columns], [[escape(c) for c in row] for row in table.texts()])
+        screen.table("", list(table.columns), table.texts())
         if table.caption:
-            screen.say(escape(table.caption))
+            screen.say(table.caption)
     for sentence in result.sentences:
-        screen.say(f"- {escape(sentence)}")
-    screen.say(f"written: {', '.join(escape(str(f)) for f in files)}")
+        screen.say(f"- {sentence}")
+    screen.say(f"written: {', '.join(str(f) for f in files)}")
     screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
                    "sentences": list(result.sentences), "files": [str(f) for f in files],
                    "tables": {t.name: {"columns": t.columns, "rows": t.records()} for t in result.tables}})  # fmt: skip

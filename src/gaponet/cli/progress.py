@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
@@ -18,6 +17,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from gaponet.text import plain
 
 EVERY = 10.0  # s between two lines where there is no terminal
 
@@ -53,11 +54,12 @@ def _progress(title: str) -> Iterator[Show]:
         yield _lines(title, console)
         return
     columns: tuple[ProgressColumn, ...] = (
-        TextColumn("[bold]{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
+        TextColumn("{task.description}", style="bold", markup=False), BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
     )  # fmt: skip
     with Progress(*columns, console=console, speed_estimate_period=600) as progress:
-        whole = progress.add_task(escape(title), total=None, note="")
+        whole = progress.add_task(title, total=None, note="")
         shown: dict[str, TaskID] = {}
 
         def show(running: Running, done: float, total: float, note: str = "") -> None:
@@ -65,9 +67,9 @@ def _progress(title: str) -> Iterator[Show]:
                 progress.remove_task(shown.pop(name))
             for name, (share, said) in running.items():
                 if name not in shown:
-                    shown[name] = progress.add_task(f"  {escape(name)}", total=1.0, note="")
-                progress.update(shown[name], completed=share, note=escape(said))
-            progress.update(whole, completed=done, total=total, note=escape(note))
+                    shown[name] = progress.add_task(f"  {plain(name)}", total=1.0, note="")
+                progress.update(shown[name], completed=share, note=plain(said))
+            progress.update(whole, completed=done, total=total, note=plain(note))
 
         yield show
 
@@ -86,8 +88,7 @@ def _lines(title: str, console: Console) -> Show:
         parts = [note, *(f"{name} {100 * share:.0f} % {said}".rstrip() for name, (share, said) in running.items())]
         share = f"{100 * done / total:.0f} %" if total else ""
         said = "; ".join(part for part in parts if part)
-        console.print(
-            f"{title}: {share}, {now - began:.0f} s{', ' + said if said else ''}", markup=False, soft_wrap=True
-        )
+        line = f"{title}: {share}, {now - began:.0f} s{', ' + said if said else ''}"
+        console.print(plain(line), markup=False, soft_wrap=True)
 
     return show

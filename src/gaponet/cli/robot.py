@@ -6,7 +6,6 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
@@ -39,7 +38,7 @@ def list_robots(out: Out) -> None:
     specs = [load_robot(name) for name in available()]
     out.table("Robots", ["name", "joints", "operated", "Hz", "payload", "what it is"], [
         [s.name, str(len(s.joint_names)), str(len(s.operated)), f"{1 / s.dt:g}",
-         ", ".join(m.side for m in s.payload_mounts) or "–", escape(s.description)] for s in specs
+         ", ".join(m.side for m in s.payload_mounts) or "–", s.description] for s in specs
     ])  # fmt: skip
     out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
     out.result({"robots": [{"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs]})
@@ -55,7 +54,7 @@ def check_robot(out: Out, spec: RobotSpec) -> None:
         build_model(spec, 1.0)
     load = static_torque(model, spec.qpos_home[None])[0]
     warnings = doubts(spec, load)
-    out.table(f"{spec.name}: {escape(spec.description)}; N·m/rad, N·m·s/rad, N·m, rad",
+    out.table(f"{spec.name}: {spec.description}; N·m/rad, N·m·s/rad, N·m, rad",
               ["joint", "operated", "kp", "kd", "limit", "range"], [
         [name, "yes" if name in spec.operated else "no", f"{spec.kp[i]:g}", f"{spec.kd[i]:g}",
          f"{spec.effort_limit[i]:g}", "{:.2f}…{:.2f}".format(*spec.qpos_range[i])]
@@ -70,8 +69,11 @@ def check_robot(out: Out, spec: RobotSpec) -> None:
         f"payload mounts: {mounts}; simulator {model_hash(spec)}"
     )
     for warning in warnings:
-        out.say(f"[yellow]warning[/]  {warning}")
-    out.say(f"[bold green]ok[/]: {spec.name} compiles" if not warnings else f"{spec.name} compiles; see the warnings")
+        out.say(f"  {warning}", "warning", "yellow")
+    if warnings:
+        out.say(f"{spec.name} compiles; see the warnings")
+    else:
+        out.say(f": {spec.name} compiles", "ok", "bold green")
     out.result(as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings})
 
 

@@ -206,9 +206,10 @@ def _compensator(asked: Request, robot: RobotSpec) -> Any:
 
 def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
     screen.say(
-        f"[bold]{driver.address}[/] will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
+        f" will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
         f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? "
-        "Enter to start, Ctrl-C to leave."
+        "Enter to start, Ctrl-C to leave.",
+        driver.address,
     )
     if not sys.stdin.isatty():
         raise UsageError("no terminal to ask on; say --yes if the space around the robot is free")
@@ -217,7 +218,7 @@ def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
 
 def _tell(screen: Out, event: Event) -> None:
     colour = "bold red" if event.kind not in ("", "end") else "cyan"
-    screen.say(f"[{colour}]{event.phase:>9}[/]  {event.kind and event.kind + ': '}{event.text}")
+    screen.say(f"  {event.kind and event.kind + ': '}{event.text}", f"{event.phase:>9}", colour)
 
 
 def _report(screen: Out, recording: Recording) -> None:

@@ -128,7 +128,7 @@ def evaluate(
         )  # fmt: skip
     save(evaluation, run)
     if not evaluation.result["unseen"]:
-        out.say("[yellow]some of these sequences were used in training: the numbers are not held-out ones[/]")
+        out.say("", "some of these sequences were used in training: the numbers are not held-out ones", "yellow")
     show_methods(out, evaluation.result, spec)
     out.result(evaluation.result)
 

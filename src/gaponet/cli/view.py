@@ -91,11 +91,12 @@ def view(
     clip = Clip.of(shown, start, duration, speed, fps)
     meta = entry.meta
     out.say(
-        f"[bold]{meta.motion}[/], {'VIRTUAL ' if meta.virtual else ''}unit {meta.unit_id}, {meta.payload_mass:g} kg; "
-        + ", ".join(f"{m.name} {mrad(m.mpjae)} mrad" for m in shown.motions if m.method != "recorded")
+        f", {'VIRTUAL ' if meta.virtual else ''}unit {meta.unit_id}, {meta.payload_mass:g} kg; "
+        + ", ".join(f"{m.name} {mrad(m.mpjae)} mrad" for m in shown.motions if m.method != "recorded"),
+        meta.motion,
     )
     if shown.seen:
-        out.say("[yellow]a model was trained or chosen on this recording: it is not held-out[/]")
+        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
     rows = slice(first, last + 1)
     scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)

@@ -24,6 +24,7 @@ STYLE = {
     "legend.frameon": False,
     "lines.linewidth": 1.2,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # a $ in a name is a $
     "svg.hashsalt": "gaponet",
     "figure.constrained_layout.use": True,
 }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gaponet.errors import UsageError
 
+MOST = 1e12  # of steps or of any unit of time
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -25,7 +26,7 @@ class Budget:
             number = float(match.group(1)) if match else 0.0
         except ValueError:
             number = 0.0
-        if not match or number <= 0:
+        if not match or not 0 < number <= MOST:
             raise UsageError(f"--budget {text}: give a time such as 90s, 10m or 2h, or a number of control steps")
         unit = match.group(2).lower()
         return cls(seconds=number * UNITS[unit]) if unit else cls(steps=int(number))

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from gaponet.model.config import ModelConfig
+from annotated_types import Interval
+
+from gaponet.model.config import Layers, ModelConfig
 
 
 @dataclass(frozen=True)
 class RewardConfig:
     """r = −position·mean(Δq²) − velocity·mean(Δq̇²) − delta·mean(Δa²) − delta_rate·mean((Δa_t − Δa_{t−1})²)."""
 
-    position: float = 32.83
+    position: Annotated[float, Interval(ge=0, le=1e6)] = 32.83
     """κ of the paper, 1/rad²."""
-    velocity: float = 0.3283
+    velocity: Annotated[float, Interval(ge=0, le=1e6)] = 0.3283
     """0.01 κ, s²/rad²."""
-    delta: float = 0.01
+    delta: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
     """Price of a large correction, 1/rad²."""
-    delta_rate: float = 0.1
+    delta_rate: Annotated[float, Interval(ge=0, le=1e6)] = 0.1
     """Price of a jerky correction, 1/rad²."""
 
 
@@ -26,23 +29,23 @@ class RewardConfig:
 class WarmStartConfig:
     """Supervised start: regress the inverse labels on states that the policy visits itself."""
 
-    rounds: int = 10
+    rounds: Annotated[int, Interval(ge=0, le=100000)] = 10
     """Roll-outs of the present policy; 0 starts PPO from an untrained network."""
-    num_envs: int = 256
+    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations per round."""
-    steps: int = 400
+    steps: Annotated[int, Interval(ge=1, le=10000000)] = 400
     """Control periods per round."""
-    disturbance: float = 0.003
+    disturbance: Annotated[float, Interval(ge=0, le=1e6)] = 0.003
     """Noise on the applied corrections, white and slow, σ in rad."""
-    batch_size: int = 1024
+    batch_size: Annotated[int, Interval(ge=1, le=10000000)] = 1024
     """Samples per gradient step."""
-    gradient_steps: int = 300
+    gradient_steps: Annotated[int, Interval(ge=0, le=10000000)] = 300
     """Gradient steps per round."""
-    learning_rate: float = 1e-3
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
     """AdamW step size, decayed to a tenth over the rounds."""
-    weight_decay: float = 0.01
+    weight_decay: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
     """AdamW weight decay."""
-    sensor_states: int = 2048
+    sensor_states: Annotated[int, Interval(ge=1, le=10000000)] = 2048
     """States at which the simulator is asked, once for each probe, to fit the sensor predictor."""
     sensor_refresh: float | None = None
     """Ask after each round how well the sensor predictor explains the states that the policy visits, and fit it again
@@ -53,30 +56,30 @@ class WarmStartConfig:
 class PPOConfig:
     """PPO of rsl_rl, start values of the method."""
 
-    num_envs: int = 512
+    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 512
     """Simulations."""
-    num_steps: int = 32
+    num_steps: Annotated[int, Interval(ge=1, le=100000)] = 32
     """Decisions between updates; a decision is model.delta_hold control periods."""
-    epochs: int = 2
+    epochs: Annotated[int, Interval(ge=1, le=1000)] = 2
     """Passes over each batch."""
-    mini_batches: int = 8
+    mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 8
     """Mini-batches per pass; 2048 samples each stay in the cache."""
-    learning_rate: float = 1e-5
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-5
     """Start value; adapts to desired_kl, not below 1e-5."""
-    desired_kl: float = 0.008
+    desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.008
     """Step size is halved or doubled to stay near this KL."""
-    gamma: float = 0.95
+    gamma: Annotated[float, Interval(gt=0, le=1)] = 0.95
     """Discount per control period; a correction acts within the lag, and a longer view only adds variance."""
-    lam: float = 0.95
+    lam: Annotated[float, Interval(gt=0, le=1)] = 0.95
     """GAE λ."""
-    clip: float = 0.2
+    clip: Annotated[float, Interval(gt=0, le=1)] = 0.2
     """PPO clip range."""
-    critic_warmup: int = 10
+    critic_warmup: Annotated[int, Interval(ge=0, le=10000000)] = 10
     """Updates of the critic alone, before a warm-started actor moves."""
-    init_std: float = 0.003
+    init_std: Annotated[float, Interval(ge=0, le=1e6)] = 0.003
     """Exploration σ at start, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
     and the best noisy policy is not the best policy."""
-    critic_hidden: tuple[int, ...] = (256, 128)
+    critic_hidden: Layers = (256, 128)
     """Hidden layers of the critic."""
 
 
@@ -88,9 +91,9 @@ class TrainConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
     warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
-    seed: int = 0
+    seed: Annotated[int, Interval(ge=0, le=2**63)] = 0
     """Seed of everything random."""
-    episode_s: float = 10.0
+    episode_s: Annotated[float, Interval(gt=0, le=1e5)] = 10.0
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
     split: str = ""
     """Split file of gaponet data split; default: by motion, a fixed rule."""
@@ -98,13 +101,13 @@ class TrainConfig:
     """Payloads never trained on, kg; their test motions stay in the test part."""
     rates: tuple[float, ...] = ()
     """Only recordings at these control rates, Hz, in all parts; all by default."""
-    train_share: float = 1.0
+    train_share: Annotated[float, Interval(gt=0, le=1)] = 1.0
     """Share of the training motions that is used; validation and test motions stay the same."""
     mixed_gains: bool = False
     """Take recordings made with different kp or kd together."""
-    validate_every: int = 10
+    validate_every: Annotated[int, Interval(ge=1, le=10000000)] = 10
     """PPO updates between free runs over the validation motions."""
-    threads: int = 0
+    threads: Annotated[int, Interval(ge=0, le=4096)] = 0
     """Threads of the simulator, and in turn of the learner; 0 for all cores."""
 
     @property

@@ -40,6 +40,7 @@ from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 from gaponet.sim.replay import replay
+from gaponet.structure import validated
 from gaponet.train.budget import Budget
 from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state, write_state
 from gaponet.train.config import TrainConfig
@@ -118,6 +119,7 @@ class Trainer:
     ) -> None:
         """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
         dataset.require_robot(robot)
+        config = validated(TrainConfig, asdict(config), "training options", UsageError)
         if not resume and any((out / name).exists() for name in ("checkpoint.pt", "model/card.json")):
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
