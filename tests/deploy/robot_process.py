@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def main(domain: int) -> None:
     from gaponet.virtual.fleet import load_fleet
 
     robot = load_robot("h1_2")
-    served = VirtualH12(robot, load_fleet("default", robot).unit("virtual-4"), (3.0, "both"), domain, rate=RATE)
+    served = VirtualH12(robot, load_fleet("default", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
     threading.Thread(target=served.run, daemon=True).start()
     for line in sys.stdin:
         word, _, rest = line.strip().partition(" ")
@@ -51,6 +52,7 @@ def main(domain: int) -> None:
         if word == "fault":
             served.fault_at, served.fault = 0.0, rest  # type: ignore[assignment]
         if word == "clear":
+            time.sleep(0.2)  # what the last controller sent is still on its way
             served.fault, served.heard = "none", Heard()
         if word == "heard":
             heard = served.heard

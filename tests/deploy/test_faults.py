@@ -28,6 +28,7 @@ pytestmark = pytest.mark.faults
 
 DOMAIN = 20 + os.getpid() % 150
 SLOW = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=0.3)  # machines that run tests are busy
+SAFETY = SafetyConfig(acceleration=5.0)  # at 10 Hz a state is so old before it is too old
 ROBOT = load_robot("h1_2")
 AT = 4  # period of the run in which the fault is injected
 
@@ -55,14 +56,14 @@ def run(at_fault, robot: RobotSpec = ROBOT, domain: int = DOMAIN) -> Recording:
         return swing(k) if k < AT + 30 else None
 
     driver = UnitreeDriver(robot, domain=domain)
-    return Controller(driver, robot, SLOW, guard=False).run(policy)
+    return Controller(driver, robot, SLOW, SAFETY, guard=False).run(policy)
 
 
 def judge(recording: Recording, heard: dict[str, list]) -> None:
     """What the robot heard: never outside the limits, and once damped, damped for good."""
     arms = ROBOT.index(recording.commanded)
     ctrl, kp, _kd, _qvel = (np.array(heard[n])[:, arms] for n in ("ctrl", "kp", "kd", "qvel"))
-    limits = Limits.of(ROBOT, recording.commanded, SafetyConfig())
+    limits = Limits.of(ROBOT, recording.commanded, SAFETY)
     stiff = (kp > 0).all(axis=1)
     assert (stiff | (kp == 0).all(axis=1)).all()
     assert (np.diff(stiff.astype(int)) <= 0).all(), "a position command after damping"
@@ -89,7 +90,7 @@ def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
     served.ask("clear")
     recording = run(lambda: served.ask(f"fault {fault}"))
     assert recording.fault is not None
-    assert recording.fault.kind == kind
+    assert recording.fault.kind == kind, recording.fault.text
     sent_after = sum(r.phase == "run" for r in recording.rows) - (AT + 1)
     assert 0 <= sent_after <= periods  # position commands between the fault and damping
     judge(recording, served.ask("heard"))
@@ -105,8 +106,8 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(served):
             served.ask(word)
         return swing(k)
 
-    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, guard=False).run(policy)
-    assert recording.fault.kind == "stale"
+    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+    assert recording.fault.kind == "stale", recording.fault.text
     assert 0 <= sum(r.phase == "run" for r in recording.rows) - (AT + 15 + 1) <= 2
     judge(recording, served.ask("heard"))
 
@@ -120,7 +121,7 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
 
     driver = UnitreeDriver(ROBOT, domain=domain)
     config = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=8.0)
-    controller = Controller(driver, ROBOT, config, guard=False)
+    controller = Controller(driver, ROBOT, config, SAFETY, guard=False)
 
     def policy(k, state):
         if k == AT:
@@ -133,7 +134,7 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
 
     controller._on_event = told
     recording = controller.run(policy)
-    assert recording.fault.kind == "stale"
+    assert recording.fault.kind == "stale", recording.fault.text
     heard = robots[1].ask("heard")
     robots[1].kill()
     assert len(heard["kp"]) > 0
@@ -142,10 +143,10 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
 
 CONTROLLER = """
 import sys
-from deploy.test_faults import ROBOT, SLOW, swing
+from deploy.test_faults import ROBOT, SAFETY, SLOW, swing
 from gaponet.deploy.controller import Controller
 from gaponet.deploy.drivers.unitree import UnitreeDriver
-Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW).run(lambda k, state: swing(k))
+Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY).run(lambda k, state: swing(k))
 """
 
 

@@ -30,6 +30,8 @@ Array = np.ndarray
 
 ROUNDING = 1e-9  # of a bound: kept free so that a limit computed back from a command is not passed by rounding
 
+STILL = 4  # new states in which one joint must read the same before that can count; at a turn two may by chance
+
 
 @dataclass(frozen=True)
 class SafetyConfig:
@@ -41,7 +43,7 @@ class SafetyConfig:
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
     """Of a joint's effort limit that a command may ask for."""
-    acceleration: float = 100.0
+    acceleration: float = 50.0
     """Fastest acceleration of a joint, rad/s²: how wrong an old state may be."""
     delta: float = 0.5
     """Largest correction of a model, rad."""
@@ -217,7 +219,7 @@ class Watch:
         self._equal, self._travel = 0, np.zeros(len(commanded))
         self._ctrl: Array | None = None
         self._anchor: Array | None = None
-        self._glided = np.zeros(len(commanded))
+        self._glided, self._still = np.zeros(len(commanded)), np.zeros(len(commanded), int)
         self._astray = 0.0
         self._refused: list[tuple[float, int]] = []
 
@@ -303,14 +305,17 @@ class Watch:
     def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
         """One encoder that stands still while its command moves on or its velocity says that the joint does."""
         qpos, last = state.qpos[self.commanded], self._last
+        if last is not None and state.time <= last.time:
+            return None  # the same state again
         if last is None or ctrl is None or not self.noisy:
             self._anchor = ctrl
             return None
         moved = qpos != last.qpos[self.commanded]
         anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
-        passed = max(state.time - last.time, 0.0)
-        self._anchor, self._glided = anchor, np.where(moved, 0.0, self._glided + state.qvel[self.commanded] * passed)
-        beyond = np.maximum(np.abs(ctrl - anchor), np.abs(self._glided))
+        glided = self._glided + state.qvel[self.commanded] * (state.time - last.time)
+        self._anchor, self._glided = anchor, np.where(moved, 0.0, glided)
+        self._still = np.where(moved, 0, self._still + 1)
+        beyond = np.where(self._still < STILL, 0.0, np.maximum(np.abs(ctrl - anchor), np.abs(self._glided)))
         worst = int(beyond.argmax())
         if beyond[worst] <= self.config.frozen_joint:
             return None

@@ -139,9 +139,13 @@ class Bus:
         """
         if interface not in _interfaces():
             raise DriverError(f"no network interface '{interface}' here; there are {', '.join(_interfaces())}")
+        # lo has no multicast on Linux: programs on it, Unitree's SDK among them, are found by asking port after port.
+        lonely = interface == "lo"
+        discovery = '<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="localhost"/></Peers>'
         config = (
             f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"/></Interfaces>'
-            "<AllowMulticast>true</AllowMulticast></General></Domain></CycloneDDS>"
+            f"<AllowMulticast>{str(not lonely).lower()}</AllowMulticast></General>"
+            f"<Discovery>{discovery if lonely else ''}</Discovery></Domain></CycloneDDS>"
         )
         try:
             self._domain = (
