@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults fuzz check clean
+.PHONY: setup demo test faults peers fuzz check clean
 
 setup: $(VENV)/.done
 
@@ -31,6 +31,10 @@ test: setup
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
 	$(BIN)/python -m pytest -m faults
+
+# Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
+peers: setup
+	$(BIN)/python -m pytest -m peers -s
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
