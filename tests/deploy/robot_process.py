@@ -1,6 +1,7 @@
 """A virtual H1-2 on the bus in a process of its own, told what to do by lines on stdin, one JSON answer each.
 
-fault KIND: go wrong from now on. clear: be well, forget what was heard. heard: the commands since.
+fault KIND: go wrong from now on. machine N: be another robot. clear: be well, forget what was heard. heard: the
+commands since.
 """
 
 from __future__ import annotations
@@ -51,9 +52,11 @@ def main(domain: int) -> None:
         answer: Any = "ok"
         if word == "fault":
             served.fault_at, served.fault = 0.0, rest  # type: ignore[assignment]
+        if word == "machine":
+            served.machine = int(rest)
         if word == "clear":
             time.sleep(0.2)  # what the last controller sent is still on its way
-            served.fault, served.heard = "none", Heard()
+            served.fault, served.machine, served.heard, served.refused = "none", 6, Heard(), 0
         if word == "heard":
             heard = served.heard
             k = len(heard.time)

@@ -399,3 +399,32 @@ def test_damping_takes_the_stiffness_away_and_brakes(arm):
     sinking = driver.read()
     assert np.abs(sinking.qpos - held).max() > 0.05
     assert (np.abs(sinking.qvel) < 5).all()
+
+
+def test_the_guard_tries_again_until_it_has_damped(capsys):
+    from gaponet.deploy import guard
+
+    class Loose:
+        address = "/dev/loose"
+        tries, damped, closed = 0, [], False
+
+        def connect(self):
+            self.tries += 1
+            if self.tries < 3:
+                raise DriverError("the cable is out")
+
+        def damp(self, weight):
+            self.damped.append(weight)
+            if len(self.damped) in (2, 3):
+                raise OSError("a glitch")
+
+        def close(self, hold=False):
+            self.closed = True
+
+    robot = Loose()
+    guard._damp(robot, 0.1, 0.5, connected=False)
+    assert robot.tries == 3
+    assert len(robot.damped) > 3
+    assert 0.5 >= robot.damped[0] > robot.damped[-1]
+    assert robot.closed
+    assert "the cable is out; trying again" in capsys.readouterr().err

@@ -84,6 +84,8 @@ def judge(recording: Recording, heard: dict[str, list]) -> None:
     [
         ("stop", "stale", 2), ("repeat", "stale", 2), ("late", "stale", 2), ("checksum", "stale", 2),
         ("freeze", "frozen", 2), ("nan", "nan", 1), ("jump", "jump", 1), ("hot", "temperature", 1),
+        ("encoder", "frozen", 6), ("motor", "robot", 1), ("remote", "stop", 1), ("fall", "tilt", 1),
+        ("machine", "robot", 1),
     ],
 )  # fmt: skip
 def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
@@ -141,6 +143,83 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
     np.testing.assert_array_equal(heard["kp"], 0.0)
 
 
+def test_a_g1_is_refused_and_hears_nothing(served):
+    served.ask("clear")
+    served.ask("machine 5")
+    time.sleep(0.2)
+    with pytest.raises(DriverError, match="not an H1-2: its mode_machine is 5, a G1's; nothing was sent"):
+        run(lambda: None)
+    assert served.ask("heard")["time"] == []
+    served.ask("clear")
+
+
+def test_a_stop_before_the_start_and_a_robot_that_is_never_ready_send_nothing(served):
+    served.ask("clear")
+    controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY)
+    controller.stop("before the start")
+    assert controller.run(lambda k, state: swing(k)).fault.kind == "stop"
+    cold = SafetyConfig(acceleration=5.0, temperature=1.0)
+    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, cold).run(lambda k, state: swing(k))
+    assert recording.fault.kind == "temperature"
+    time.sleep(0.3)
+    assert served.ask("heard")["time"] == []
+
+
+def test_a_good_run_ends_with_the_arms_held_until_they_are_the_robots_again(served):
+    served.ask("clear")
+    driver = UnitreeDriver(ROBOT, domain=DOMAIN)
+    recording = Controller(driver, ROBOT, SLOW, SAFETY).run(lambda k, state: ROBOT.qpos_home if k < 10 else None)
+    assert recording.fault is None
+    heard = served.ask("heard")
+    arms = ROBOT.index(recording.commanded)
+    assert (np.array(heard["kp"])[:, arms] > 0).all(), "no damping: the arms would sink"
+    assert heard["weight"][-1] == 0.0
+    sunk = recording.rows[-1].state.qpos - recording.rows[0].state.qpos
+    assert np.abs(sunk).max() < 0.05
+
+
+def test_a_policy_that_crashes_leaves_a_damped_robot(served):
+    served.ask("clear")
+
+    def crash():
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(crash)
+    time.sleep(0.3)
+    kp = np.array(served.ask("heard")["kp"])
+    damped = (kp == 0).all(axis=1)
+    assert damped.sum() >= 3, "SLOW damps for three periods"
+    assert (np.diff(damped.astype(int)) >= 0).all()
+
+
+PREPARING = """
+import sys, time
+from deploy.test_faults import ROBOT, SAFETY, SLOW, swing
+from gaponet.deploy.controller import Controller
+from gaponet.deploy.drivers.unitree import UnitreeDriver
+class Slow:
+    def reset(self, target, payload_mass=None):
+        print("preparing", flush=True)
+        time.sleep(60)
+Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY, Slow()).run(lambda k, state: swing(k))
+"""
+
+
+def test_a_controller_killed_while_its_compensator_prepares_has_sent_nothing_and_its_guard_neither(served):
+    served.ask("clear")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", PREPARING, str(DOMAIN)], env=environment, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout
+    assert process.stdout.readline() == "preparing\n"
+    process.kill()
+    process.wait()
+    time.sleep(1.5)
+    assert served.ask("heard")["time"] == []
+
+
 CONTROLLER = """
 import sys
 from deploy.test_faults import ROBOT, SAFETY, SLOW, swing
@@ -165,6 +244,10 @@ def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how):
         stiff = np.any(heard["kp"], axis=1)
         assert (np.diff(stiff.astype(int)) <= 0).all()
         wait(lambda: served.ask("heard")["weight"][-1] < 0.05)  # in the end the arms are handed back
+        process.send_signal(signal.SIGCONT)  # who comes back from standing still has nothing more to say
+        process.wait(20)
+        time.sleep(0.3)
+        assert not np.any(served.ask("heard")["kp"][-1])
     finally:
         process.kill()
         process.wait()

@@ -94,6 +94,7 @@ class VirtualRobot:
         self._nominal_friction = model.dof_frictionloss.copy()
         self._kp = robot.kp[self.active] * p.kp_scale
         self._kd = robot.kd[self.active] * p.kd_scale
+        self._added = np.zeros_like(self._kp)
         self._effort = robot.effort_limit[self.active]
         self._limits = qpos_range(model)
         self.backlash = Backlash(p, model.dof_armature)
@@ -130,18 +131,25 @@ class VirtualRobot:
         self.events: list[list[Event]] = [[] for _ in seeds]
         self._reported = np.zeros((2, *target.shape), bool)
 
-    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None) -> None:
+    def set_gains(
+        self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0
+    ) -> None:
         """Gains told to the drives instead of the robot's, (n) or (N, n); they deliver their share of them.
 
         A torque limit (n) N·m, too, where given.
 
         Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles by those it finds.
+
+        Args:
+            kp, kd: N·m/rad, N·m·s/rad.
+            torque: Added to what they ask for, N·m.
         """
         p, at = self.physics, self.active
         self._kp = np.broadcast_to(np.asarray(kp, float)[..., at] * p.kp_scale, self._kp.shape)
         self._kd = np.broadcast_to(np.asarray(kd, float)[..., at] * p.kd_scale, self._kd.shape)
         if effort is not None:
             self._effort = np.asarray(effort, float)[at]
+        self._added = np.broadcast_to(np.broadcast_to(torque, self.n)[..., at], self._kd.shape)
 
     def _settle(self, target: Array) -> None:
         """Where PD and gravity balance, and a little off it: friction keeps a joint where it happened to stop."""
@@ -158,7 +166,7 @@ class VirtualRobot:
 
     def _motor_torque(self) -> Array:
         """What the drive asks of the motor at the rated torque constant, (N, active), N·m."""
-        torque = self._kp * (self._ctrl - self._qpos) - self._kd * self._qvel
+        torque = self._kp * (self._ctrl - self._qpos) - self._kd * self._qvel + self._added
         return np.clip(torque * self._gain_share(), -self._effort, self._effort)
 
     def _gain_share(self) -> Array:
@@ -177,10 +185,10 @@ class VirtualRobot:
         share = kt * self._gain_share()
         self._range[:, :, 1] = self._effort * kt * np.minimum(self._supply, 1.0)
         self._range[:, :, 0] = -self._range[:, :, 1]
-        kp, kd = self._kp * share, self._kd * share
+        kp, kd, added = self._kp * share, self._kd * share, self._added * share
         for k in range(count):
             self._ctrl[:] = self.link.read(self._now + k * period)
-            self._laws(kp, kd, kt, period)
+            self._laws(kp, kd, added, kt, period)
             self.batch.step(rows, nstep=self.substeps)
             self._push = -self._constraint
         self._slow_laws(count)
@@ -188,14 +196,15 @@ class VirtualRobot:
         self._now += self.dt
         self._row += 1
 
-    def _laws(self, kp: Array, kd: Array, kt: Array, period: float) -> None:
+    def _laws(self, kp: Array, kd: Array, added: Array, kt: Array, period: float) -> None:
         torque = self._motor_torque()
         self._squares += torque * torque
         joint_torque = torque * kt
         if self.backlash.any:
             engaged = self.backlash.step(joint_torque, period)
-            kp, kd = kp * engaged, kd * engaged
+            kp, kd, added = kp * engaged, kd * engaged, added * engaged
         self._gain[:, :, 0] = kp
+        self._bias[:, :, 0] = added
         self._bias[:, :, 1] = -kp
         self._bias[:, :, 2] = -kd
         if self._cogs:

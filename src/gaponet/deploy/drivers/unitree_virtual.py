@@ -22,7 +22,10 @@ from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
-FaultKind = Literal["none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock"]
+FaultKind = Literal[
+    "none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock",
+    "encoder", "motor", "remote", "fall", "machine",
+]  # fmt: skip
 
 LATE = 0.3  # s by which messages of the fault "late" are held back
 CLOCK_STEP = 10.0  # s by which the robot's clock is ahead while the fault "clock" holds
@@ -88,8 +91,7 @@ class VirtualH12:
         self.refused = self.missed = 0
         self._message = hg.LowState.new()
         hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
-        hg.LowState.view(self._message, "mode_machine")[0] = 6
-        hg.LowState.view(self._message, "imu_state.quaternion")[0] = 1.0
+        self.machine = 6  # what an H1-2 is said to be; no document of Unitree's names it
         self._held: deque[tuple[float, Array]] = deque()
         self._frozen: tuple[Array, ...] | None = None
 
@@ -119,21 +121,27 @@ class VirtualH12:
                 self._apply(topic, data, now)
 
     def _apply(self, topic: str, data: Array, now: float) -> None:
-        q, kp, kd, mode = (hg.LowCmd.motors(data, n).astype(float) for n in ("q", "kp", "kd", "mode"))
+        names = ("q", "kp", "kd", "mode", "dq", "tau")
+        q, kp, kd, mode, dq, tau = (hg.LowCmd.motors(data, name).astype(float) for name in names)
+        if not all(np.isfinite(values).all() for values in (q, kp, kd, dq, tau)):
+            self.refused += 1
+            return
         weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
         self._note(topic, q, kp, kd, mode, weight, now)
         robot, motors = self.robot, len(MOTOR_NAMES)
         share = np.zeros(motors)
         share[0 if topic == "lowcmd" else ARMS :] = weight
         enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
-        gains, dampers = robot.kp.copy(), robot.kd.copy()
+        gains, dampers, torque = robot.kp.copy(), robot.kd.copy(), np.zeros_like(robot.kp)
+        forward = tau[:motors] + kd[:motors] * dq[:motors]
         for out, mine, theirs in (
             (self.live.ctrl, robot.qpos_home, q[:motors]),
             (gains, robot.kp, np.where(enabled, kp[:motors], 0.0)),
             (dampers, robot.kd, np.where(enabled, kd[:motors], 0.0)),
+            (torque, np.zeros_like(robot.kp), np.where(enabled, forward, 0.0)),
         ):
             out[self._order] = (1 - share) * mine[self._order] + share * theirs
-        self.live.set_gains(gains, dampers)
+        self.live.set_gains(gains, dampers, torque=torque)
 
     def _note(self, topic: str, q: Array, kp: Array, kd: Array, mode: Array, weight: float, now: float) -> None:
         qpos, qvel, *_ = self.live.read()
@@ -156,6 +164,7 @@ class VirtualH12:
         if fault != "repeat":
             ahead = CLOCK_STEP if fault == "clock" else 0.0
             message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
+        self._tell(fault)
         for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
             column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
             column[: len(MOTOR_NAMES)] = values[self._order, None] if name == "temperature" else values[self._order]
@@ -167,12 +176,25 @@ class VirtualH12:
         while self._held and self._held[0][0] <= now:
             self._dds.send(self._writer, self._dds.LowState, self._held.popleft()[1])
 
+    def _tell(self, fault: str) -> None:
+        """What the robot says about itself, honest or not."""
+        message, data = hg.LowState, self._message
+        half = 0.5 if fault == "fall" else 0.0  # half the angle by which it leans forward
+        message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
+        message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0  # L2 + B
+        message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
+        errors = np.zeros(hg.MOTORS)
+        errors[MOTOR_NAMES.index("left_elbow_joint")] = 4 * (fault == "motor")
+        message.set_motors(data, "motorstate", errors)
+
     def _readings(self, fault: str) -> tuple[Array, ...]:
         """qpos, qvel, tau, temperature (n), honest or not."""
         if fault in ("freeze", "repeat") and self._frozen is not None:
             return self._frozen
         qpos, qvel, tau, temperature = (values.copy() for values in self.live.read())
         joint = self.robot.index(["left_elbow_joint"])[0]
+        if fault == "encoder" and self._frozen is not None:
+            qpos[joint] = self._frozen[0][joint]
         if fault == "nan":
             qpos[joint] = np.nan
         if fault == "jump":

@@ -46,15 +46,16 @@ class LiveUnit:
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
         self.ctrl = np.array(robot.qpos_home if start is None else start, float)
         self.unit.reset(self.ctrl[None], [seed])
-        self._told = [robot.kp, robot.kd, robot.effort_limit]
+        self._law = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
         self.steps = 0
 
-    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None) -> None:
-        """(n) N·m/rad, N·m·s/rad, and torque limits N·m (default the robot's), if they differ from those that hold."""
-        told = [np.array(x, float) for x in (kp, kd, self.robot.effort_limit if effort is None else effort)]
-        if not all(np.array_equal(a, b) for a, b in zip(told, self._told, strict=True)):
-            self._told = told
-            self.unit.set_gains(*told)
+    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
+        """N·m/rad, N·m·s/rad, torque limits (default the robot's) and added torque in N·m, if they are not in force."""
+        limit = self.robot.effort_limit if effort is None else effort
+        law = np.array([kp, kd, limit, np.broadcast_to(torque, len(kp))], float)
+        if not np.array_equal(law, self._law):
+            self._law = law
+            self.unit.set_gains(*law)
 
     def step(self) -> None:
         """Let one period pass under the present command and gains."""
