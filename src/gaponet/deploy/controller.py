@@ -340,7 +340,9 @@ class Controller:
             joint = self.driver.commanded[int(np.argmin(out.feasible))]
             if limit_command(ctrl, before, q, v, self.dt, self.limits).feasible.all():
                 age = f"{(now - state.time) * 1e3:.0f} ms"
-                return Fault("stale", f"the newest state is {age} old; no command is safe wherever {joint} can be by now")
+                return Fault(
+                    "stale", f"the newest state is {age} old; no command is safe wherever {joint} can be by now"
+                )
             return Fault("torque", f"{joint}: no command is within range, rate and torque")
         self._ctrl, self._weight = out.ctrl, weight
         try:

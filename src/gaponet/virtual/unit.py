@@ -131,17 +131,14 @@ class VirtualRobot:
         self.events: list[list[Event]] = [[] for _ in seeds]
         self._reported = np.zeros((2, *target.shape), bool)
 
-    def set_gains(
-        self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0
-    ) -> None:
+    def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
         """Gains told to the drives instead of the robot's, (n) or (N, n); they deliver their share of them.
-
-        A torque limit (n) N·m, too, where given.
 
         Zero stiffness damps: only the velocity feedback is left. Set after reset, which settles by those it finds.
 
         Args:
             kp, kd: N·m/rad, N·m·s/rad.
+            effort: Torque limits, (n) N·m; those in force stay where it is not given.
             torque: Added to what they ask for, N·m.
         """
         p, at = self.physics, self.active
