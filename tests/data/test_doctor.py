@@ -1,5 +1,6 @@
 """The doctor finds what is wrong with a recording, says it in words, and finds nothing wrong with a good one."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,12 @@ from logs import arm_sequence, late, wave
 
 from gaponet.data.checks.finding import Finding
 from gaponet.data.doctor import Diagnosis, diagnose, inventory
+from gaponet.data.sequence import Sequence
+from gaponet.data.signals import lowpass
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model
 
 ROWS = 600
 FAST = {"amplitude": 0.4, "hertz": 0.4}  # about 1 rad/s
@@ -81,6 +86,87 @@ def test_velocities_in_degrees_are_a_warning(arm, tmp_path):
     qvel[:, 0] /= 57.3
     finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos, qvel=qvel)), "unit", "warning")
     assert finding.message.startswith("recorded velocity of elbow is 57.3 times the derivative of its position")
+
+
+def test_a_state_of_another_scale_is_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos * [1, 1.3])), "unit", "warning")
+    assert finding.message.startswith("elbow goes 1.30 rad where its command goes 1 rad: another scale")
+
+
+def test_a_command_that_is_the_state_is_an_error(arm, tmp_path):
+    _, qpos = good()
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, qpos))
+    said = [f.message for f in diagnosis.findings if (f.check, f.level) == ("copied", "error")]
+    assert said[1].startswith("command and state of elbow are the same numbers in m: one was logged as both")
+
+
+def test_a_state_that_comes_before_its_command_is_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, ctrl))
+    said = [f.message for f in diagnosis.findings if (f.check, f.level) == ("copied", "error")]
+    assert re.match(r"shoulder moves 6\d ms before its command in 1 of 1 motions: are command and", said[0])
+
+
+def test_one_sample_one_radian_off_is_a_warning(arm, tmp_path):
+    ctrl, qpos = good()
+    qpos[200, 1] += 1.0
+    finding = found(examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos)), "jumps", "warning")
+    assert finding.joints == ("elbow",)
+    assert finding.message.startswith("elbow jumps and comes back faster than any motor in 3 rows of m")
+
+
+@pytest.mark.parametrize("where", ["state", "command", "first rows of the state"])
+def test_rows_of_zeros_are_a_warning(arm, tmp_path, where):
+    ctrl, qpos = (x + 0.1 for x in good())
+    rows = slice(0, 3) if "first" in where else slice(200, 203)
+    (ctrl if where == "command" else qpos)[rows] = 0
+    diagnosis = examine(arm, tmp_path, arm_sequence(arm, ctrl, qpos))
+    said = [f.message for f in diagnosis.findings if (f.check, f.level) == ("jumps", "warning")]
+    assert said[-1].startswith("all joints are exactly 0 for 3 rows of m")
+
+
+def test_steps_from_and_to_zero_are_no_rows_of_zeros(arm, tmp_path):
+    ctrl = np.repeat(((np.arange(ROWS) // 50) % 2 * 0.3)[:, None], 2, axis=1)
+    assert found(examine(arm, tmp_path, arm_sequence(arm, ctrl, late(lowpass(ctrl, 0.02, 2.0), 3))), "jumps", "ok")
+
+
+def hanging(arm, payload: float = 0.0) -> Sequence:
+    """The arm of tests/arm.py moved slowly, with the torques that hold it up and a little friction."""
+    ctrl = wave(ROWS, 2, 0.02, amplitude=0.8, hertz=0.05)
+    qpos = late(ctrl, 3)
+    friction = 0.05 * np.sign(np.gradient(qpos, axis=0))
+    tau = static_torque(build_model(arm, payload), qpos) + friction
+    return arm_sequence(arm, ctrl, qpos, payload=payload, tau=tau)
+
+
+def weigh(arm, tmp_path, *sequences) -> Diagnosis:
+    dataset = Dataset.create(tmp_path / "data", arm)
+    for sequence in sequences:
+        dataset.append(sequence)
+    return diagnose(dataset, arm, model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos))
+
+
+@pytest.mark.parametrize("payload", [0.0, 0.2])
+def test_torques_that_hold_up_the_arm_as_logged_are_fine(arm, tmp_path, payload):
+    diagnosis = weigh(arm, tmp_path, hanging(arm, payload))
+    assert found(diagnosis, "gravity", "ok")
+    assert diagnosis.verdict.startswith("Good")
+
+
+@pytest.mark.parametrize(("joint", "turn"), [(0, 0.6), (1, 0.8), (0, -1.2)])
+def test_a_zero_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_path, joint, turn):
+    s, shift = hanging(arm), turn * np.eye(2)[joint]
+    finding = found(weigh(arm, tmp_path, replace(s, ctrl=s.ctrl + shift, qpos=s.qpos + shift)), "gravity", "warning")
+    assert finding.joints == (arm.joint_names[joint],)
+    assert "fit the weight of the arm better with its zero turned by" in finding.message
+
+
+def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_path):
+    s, sign = hanging(arm), np.array([1, -1])
+    wrong = replace(s, ctrl=s.ctrl * sign, qpos=s.qpos * sign, qvel=s.qvel * sign)
+    finding = found(weigh(arm, tmp_path, wrong), "gravity", "warning")
+    assert "mirrored at" in finding.message
 
 
 def test_commands_beyond_the_joint_range_are_a_warning(arm, tmp_path):
@@ -211,8 +297,9 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
 
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
-    diagnosis = diagnose(real_dataset, so101)
-    assert diagnosis.count("error") == 0
+    model = build_model(so101)
+    diagnosis = diagnose(real_dataset, so101, model=lambda qpos, mass, side: static_torque(model, qpos))
+    assert diagnosis.verdict == "Usable. Read the 4 warning(s) first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:
         assert 0.08 <= lags[joint]["median"] <= 0.16

@@ -92,7 +92,7 @@ def doctor(
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
-        diagnosis = diagnose(data, spec, update)
+        diagnosis = diagnose(data, spec, update, gravity_of(spec))
     out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())

@@ -11,7 +11,9 @@ import numpy as np
 
 from gaponet.data.checks import CHECKS
 from gaponet.data.checks.finding import LEVELS, Finding
+from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
+from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey, survey
 from gaponet.errors import DatasetError
@@ -51,7 +53,10 @@ class Diagnosis:
 
 
 def diagnose(
-    dataset: Dataset, robot: RobotSpec, progress: Callable[[float, float, str], None] | None = None
+    dataset: Dataset,
+    robot: RobotSpec,
+    progress: Callable[[float, float, str], None] | None = None,
+    model: Gravity | None = None,
 ) -> Diagnosis:
     """Survey every sequence, one in memory at a time, and judge them together.
 
@@ -59,6 +64,7 @@ def diagnose(
         dataset: At least one sequence.
         robot: The dataset's robot.
         progress: Called with done, total and the motion.
+        model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
     """
     dataset.require_robot(robot)
     if not dataset.entries:
@@ -69,6 +75,8 @@ def diagnose(
         if progress:
             progress(len(surveys), len(dataset), entry.meta.motion)
     findings = [f for check in CHECKS for f in check(surveys, robot)]
+    if model is not None:
+        findings += gravity(surveys, robot, model)
     findings.sort(key=lambda f: -LEVELS.index(f.level))
     return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 

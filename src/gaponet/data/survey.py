@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from gaponet.data.holds import Holds, find_holds
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import differentiate, estimate_delay, fast_speed
+from gaponet.data.signals import FAST, differentiate, estimate_delay, fast_speed
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
 
@@ -20,7 +21,12 @@ BLOCKED_ERROR = 0.15  # standing this far from a command, rad; a loaded joint ma
 BLOCKED_CHANGE = 0.1  # by this, rad, without moving the joint
 STAND_S, STAND = 0.2, 0.005  # a joint that moves less than this in this time stands: s, rad
 FROZEN_CHANGE = 0.1  # the command must move this far while the state repeats itself, rad
+SLOPE_RANGE = 0.2  # commanded over less, sag and stiction decide the slope, rad
+LOADS, SLOW = 60, 0.5  # rows of a sequence in which torque is compared with gravity; no joint is faster there, rad/s
 TORQUE_NOISE = 0.05  # of the limit; a reading may exceed it by that
+COPIED = 1e-5  # command and state closer than this are one signal, rad
+JUMP, JUMP_ACCELERATION = 0.1, 1000.0  # off the line between its neighbours by this, rad, no joint turns back so fast
+DROPPED = 0.05  # a row of zeros so far from the next row was not measured, rad
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
 
 
@@ -47,11 +53,17 @@ class Survey:
         delay: (n) s, NaN where the motion does not say.
         follows, opposes: (n, n); [i, j] is the greatest correlation of commanded velocity i with measured velocity j,
             and with its negative, at lags up to MAX_LAG_S; 0 where one does not move; periodic motion does both.
+        lead: Time by which the state moves before its command, (n) s, NaN where it does not.
+        slope: How far the state goes where the command goes 1 rad, (n); NaN where the motion does not say.
+        copied: Joints whose state is the command itself, (n).
+        jumps: Rows in which a joint is where it cannot have come from and gone back to, (n).
+        dropped: Rows in which every joint is exactly 0 and was not a row before or after.
         qvel_gain: Recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves.
         blocked_s, blocked_at: Longest stand-still far from a command that moves on, (n) s, and where, rad.
         frozen_s: Longest stretch in which no sample of the state changed while the command moved, s.
         torque: None where no torque was recorded.
         holds: Rests.
+        loads: Joint angles and torques, (k, n) each, in slow rows; None where no torque was recorded.
     """
 
     entry: Entry
@@ -65,12 +77,18 @@ class Survey:
     delay: Array
     follows: Array
     opposes: Array
+    lead: Array
+    slope: Array
+    copied: Array
+    jumps: Array
+    dropped: int
     qvel_gain: Array
     blocked_s: Array
     blocked_at: Array
     frozen_s: float
     torque: Torque | None
     holds: Holds
+    loads: tuple[Array, Array] | None
 
     @property
     def motion(self) -> str:
@@ -93,6 +111,7 @@ def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
     ctrl, qpos, dt, notes = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes
     blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
     follows, opposes = _follows(ctrl, qpos, dt)
+    delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
     return Survey(
         entry=entry,
         samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
@@ -102,15 +121,21 @@ def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
         qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
         speed=fast_speed(ctrl, dt),
-        delay=estimate_delay(ctrl, qpos, dt, MAX_LAG_S),
+        delay=delay,
         follows=follows,
         opposes=opposes,
+        lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+        slope=_slope(ctrl, qpos, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
+        copied=(np.ptp(ctrl, axis=0) > 0.05) & (np.abs(ctrl - qpos) < COPIED).all(axis=0),
+        jumps=_jumps(qpos, dt),
+        dropped=_dropped(sequence, notes, robot),
         qvel_gain=_qvel_gain(sequence),
         blocked_s=blocked_s,
         blocked_at=blocked_at,
         frozen_s=_frozen(sequence),
         torque=_torque(sequence, robot),
         holds=find_holds(sequence, robot.operated_index),
+        loads=_loads(sequence),
     )
 
 
@@ -126,6 +151,47 @@ def _follows(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
         correlation = (a.T @ b) / np.where(scale > 0, scale, np.inf)
         most, least = np.maximum(most, correlation), np.minimum(least, correlation)
     return most, -least
+
+
+def _slope(ctrl: Array, qpos: Array, lag: Array, speed: Array) -> Array:
+    """Of the state over the command of `lag` rows ago; where a fast joint's lag is unknown, nothing is said."""
+    slope = np.full(len(lag), np.nan)
+    for j in np.flatnonzero((np.ptp(ctrl, axis=0) > SLOPE_RANGE) & ((lag > 0) | (speed < FAST))):
+        steps = round(float(lag[j]))
+        u, v = ctrl[: len(ctrl) - steps, j].astype(float), qpos[steps:, j].astype(float)
+        u = u - u.mean()
+        slope[j] = u @ v / (u @ u)
+    return slope
+
+
+def _jumps(qpos: Array, dt: float) -> Array:
+    off = np.abs(qpos[1:-1] - (qpos[:-2] + qpos[2:]) / 2)
+    return (off > max(JUMP, JUMP_ACCELERATION / 2 * dt**2)).sum(axis=0)
+
+
+def _dropped(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> int:
+    """Joints that were not logged, or not in rad, are no zeros; one joint alone may well pass through zero."""
+    strange = {*notes.get("held_at_home", ()), *(j for j, u in notes.get("converted_from", {}).items() if u != "deg")}
+    logged = [i for i, name in enumerate(robot.joint_names) if name not in strange]
+    if len(logged) < 2:
+        return 0
+    count = 0
+    for values, ends in ((sequence.qpos[:, logged], 1), (sequence.ctrl[:, logged], 2)):
+        far = np.abs(np.diff(values, axis=0)).max(axis=1) > DROPPED  # (T − 1,)
+        for run in _runs((values == 0).all(axis=1)):
+            edges = [*far[run.start - 1 : run.start if run.start else 0], *far[run.stop - 1 : run.stop]]
+            # A command may step away from zero; it does not step there and back within a few rows.
+            if sum(edges) >= ends and (ends == 1 or run.stop - run.start <= 5):
+                count += run.stop - run.start
+    return count
+
+
+def _loads(sequence: Sequence) -> tuple[Array, Array] | None:
+    if sequence.tau is None:
+        return None
+    slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW).all(axis=1))
+    rows = slow[:: max(1, len(slow) // LOADS)]
+    return sequence.qpos[rows].astype(float), sequence.tau[rows].astype(float)
 
 
 def _qvel_gain(sequence: Sequence) -> Array:

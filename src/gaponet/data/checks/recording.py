@@ -47,6 +47,28 @@ def regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.longest_gap_ms})
 
 
+def jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Is the state somewhere that no joint can reach and leave in one period?"""
+    found = []
+    for i, name in enumerate(robot.joint_names):
+        hit = [s for s in surveys if s.jumps[i]]
+        if hit:
+            text = (
+                f"{name} jumps and comes back faster than any motor in {sum(int(s.jumps[i]) for s in hit)} rows of "
+                f"{some([s.motion for s in hit])}: a misread sample or a wrap of the encoder; repair or cut these rows"
+            )
+            found.append(Finding("warning", "jumps", text, (name,), {"rows": sum(int(s.jumps[i]) for s in hit)}))
+    dropped = [s for s in surveys if s.dropped]
+    if dropped:
+        rows = sum(s.dropped for s in dropped)
+        text = (
+            f"all joints are exactly 0 for {rows} rows of {some([s.motion for s in dropped])}, and far from it a row "
+            "before or after: nothing was read there; repair or cut these rows"
+        )
+        found.append(Finding("warning", "jumps", text, values={"rows": rows}))
+    yield from found or [Finding("ok", "jumps", "no joint jumps")]
+
+
 def blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop?"""
     found = []

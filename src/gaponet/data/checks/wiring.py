@@ -11,6 +11,7 @@ from gaponet.data.checks.finding import Finding, some
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
+SCALE = (0.5, 1.1)  # a loaded joint falls short of its commands; it does not overshoot them all
 MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
 
 
@@ -60,6 +61,29 @@ def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("ok", "sign", "no joint moves against its command")
 
 
+def copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Are command and state two signals, and does the command come first?"""
+    found = []
+    for i, name in enumerate(robot.joint_names):
+        asked = [s for s in surveys if s.ctrl_range[i] > MOVED]
+        same = [s for s in asked if s.copied[i]]
+        first = [s for s in asked if np.isfinite(s.lead[i])]
+        if same:
+            text = (
+                f"command and state of {name} are the same numbers in {some([s.motion for s in same])}: one was logged "
+                "as both; log the command that the servo was sent"
+            )
+            found.append(Finding("error", "copied", text, (name,)))
+        elif len(first) > 0.5 * len(asked):
+            lead = float(np.median([s.lead[i] for s in first]))
+            text = (
+                f"{name} moves {lead * 1e3:.0f} ms before its command in {len(first)} of {len(asked)} motions: are "
+                "command and state swapped, or their clocks apart?"
+            )
+            found.append(Finding("error", "copied", text, (name,), {"lead_s": lead}))
+    yield from found or [Finding("ok", "copied", "commands come before states")]
+
+
 def unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands, positions and velocities in the same unit, and is it the radian?"""
     wrong = []
@@ -72,6 +96,14 @@ def unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "import again with the right units"
             )
             wrong.append(Finding("error", "unit", text, (name,), {"ratio": ratio}))
+        slopes = [s.slope[i] for s in surveys if np.isfinite(s.slope[i])]
+        slope = float(np.median(slopes)) if slopes else 1.0
+        if not wrong and (slope > SCALE[1] or 0.1 < slope < SCALE[0]):
+            text = (
+                f"{name} goes {slope:.2f} rad where its command goes 1 rad: another scale (a gear, a range, ticks a "
+                "turn), or a motor that does not reach its targets; check both at a right angle"
+            )
+            wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
         gains = [s.qvel_gain[i] for s in surveys if np.isfinite(s.qvel_gain[i])]
         gain = float(np.median(gains)) if gains else 1.0
         if not 0.5 < gain < 2:

@@ -229,9 +229,9 @@ def _tasks(part: Set) -> dict[int, str]:
 
 def _unit(part: Set, given: str | None) -> str:
     """The unit of positions: stated by an export, else by the user."""
-    stated = {(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
-              if f in part.features}  # fmt: skip
-    if part.ours and stated == {"rad"}:
+    stated = [(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
+              if f in part.features]  # fmt: skip
+    if part.ours and stated == ["rad", "rad"]:
         if given not in (None, "rad"):
             raise UsageError(f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out")
         return "rad"
@@ -371,6 +371,6 @@ def _table(file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: 
                 raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
         wanted = [*need, *(name for name in also if there.count(name) == 1)]
         return parquet.read(columns=wanted).select(wanted)
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
         raise LogError(f"{file}: not a readable Parquet file ({reason}); {AGAIN}") from None

@@ -257,7 +257,7 @@ def _parquet_header(file: Path) -> list[str]:
 
     try:
         return pq.read_schema(file).names
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(_unreadable(file, error)) from None
 
 
@@ -268,7 +268,7 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Array]:
 
     try:
         table = pq.ParquetFile(file).read(columns=wanted)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise LogError(_unreadable(file, error)) from None
     data = {}
     for name in wanted:
