@@ -2,8 +2,8 @@
 
 A zero or a sign that is wrong in command and state alike shows in neither. It shows in the torque: an arm holds its own
 weight, and how much depends on where it is. The recorded torque, where it has a sign, and the servo's kp (ctrl − qpos)
-at rest are compared with the gravity of the nominal model, at the angles as logged and with one joint turned or mirrored.
-Not seen is a mirrored joint that weighs the same both ways.
+at rest are compared with the gravity of the nominal model, at the angles as logged and with one joint turned or
+mirrored. Not seen is a mirrored joint that weighs the same both ways.
 """
 
 from __future__ import annotations
@@ -56,17 +56,11 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
     best = max(found, key=lambda b: b.evidence)
     if best.evidence > EVIDENCE and best.otherwise > ENOUGH:
         sign, turn, _ = best.how
-        what = (
-            "its angle mirrored"
-            if sign < 0
-            else f"its zero turned by {turn:+.2f} rad"
-            if turn
-            else "its torque negated"
-        )
+        what = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
         text = (
-            f"the torques fit the weight of the arm better with {what} at {best.joint} ({best.otherwise:.0%} explained) "
-            f"than as logged ({best.as_logged:.0%}): a sign or zero may be wrong in command and state alike; check it "
-            "against the model"
+            f"the torques fit the weight of the arm better with {'its angle mirrored' if sign < 0 else what} at "
+            f"{best.joint} ({best.otherwise:.0%} explained) than as logged ({best.as_logged:.0%}): a sign or zero may be "
+            "wrong in command and state alike; check it against the model"
         )
         yield Finding("warning", "gravity", text, (best.joint,), {"evidence": best.evidence})
     else:
