@@ -131,7 +131,7 @@ def after_calibration(work: Path, word: str, data: Dataset, nominal: RobotSpec) 
         if UNIT not in calibration.load(run, model.weights_hash()):
             gaponet("calibrate", run, work / "default", "--unit", UNIT)
         own = calibration.load(run, model.weights_hash())[UNIT]
-        entries = [e for e in choose(run, data, ())[0] if e.meta.unit_id == UNIT]
+        entries = [e for e in choose([run], data)[0] if e.meta.unit_id == UNIT]
         out.append(mpjae(data.sequences(entries), nominal, own.robot(simulator), model.corrector(simulator)))
     return out
 

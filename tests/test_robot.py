@@ -1,5 +1,7 @@
 """Robots are folders: names, gains and limits come from there, and a broken folder says what is wrong."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from arm import TOML, XML, write_arm
@@ -124,3 +126,42 @@ def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
     save_robot(load_robot(name), tmp_path / "here")
     (tmp_path / "here").rename(tmp_path / "there")
     assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"
+
+
+def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(tmp_path / "arm")
+    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are h1_2, so101; for the folder here write "
+                       r"\./arm"):  # fmt: skip
+        load_robot("arm")
+    for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
+        assert load_robot(way).name == "arm"
+    with pytest.raises(RobotError, match=r"no robot\.toml there"):
+        load_robot("./so101")
+
+
+def test_a_name_that_could_mean_two_robots_is_refused_with_both(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(tmp_path / "so101")
+    with pytest.raises(RobotError, match=r"'so101' is a robot of the package and a folder here; write (.*) or \./so101"
+                       ) as refused:  # fmt: skip
+        load_robot("so101")
+    packaged = str(refused.value).split("write ")[1].split(" or ")[0]
+    assert load_robot(packaged).name == "so101"
+    assert load_robot("./so101").name == "arm"
+    monkeypatch.chdir(Path(packaged).parent)
+    assert load_robot("so101").name == "so101"  # one and the same
+
+
+def test_shapes_for_collision_and_for_looking_are_kept_too(tmp_path):
+    save_robot(load_robot("h1_2"), tmp_path / "h1_2")
+    assert (tmp_path / "h1_2" / "collision.toml").is_file()
+
+
+def test_identified_tables_anywhere_in_the_file_belong_to_the_identified_robot_alone(tmp_path):
+    robot = write_arm(tmp_path / "arm", TOML.replace("[[payload", "[identified.elbow]\nkp = 9.0\n[[payload"))
+    save_robot(robot, tmp_path / "both")
+    save_robot(robot.nominal, tmp_path / "nominal")
+    assert load_robot(tmp_path / "both").kp.tolist() == [20.0, 9.0]
+    assert load_robot(tmp_path / "nominal").kp.tolist() == [20.0, 20.0]
+    assert load_robot(tmp_path / "nominal").payload_mounts == robot.payload_mounts

@@ -27,6 +27,8 @@ from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text, writing
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.robot import RobotSpec
+from gaponet.robot_folder import MOVE_KEPT
+from gaponet.sim.kept import require_kept
 from gaponet.sim.pairing import pair_dataset
 from gaponet.sim.replay import replay
 from gaponet.structure import read_json, validated
@@ -96,6 +98,7 @@ def collect(
     wanted = takes(recipe, library(robot, seed, recipe).names(recipe.variants))
     with writing(Path(out), KIND):
         dataset = Dataset.create(out, robot)
+        require_kept(dataset.path, robot, DatasetError, MOVE_KEPT)
         _claim(dataset, robot, fleet, recipe, seed)
         present = {_key(m.motion, m.unit_id, m.payload_mass, dt, m.repetition) for m, dt in _listed(dataset)}
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]

@@ -45,6 +45,7 @@ class RobotSpec:
     Attributes:
         name: Folder name, e.g. "so101".
         mjcf: Path of the MJCF.
+        folder: Where robot.toml is.
         joint_names: All actuated joints, (n).
         operated: The subset that the operator corrects, in the same order.
         kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
@@ -65,6 +66,7 @@ class RobotSpec:
     name: str
     description: str
     mjcf: Path
+    folder: Path
     joint_names: tuple[str, ...]
     operated: tuple[str, ...]
     kp: Array
@@ -184,37 +186,50 @@ def available() -> list[str]:
 def load_robot(name_or_path: str | Path) -> RobotSpec:
     """Read a robot from the package by name, or from a folder by path.
 
+    A text without a slash is a name and never a folder of that name in the current directory; a Path, or a text with
+    a slash such as "./g1", is a folder.
+
     Raises:
         RobotError: With the folder, the field and what to write there.
     """
     from gaponet.robot_table import RobotTable
     from gaponet.structure import read_toml
 
-    folder = Path(name_or_path)
-    if str(name_or_path) in available():
-        folder = BUILTIN / name_or_path
+    folder = _folder(name_or_path)
     toml = folder / "robot.toml"
     if not toml.is_file():
-        raise RobotError(
-            f"no robot '{name_or_path}': in the package are {', '.join(available())}; "
-            "or give a folder that holds robot.toml and robot.xml"
-        )
+        raise RobotError(f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another")
     table = read_toml(RobotTable, toml, RobotError, "docs/new-robot.md lists the fields")
     mjcf = folder / table.mjcf
     if not mjcf.is_file():
         raise RobotError(f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."')
     try:
-        return _spec(table, mjcf)
+        return _spec(table, mjcf, folder)
     except RobotError as error:
         raise RobotError(f"{toml}: {error}") from None
 
 
-def _spec(table: RobotTable, mjcf: Path) -> RobotSpec:
+def _folder(name_or_path: str | Path) -> Path:
+    """Where a robot is; refuses a name that could mean two."""
+    text, folder = str(name_or_path), Path(name_or_path)
+    if isinstance(name_or_path, Path) or folder.name != text or text == "..":
+        return folder
+    packaged, here = BUILTIN / text, (folder / "robot.toml").is_file()
+    if text not in available():
+        what = f"for the folder here write ./{text}" if here else "or give a folder, with a slash: ./my_robot"
+        raise RobotError(f"no robot '{text}': in the package are {', '.join(available())}; {what}")
+    if here and not packaged.samefile(folder):
+        raise RobotError(f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}")
+    return packaged
+
+
+def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     joints = table.joint
     robot = RobotSpec(
         name=table.name,
         description=table.description or table.name,
         mjcf=mjcf,
+        folder=folder,
         joint_names=tuple(j.name for j in joints),
         operated=tuple(j.name for j in joints if j.operated),
         kp=np.array([j.kp for j in joints]),

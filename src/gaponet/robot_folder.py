@@ -1,48 +1,73 @@
-"""Write a robot's folder again: into a run that must stay readable, or with identified servo parameters."""
+"""The robot folder that a run or a dataset keeps: complete, wherever it lies and whatever lies around it."""
 
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 
-from gaponet.errors import UsageError
-from gaponet.files import whole, write_text, writing
-from gaponet.robot import IDENTIFIED, RobotSpec, load_robot
+from gaponet.errors import RobotError, UsageError
+from gaponet.files import write_text, writing
+from gaponet.robot import BUILTIN, IDENTIFIED, RobotSpec, available, load_robot
 
-MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
+KEPT = "robot"  # folder of a run or a dataset
+MOVE_KEPT = "move that folder away to keep the other robot from now on"
+BESIDE = ("collision.toml", "look.toml")
+IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
+IDENTIFIED_TABLES = re.compile(r"^\[identified\..*?(?=^\[(?!identified\.)|\Z)", re.MULTILINE | re.DOTALL)
+FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
 def save_robot(robot: RobotSpec, folder: Path) -> None:
-    """robot.toml and robot.xml of the nominal robot, and [identified.JOINT] tables where parameters were identified.
+    """Write the nominal robot's folder again, and [identified.JOINT] tables where parameters were identified.
+
+    The copy needs nothing outside it: an MJCF that includes or names files is written anew without them (sim/bare.py).
 
     Args:
         robot: Loaded by load_robot, or made from such a one by with_servos.
-        folder: Written anew; one that gaponet has not made is refused.
+        folder: Where to; one that gaponet has not made is refused.
+
+    Raises:
+        RobotError: A copy in one file would not move as the robot does.
     """
-    with writing(folder, "robot"):
-        _save(robot, folder)
+    from gaponet.bare import bare_mjcf
 
-
-def _save(robot: RobotSpec, folder: Path) -> None:
-    source = robot.mjcf.parent
-    if folder.resolve() == source.resolve():
+    if folder.resolve() == robot.folder.resolve():
         raise UsageError(f"{folder}: is the robot's own folder; choose another")
-    text = (source / "robot.toml").read_text(encoding="utf-8").split(MARK)[0].rstrip() + "\n"
-    xml = robot.mjcf.read_text(encoding="utf-8")
-    # An MJCF that refers to files beside it stays where it is.
-    if re.search(r"<include\b|\bfile=|\b(mesh|texture|asset)dir=", xml):
-        text = re.sub(r"(?m)^mjcf *=.*\n", "", text)
-        text = f"mjcf = '{robot.mjcf.resolve()}'\n" + text
-    else:
-        with whole(folder / robot.mjcf.name) as temporary:
-            shutil.copyfile(robot.mjcf, temporary)
+    text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_MARK)[0]
+    text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
     if robot.nominal is not None:
-        text += f"\n{MARK}\n" + "".join(_table(robot, joint) for joint in robot.operated)
-    write_text(folder / "robot.toml", text)
+        text += f"\n{IDENTIFIED_MARK}\n" + "".join(_table(robot, joint) for joint in robot.operated)
+    xml = robot.mjcf.read_text(encoding="utf-8")
+    xml = bare_mjcf(robot.mjcf) if FILES.search(xml) else xml
+    beside = {name: robot.folder / name for name in BESIDE if (robot.folder / name).is_file()}
+    with writing(folder, "robot"):
+        (folder / "robot.toml").unlink(missing_ok=True)  # without it, nothing is kept: it comes last
+        write_text(folder / "robot.xml", xml)
+        for name, file in beside.items():
+            write_text(folder / name, file.read_text(encoding="utf-8"))
+        write_text(folder / "robot.toml", text)
     load_robot(folder)
+
+
+def kept_robot(holder: Path, name: str) -> RobotSpec:
+    """The robot that a run or a dataset keeps, or in one written before they kept any, the package's of that name.
+
+    Never a folder of that name elsewhere.
+    """
+    if keeps_robot(holder):
+        return load_robot(holder / KEPT)
+    if name in available():
+        return load_robot(BUILTIN / name)
+    raise RobotError(
+        f"{holder}: keeps no robot, and the package has no '{name}'; say which robot it is with --robot ./FOLDER"
+    )
+
+
+def keeps_robot(holder: Path) -> bool:
+    """Whether there is a robot folder in a run or a dataset."""
+    return (holder / KEPT / "robot.toml").is_file()
 
 
 def _table(robot: RobotSpec, joint: str) -> str:

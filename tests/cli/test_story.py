@@ -23,14 +23,14 @@ def place(tmp_path_factory):
     for sequence in recordings(robot, 8, rows=120, kp=0.5, delay=2):
         dataset.append(sequence)
     for kind in ("gaponet", "mlp"):
-        where = [str(folder / "data"), "--out", str(folder / kind), "--robot", str(folder / "arm"), "--model", kind]
+        where = [str(folder / "data"), "--out", str(folder / kind), "--model", kind]
         assert main(["train", *where, *TRAIN]) == 0
     return folder
 
 
 def run(place, capsys, *words):
     capsys.readouterr()
-    code = main([*words, "--robot", str(place / "arm"), "--json"])
+    code = main([*words, "--json"])
     captured = capsys.readouterr()
     assert code == 0, captured.err
     return json.loads(captured.out), captured.err

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
+from gaponet.sim.model import text_hash
 from gaponet.sim.replay import replay
 
 
@@ -78,9 +80,24 @@ def test_another_rate_is_refused(artifact, robot):
         model.require(robot, 0.01)
 
 
+def test_a_card_written_before_simulators_were_hashed_by_what_they_do_is_still_read_by_its_own_rule(artifact, tmp_path):
+    shutil.copytree(artifact[0], tmp_path / "model")
+    robot = write_arm(tmp_path / "arm")
+    card = json.loads((tmp_path / "model" / "card.json").read_text())
+    del card["simulator"]
+    (tmp_path / "model" / "card.json").write_text(json.dumps(card))
+    with pytest.raises(ModelError, match="simulator: is missing"):
+        GapModel.load(tmp_path / "model")
+    (tmp_path / "model" / "card.json").write_text(json.dumps(card | {"simulator_hash": text_hash(robot)}))
+    GapModel.load(tmp_path / "model").require(robot)
+    stiff = write_arm(tmp_path / "stiff", TOML.replace("kp = 20.0", "kp = 21.0"))
+    with pytest.raises(ModelError, match=text_hash(stiff)):
+        GapModel.load(tmp_path / "model").require(stiff)
+
+
 def test_other_gains_are_refused(artifact, tmp_path):
     stiff = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
-    with pytest.raises(ModelError, match="gains or limits changed"):
+    with pytest.raises(ModelError, match="gains or limits differ"):
         GapModel.load(artifact[0]).require(stiff)
 
 

@@ -4,10 +4,13 @@ import mujoco
 import numpy as np
 import pytest
 from arm import TOML, XML, write_arm
+from files_arm import COMMON, write_files_arm
+from files_arm import XML as FILES_XML
 
 from gaponet.errors import RobotError, UsageError
+from gaponet.identity import lines
 from gaponet.robot import load_robot
-from gaponet.sim.model import build_model, model_hash, qpos_range
+from gaponet.sim.model import build_model, model_hash, qpos_range, text_hash
 
 
 def hold(model: mujoco.MjModel, ctrl: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
@@ -133,6 +136,73 @@ def test_actuators_of_the_mjcf_are_replaced(tmp_path):
 
 def test_ranges_come_from_the_mjcf(arm):
     assert qpos_range(build_model(arm)).tolist() == [[-1.5, 1.5], [-1.5, 1.5]]
+
+
+def vendor_hash(folder, **change):
+    return model_hash(write_files_arm(folder, **change))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"common": COMMON.replace('damping="0.51', 'damping="5.1')},  # in an included file
+        {"common": COMMON.replace("0.02", "0.020001")},
+        {"toml": TOML.replace("pos = [0.2, 0.0, 0.0]", "pos = [2.9, 0.0, 0.0]")},  # of the mount
+        {"toml": TOML.replace('body = "fore"', 'body = "tool"')},
+        {"toml": TOML.replace("kp = 20.0", "kp = 20.001", 1)},
+        {"toml": TOML.replace("effort_limit = 5.0", "effort_limit = 5.5", 1)},
+        {"toml": TOML.replace("timestep = 0.005", "timestep = 0.004")},
+        {"scale": 1.01},  # of the mesh that gives the inertia
+        {"xml": FILES_XML.replace('density="1500"', 'density="1510"')},
+        {"xml": FILES_XML.replace("-9.80665", "-9.81")},
+        {"xml": FILES_XML.replace("implicitfast", "Euler")},
+        {"xml": FILES_XML.replace('springref="4"', 'springref="5"')},
+        {"xml": FILES_XML.replace('range="-80 80"', 'range="-80 70"')},
+        {"xml": FILES_XML.replace('<body name="fore" pos="0.2 0 0">', '<body name="fore" pos="0.20001 0 0">')},
+        {"contacts": True},
+    ],
+)  # fmt: skip
+def test_whatever_changes_the_motion_changes_the_hash(tmp_path, change):
+    assert vendor_hash(tmp_path / "changed", **change) != vendor_hash(tmp_path / "arm")
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        FILES_XML.replace("<light", "<!-- a word --><light"),
+        FILES_XML.replace('<geom class="look"/>', '<geom class="look" pos="1 2 3"/><site name="s"/>'),
+        FILES_XML.replace('<geom class="look"/>', '<body name="cover"><geom class="look"/></body>'),
+        FILES_XML.replace('rgba="0.5', 'rgba="0.1'),
+        FILES_XML.replace('<light pos="0 0 1"/>', '<camera name="c"/>'),
+        FILES_XML.replace("<sensor>", "<sensor><jointvel joint='elbow'/>"),
+        FILES_XML.replace('pos="0 0 0.21234567" euler="0 20 30"', 'euler="0 20 30" pos="0 0 0.21234567"'),
+        FILES_XML.replace('quat="1 0.1 0.2 0.3"', 'quat="-2 -0.2 -0.4 -0.6"'),
+        FILES_XML.replace('name="tool"', 'name="gripper"'),
+    ],
+)
+def test_what_is_only_looked_at_or_said_leaves_the_hash_as_it_is(tmp_path, xml):
+    assert xml != FILES_XML
+    assert vendor_hash(tmp_path / "arm", xml=xml) == vendor_hash(tmp_path / "elsewhere" / "with a space")
+
+
+def test_geoms_that_touch_count_where_contacts_are_on_and_only_there(tmp_path):
+    wider = FILES_XML.replace('size="0.02" mass', 'size="0.021" mass')
+    for contacts in (False, True):
+        same = [build_model(write_files_arm(tmp_path / f"{contacts}{i}", contacts=contacts, xml=x)) for i, x in
+                enumerate((FILES_XML, wider))]  # fmt: skip
+        for model in same:  # the capsule's mass is given; its inertia follows from its size
+            model.body_inertia[:] = same[0].body_inertia
+            model.body_ipos[:] = same[0].body_ipos
+            model.body_iquat[:] = same[0].body_iquat
+        first, second = (list(lines(model)) for model in same)
+        assert (first == second) is not contacts
+
+
+def test_a_card_of_before_is_checked_by_the_rule_of_before(tmp_path):
+    robot = write_arm(tmp_path / "a")
+    assert text_hash(robot) == text_hash(write_arm(tmp_path / "c"))
+    assert text_hash(robot) != text_hash(write_arm(tmp_path / "d", xml=XML.replace("<body", "<!-- --><body", 1)))
+    assert text_hash(load_robot("h1_2")) == "a127234c3d89"  # of docs/results, before November 22
 
 
 def test_another_gain_is_another_simulator(tmp_path):

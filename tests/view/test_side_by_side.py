@@ -1,10 +1,9 @@
 """What is shown is what was asked, simulated and recorded."""
 
-import json
-
 import numpy as np
 import pytest
 from arm import recordings
+from runs import untrained
 
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
@@ -60,12 +59,11 @@ def test_a_motion_that_is_not_there_is_named_with_those_that_are(dataset, arm):
         pick(dataset, (), "motion1", payload_mass=1.0)
 
 
-def test_a_recording_that_the_run_has_not_seen_comes_first(dataset, tmp_path):
-    run = tmp_path / "run"
-    run.mkdir()
-    hashes = [e.hash for e in dataset.entries]
-    split = {"train": {"0": hashes[0], "1": hashes[1]}, "val": {"3": hashes[3]}, "test": {"2": hashes[2]}}
-    (run / "split.json").write_text(json.dumps(split))
+def test_a_recording_that_no_run_has_seen_comes_first(dataset, arm, tmp_path):
+    run = untrained(tmp_path / "run", arm, dataset, train=("motion0", "motion1"), val=("motion3",), test=("motion2",))
+    first = untrained(tmp_path / "first", arm, dataset, train=("motion1",), val=("motion3",), test=("motion0",))
+    assert pick(dataset, (first,)).meta.motion == "motion0"
+    assert pick(dataset, (first, run)).meta.motion == "motion2"
     assert pick(dataset, (run,)).meta.motion == "motion2"
     assert pick(dataset, (run,), payload_mass=0.2).meta.motion == "motion1"  # seen, but the only ones with 0.2 kg
     assert pick(dataset, ()).meta.motion == "motion0"

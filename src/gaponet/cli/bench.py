@@ -10,6 +10,7 @@ import tyro
 
 from gaponet.cli.out import Out
 from gaponet.robot import load_robot
+from gaponet.robot_folder import kept_robot
 
 CALLS = 3000  # of each runtime, with latency
 
@@ -86,8 +87,7 @@ def _aligned(run: Path, out: Out, num_envs: int, rounds: int) -> None:
     from gaponet.model.artifact import GapModel
 
     model = GapModel.load(run, threads=0)
-    kept = run / "robot"
-    robot = load_robot(kept if (kept / "robot.toml").is_file() else model.card["robot"])
+    robot = kept_robot(run, model.card["robot"])
     speed = bench_aligned(robot, model, num_envs, rounds=rounds)
     ratio = speed["aligned"] / speed["nominal"]
     out.table(f"{robot.name}, {num_envs} simulations", ["", "control steps/s", "of nominal"], [

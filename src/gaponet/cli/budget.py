@@ -28,7 +28,7 @@ def budget(
         run: Run folder of gaponet train; one trained with --robot of an identified simulator has that step too.
         dataset: The dataset trained on (its test motions are used) or another.
         motions: Only these, separated by commas.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.eval.budget import gap_budget
@@ -37,7 +37,7 @@ def budget(
     from gaponet.plot.style import save
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot, run)
     with bar("budget") as update:
         found = gap_budget(run, data, spec, names(motions), lambda step, done, total: update(done, total, step))
     with writing(run, "run"):

@@ -39,7 +39,7 @@ def calibrate(
             stay unseen, or all, where the unit played none of them.
         seconds: How much of the recordings to use, in windows of 8 s.
         payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
@@ -50,10 +50,10 @@ def calibrate(
     from gaponet.model.artifact import GapModel
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot, run)
     data.require_robot(spec)
     model = GapModel.load(run)
-    simulator = corrected_robot(run, spec.nominal or spec)
+    simulator = corrected_robot(run, spec)
     units = sorted({e.meta.unit_id for e in data.entries})
     if unit not in units and (unit or len(units) != 1):
         raise UsageError(f"--unit {unit or '(none)'}: {dataset} holds units {', '.join(units)}; name one")

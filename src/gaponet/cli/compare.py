@@ -47,7 +47,7 @@ def compare(
             identified+KIND trains in the identified simulator (with --identify).
         seeds: How many, counted from --seed.
         budget: Of each run: time such as 90s, 10m or 2h, or control steps such as 2000000.
-        robot: Robot name or folder, if not the package's robot of the dataset; all models correct it.
+        robot: Robot name or folder, if not the one that the dataset keeps; all models correct it.
         identify: Identify the simulator first and show it beside; kept in OUT/identified.
         holdout_units: Units never trained on; shown as a group of their own.
         workers: Runs at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores.

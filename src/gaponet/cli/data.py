@@ -13,8 +13,9 @@ from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out
 from gaponet.cli.progress import bar
 from gaponet.data.signals import FAST
-from gaponet.errors import UsageError
+from gaponet.errors import DatasetError, UsageError
 from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import MOVE_KEPT
 
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
@@ -65,9 +66,13 @@ def import_logs(
         json: One JSON object on stdout.
     """
     from gaponet.data.importer import import_logs as run
+    from gaponet.data.store import Dataset
+    from gaponet.sim.kept import require_kept
     from gaponet.sim.model import model_hash
 
     spec = load_robot(robot)
+    if Dataset.peek(out, spec):
+        require_kept(out, spec, DatasetError, MOVE_KEPT)
     with bar("importing") as update:
         report = run(
             src, spec, unit_id, payload_mass, out, payload_side, level, format,
@@ -84,7 +89,7 @@ def doctor(
 
     Args:
         dataset: Dataset folder.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.data.doctor import diagnose, inventory

@@ -89,7 +89,7 @@ def figures(
     Args:
         dataset: Dataset folder.
         out: Folder for the pictures, each as SVG and PNG.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.eval.draw_dataset import draw_all

@@ -206,7 +206,7 @@ def _recorded(data: Dataset, robot: RobotSpec, trained: list[Trained], began: fl
     from gaponet.study.played.tracking_result import result
     from gaponet.study.result import facts, label
 
-    entries, unseen = choose(trained[0].run, data, ())
+    entries, unseen = choose([t.run for t in trained], data)
     sequences = data.sequences(entries)
     with bar("alignment") as update:
         scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, _by_method(update))

@@ -58,11 +58,10 @@ def export(
 def _inverse(screen: Out, run: Path, model: GapModel) -> None:
     from gaponet.deploy.compensator import INVERSE
     from gaponet.motion.library import Library
-    from gaponet.robot import load_robot
+    from gaponet.robot_folder import kept_robot
     from gaponet.train.learned_inverse import learn_inverse
 
-    kept = run / "robot"
-    robot = load_robot(kept if (kept / "robot.toml").is_file() else model.card["robot"])
+    robot = kept_robot(run, model.card["robot"])
     library = Library(robot, INVERSE_SEED, model.config.payload_max)
     motions = [library.make(name).sample(robot.dt) for name in library.names()[::2]]
     facts = learn_inverse(robot, model, motions)

@@ -20,7 +20,7 @@ def pair(
 
     Args:
         dataset: Dataset folder.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.sim.model import model_hash
@@ -44,7 +44,7 @@ def gap(
 
     Args:
         dataset: Dataset folder; sequences without a twin are replayed first.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         motions: Only these, separated by commas.
         json: One JSON object on stdout.
     """

@@ -42,7 +42,7 @@ def identify(
         dataset: Dataset folder.
         out: Robot folder to write.
         windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
-        robot: Robot name or folder to start from, if not the package's robot of the dataset.
+        robot: Robot name or folder to start from, if not the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in gaponet train.
         mixed_gains: Take recordings made with different kp or kd together.

@@ -48,7 +48,7 @@ def train(
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         resume: Go on with the run in out.
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         holdout_units: Units never trained on; their test motions stay in the test part.
         config: Everything else.
@@ -113,14 +113,14 @@ def evaluate(
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these, separated by commas.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.eval.evaluate import evaluate as run_evaluation
     from gaponet.eval.evaluate import save
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot, run)
     with bar("evaluating") as update:
         evaluation = run_evaluation(
             [run, *also], data, spec, names(motions),
@@ -128,7 +128,7 @@ def evaluate(
         )  # fmt: skip
     save(evaluation, run)
     if not evaluation.result["unseen"]:
-        out.say("", "some of these sequences were used in training: the numbers are not held-out ones", "yellow")
+        out.say("", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow")
     show_methods(out, evaluation.result, spec)
     out.result(evaluation.result)
 
@@ -146,7 +146,7 @@ def report(
         run: Run folder of gaponet train.
         dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.
         also: Further runs to compare, e.g. the MLP's.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.eval.report import write_report

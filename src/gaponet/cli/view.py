@@ -66,7 +66,7 @@ def view(
         course: Draw the error against time below a picture.
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
-        robot: Robot name or folder, if not the package's robot of the dataset.
+        robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     from gaponet.errors import UsageError

@@ -1,6 +1,7 @@
 """The dataset folder: Parquet files, one per sequence, and a journal that lists them.
 
     dataset.json            format version, robot, joint names, units; licence and source where they were said
+    robot/                  the nominal robot: robot.toml and an MJCF that needs nothing else (robot_folder)
     sequences.jsonl         one line per sequence: metadata, hash, delays; appended, never rewritten in place
     offsets.json            static offsets of each unit as fitted at import (data.offsets); recorded, never applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
@@ -34,6 +35,7 @@ from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
 from gaponet.files import require_ours, sync, whole, write_text, writing
 from gaponet.robot import RobotSpec
+from gaponet.robot_folder import KEPT, keeps_robot, save_robot
 from gaponet.structure import Json, Name, parse_json, read_format
 
 FORMAT = 1
@@ -98,15 +100,20 @@ class Dataset:
 
     @classmethod
     def create(cls, path: str | Path, robot: RobotSpec) -> Dataset:
-        """Open the dataset at path, making an empty one where there is none; refuses another robot's."""
+        """Open the dataset at path, making an empty one where there is none; refuses another robot's.
+
+        The nominal robot is kept in it, if none is yet.
+        """
         dataset = cls.peek(path, robot)
-        if dataset is not None:
+        if dataset is not None and keeps_robot(dataset.path):
             return dataset
         path = Path(path)
         with writing(path, KIND):
             if not (path / "dataset.json").is_file():
                 header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
                 write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
+            if not keeps_robot(path):
+                save_robot(robot.nominal or robot, path / KEPT)
         return cls.create(path, robot)
 
     @classmethod

@@ -19,6 +19,7 @@ from gaponet.gap import metrics, runs
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
+from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
@@ -39,7 +40,7 @@ def gap_budget(
     Args:
         run: Run folder; its split, baseline, simulator and model apply.
         dataset: The one trained on, or another.
-        robot: The nominal simulator.
+        robot: The dataset's, which must be the one that the run keeps: the baseline is the run's.
         motions: Only these.
         progress: Called with step, control steps done, total.
 
@@ -48,11 +49,11 @@ def gap_budget(
         "floor": {"encoder": rad, "repeatability": rad or None, "both": rad}, …}
     """
     dataset.require_robot(robot)
-    nominal = robot.nominal or robot
+    simulator = corrected_robot(run, robot)
+    nominal = nominal_of(simulator)
     model = GapModel.load(run)
-    entries, unseen = choose(run, dataset, motions)
+    entries, unseen = choose([run], dataset, motions)
     sequences = dataset.sequences(entries)
-    simulator = corrected_robot(run, nominal)
     steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
     fitted = DelayOffset.read(run)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))

@@ -23,7 +23,8 @@ from gaponet.gap import Run, runs, summary
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot import RobotSpec
+from gaponet.sim.kept import nominal_of, require_kept
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 from gaponet.structure import read_json
@@ -61,24 +62,25 @@ def evaluate(
     """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
 
     Args:
-        runs_dirs: Training runs; the first one's split and delay + offset baseline apply.
+        runs_dirs: Training runs; nothing that one of them was trained or chosen on is chosen or called unseen. The
+            first one's test motions and delay + offset baseline apply.
         dataset: The one trained on, or another.
-        robot: The nominal simulator.
+        robot: The dataset's, which must be the one that the runs keep: the baseline is theirs.
         motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
             trained on.
         progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)
-    nominal = robot.nominal or robot
     models: dict[str, GapModel] = {}
     for path in runs_dirs:
         model = GapModel.load(path)
         if model.config.kind in models:
             raise UsageError(f"{path}: a second {model.config.kind} model; give runs of different kinds")
         models[model.config.kind] = model
-    entries, unseen = choose(runs_dirs[0], dataset, motions)
+    robots = {kind: corrected_robot(path, robot) for kind, path in zip(models, runs_dirs, strict=True)}
+    nominal = nominal_of(next(iter(robots.values())))
+    entries, unseen = choose(runs_dirs, dataset, motions)
     sequences = dataset.sequences(entries)
-    robots = {kind: corrected_robot(path, nominal) for kind, path in zip(models, runs_dirs, strict=True)}
     for (kind, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
         model.require(robots[kind], dt)
     done_runs: dict[str, list[Run]] = {}
@@ -111,21 +113,49 @@ def evaluate(
     return Evaluation(result, done_runs, deltas)
 
 
-def choose(run: Path, dataset: Dataset, motions: tuple[str, ...]) -> tuple[list[Entry], bool]:
-    """Entries to evaluate and whether none of them was used in training or for choosing."""
-    split = read_split(run)
-    known = {h for part in ("train", "val") for h in split[part].values()}
-    known |= {h for c in calibration.load(run, GapModel.load(run).weights_hash()).values() for h in c.logs}
+def choose(runs_dirs: ListOf[Path], dataset: Dataset, motions: tuple[str, ...] = ()) -> tuple[list[Entry], bool]:
+    """Entries to evaluate, and whether none of them was seen by any of the runs.
+
+    By default the first run's test part, or else everything, each without what any run has seen; where all motions
+    were seen, recordings that were not.
+    """
+    seen = [Seen.by(run) for run in runs_dirs]
+    fresh = [e for e in dataset.entries if not any(e in s for s in seen)]
     if motions:
         entries = dataset.select(motions)
     else:
-        test = set(split["test"].values())
-        entries = [e for e in dataset.entries if e.hash in test] or [e for e in dataset.entries if e.hash not in known]
+        entries = [e for e in fresh if e.hash in seen[0].test] or fresh
+        entries = entries or [e for e in dataset.entries if not any(e.hash in s.hashes for s in seen)]
     if not entries:
         raise DatasetError(
-            f"{dataset.path}: every sequence was used in training; give logs the run never saw, or --motions"
+            f"{dataset.path}: every sequence was used in training; give logs the runs never saw, or --motions"
         )
-    return entries, not any(e.hash in known for e in entries)
+    return entries, {e.hash for e in entries} <= {e.hash for e in fresh}
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a run was trained, chosen or calibrated on: recordings, and their motions, whoever played them.
+
+    Its own test part is unseen, whatever it was held out by: a split by unit or payload tests motions trained on.
+    """
+
+    hashes: frozenset[str]
+    motions: frozenset[str]
+    test: frozenset[str]
+
+    @classmethod
+    def by(cls, run: Path) -> Seen:
+        """By this run."""
+        model, split = GapModel.load(run), read_split(run)
+        used = ("train", "val")
+        hashes = {h for part in used for h in split[part].values()}
+        hashes |= {h for c in calibration.load(run, model.weights_hash()).values() for h in c.logs}
+        motions = {m for part in used for m in model.card.get("motions", {}).get(part, ())}
+        return cls(frozenset(hashes), frozenset(motions), frozenset(split["test"].values()) - hashes)
+
+    def __contains__(self, entry: Entry) -> bool:
+        return entry.hash in self.hashes or (entry.hash not in self.test and entry.meta.motion in self.motions)
 
 
 def read_split(run: Path) -> dict[str, dict[str, str]]:
@@ -159,10 +189,17 @@ def save(evaluation: Evaluation, run: Path) -> None:
         write_json(run / "metrics.json", result)
 
 
-def corrected_robot(run: Path, nominal: RobotSpec) -> RobotSpec:
-    """The simulator that a run's model corrects: the nominal one, or the identified one kept in the run."""
-    kept = load_robot(run / "robot") if (run / "robot" / "robot.toml").is_file() else nominal
-    return nominal if model_hash(kept) == model_hash(nominal) else kept
+def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
+    """The simulator that a run's model corrects, as the run keeps it: the nominal one, or an identified one.
+
+    Args:
+        run: Run folder.
+        robot: Of the data, or asked for.
+
+    Raises:
+        ModelError: They differ before identification: errors would be told against another baseline.
+    """
+    return require_kept(run, robot, ModelError, "data of the robot that the run was trained for")
 
 
 def _methods(

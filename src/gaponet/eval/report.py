@@ -16,6 +16,8 @@ from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics,
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import keeps_robot, kept_robot
+from gaponet.sim.kept import require_kept
 
 Array = np.ndarray
 Tell = Callable[[str, float, float], None]
@@ -34,13 +36,14 @@ def write_report(
         run: Run folder.
         dataset: Evaluate on this dataset first; default the newest evaluation, or the test motions of the training set.
         also: Further runs to compare (only when evaluating).
-        robot: Robot name or folder, if not the package's.
+        robot: Robot name or folder, if not the one that the run keeps.
         progress: Called with what is being done.
     """
     model = GapModel.load(run)
-    spec = load_robot(robot or model.card["robot"])
+    asked = None if robot is None else require_kept(run, load_robot(robot), ModelError, "leave --robot out")
+    spec = asked or kept_robot(run, model.card["robot"])
     if dataset is not None or also or not (run / "trajectories.npz").is_file():
-        _evaluate(run, dataset, also, spec, progress)
+        _evaluate(run, dataset, also, asked, progress)
     metrics = read_metrics(run)
     arrays = read_trajectories(run, metrics, len(spec.operated))
     config, curve, budget = read_config(run), read_progress(run), read_budget(run)
@@ -53,7 +56,7 @@ def write_report(
     return path
 
 
-def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec, progress: Tell) -> None:
+def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec | None, progress: Tell) -> None:
     from gaponet.eval.evaluate import evaluate, save
 
     place = dataset or run / read_config(run)["dataset"]
@@ -61,6 +64,7 @@ def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: Ro
         data = Dataset(place)
     except DatasetError as error:
         raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
+    robot = robot or kept_robot(place if keeps_robot(place) else run, data.robot_name)
     save(evaluate([run, *also], data, robot, progress=progress), run)
 
 

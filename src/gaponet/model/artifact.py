@@ -50,7 +50,7 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         "qpos_range": [
             [float(x) if np.isfinite(x) else None for x in robot.qpos_range[i]] for i in robot.operated_index
         ],
-        "simulator_hash": model_hash(robot),
+        "simulator": model_hash(robot),
         "model": asdict(config),
         "simulator_only": config.asks_simulator,  # a bound to compare with, not for a robot
     } | facts
@@ -90,7 +90,9 @@ class Card(TypedDict):
     joint_names: Annotated[tuple[Name, ...], Len(1, 500)]
     kp: tuple[float, ...]
     kd: tuple[float, ...]
-    simulator_hash: str
+    simulator: NotRequired[str]
+    simulator_hash: NotRequired[str]
+    """Of the MJCF's text, in cards written before November 2026."""
     model: dict[str, Json]
     qpos_range: NotRequired[tuple[tuple[float | None, float | None], ...]]
     dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
@@ -123,6 +125,8 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     read_format(Card, file, FORMAT, ModelError, mend)
     card = read_json(dict[str, Any], file, ModelError, mend)
     config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
+    if "simulator" not in card and "simulator_hash" not in card:
+        raise ModelError(f"{file}: simulator: is missing; {mend}")
     n = len(card["joint_names"])
     for name in ("kp", "kd", "qpos_range"):
         if len(card.get(name, card["kp"])) != n:
@@ -206,7 +210,7 @@ class GapModel:
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""
-        from gaponet.sim.model import model_hash
+        from gaponet.sim.model import model_hash, text_hash
 
         card = self.card
         if card["robot"] != robot.name or tuple(card["joint_names"]) != robot.operated:
@@ -214,10 +218,12 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        if card["simulator_hash"] != model_hash(robot):
+        old = "simulator" not in card
+        trained, asked = (card["simulator_hash"], text_hash(robot)) if old else (card["simulator"], model_hash(robot))
+        if trained != asked:
             raise ModelError(
-                f"{self.path}: trained in simulator {card['simulator_hash']}, but robot '{robot.name}' is now "
-                f"{model_hash(robot)} (MJCF, gains or limits changed); train again or use the old robot folder"
+                f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
+                "(MJCF, gains or limits differ); use the robot folder that the run keeps, or train again"
             )
         if dt is not None:
             self.require_rate(dt)

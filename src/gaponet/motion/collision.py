@@ -110,7 +110,7 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
 
 
 def _read(robot: RobotSpec, model: mujoco.MjModel) -> tuple[list[Capsule], list[list[str]]]:
-    path = robot.mjcf.parent / "collision.toml"
+    path = robot.folder / "collision.toml"
     if not path.is_file():
         return [], []
     table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from gaponet.errors import RobotError, UsageError
+from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
 from gaponet.robot import IDENTIFIED, RobotSpec
 
@@ -114,11 +115,21 @@ def qpos_range(model: mujoco.MjModel) -> np.ndarray:
 
 
 def model_hash(robot: RobotSpec) -> str:
-    """What the nominal simulator is, in 12 hex digits: MJCF text, gains, limits, substeps, friction parameters.
+    """What the nominal simulator is, in 12 hex digits: everything in its compiled model that decides how it moves.
 
-    Two runs with the same hash stepped the same physics; reports print it beside every score, since two public MJCFs of
-    one robot can differ by a factor of 50 in gain.
+    Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written
+    (gaponet.identity); reports print it beside every score, since two public MJCFs of one robot can differ by a factor
+    of 50 in gain.
     """
+    if "_model_hash" not in vars(robot):
+        text = [f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g}", *lines(build_model(robot))]
+        digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
+        object.__setattr__(robot, "_model_hash", digest)
+    return str(vars(robot)["_model_hash"])
+
+
+def text_hash(robot: RobotSpec) -> str:
+    """What model_hash was until November 2026, for cards written before: the MJCF's text, gains and limits."""
     digest = hashlib.sha256()
     digest.update(robot.mjcf.read_bytes())
     for part in (robot.kp, robot.kd, robot.effort_limit):

@@ -45,7 +45,7 @@ def evaluate_model(run: Path, dataset: Dataset, robot: RobotSpec, holdout: tuple
         nthread: Threads of the simulator, 0 for all cores.
     """
     model = GapModel.load(run)
-    sequences = dataset.sequences(choose(run, dataset, ())[0])
+    sequences = dataset.sequences(choose([run], dataset)[0])
     for dt in sorted({s.dt for s in sequences}):
         model.require(robot, dt)
     return _grouped(sequences, robot, model.corrector(robot), holdout, nthread)
@@ -56,7 +56,7 @@ def evaluate_baselines(
 ) -> Result:
     """The same of the nominal simulator, of delay + offset as kept in a run, and of the identified simulator."""
     fitted = DelayOffset.read(run)
-    sequences = dataset.sequences(choose(run, dataset, ())[0])
+    sequences = dataset.sequences(choose([run], dataset)[0])
     out = {
         "nominal": _grouped(sequences, nominal, None, holdout),
         "delay_offset": _grouped(sequences, nominal, fitted.corrector(nominal), holdout),
@@ -92,7 +92,7 @@ def comparison(
         cells: Method → what each of its seeds gave, with kind, changes and start.
         facts: What else is to be said: budget, units held out.
     """
-    entries, unseen = choose(run, dataset, ())
+    entries, unseen = choose([run], dataset)
     methods: Result = {
         name: {"title": NAMES[name], "kind": name, "changes": [], "parameters": None, "seconds": None, "runs": [found]}
         for name, found in baselines.items()

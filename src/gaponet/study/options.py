@@ -34,7 +34,7 @@ class Options:
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """A rehearsal in minutes: a slice of the dataset, a budget that teaches nothing, numbers that mean nothing."""
     robot: str | None = None
-    """Robot name or folder, if not the package's robot of the dataset; all models correct it."""
+    """Robot name or folder, if not the one that the dataset keeps; all models correct it."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
     """One JSON object on stdout."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TRAINING

@@ -38,7 +38,8 @@ from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
 from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
-from gaponet.robot_folder import save_robot
+from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
+from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.structure import validated
 from gaponet.train.budget import Budget
@@ -124,6 +125,8 @@ class Trainer:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
             raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
+        if resume and keeps_robot(out) and model_hash(kept_robot(out, robot.name)) != model_hash(robot):
+            raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / KEPT}")
         self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
         self.budget, self.show = budget, show
         self.parts = _parts(dataset, config, holdout_units)
@@ -357,8 +360,9 @@ class Trainer:
             "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
-        if not resume:
-            save_robot(self.robot, self.out / "robot")
+        kept = self.out / KEPT
+        if self.robot.folder.resolve() != kept.resolve() and not (resume and keeps_robot(self.out)):
+            save_robot(self.robot, kept)
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
         self._write_progress()

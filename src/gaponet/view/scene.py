@@ -210,7 +210,7 @@ def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
 def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) -> None:
     """Capsules and boxes of look.toml, or else the capsules of collision.toml, which are generous."""
     for name, share in (("look.toml", 1.0), ("collision.toml", 0.85)):
-        path = robot.mjcf.parent / name
+        path = robot.folder / name
         if path.is_file():
             table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
             for part in (*(c["body"] for c in table.capsule), *(b.body for b in table.box)):

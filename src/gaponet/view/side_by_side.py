@@ -13,10 +13,11 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
-from gaponet.eval.evaluate import corrected_robot, read_split
+from gaponet.eval.evaluate import Seen, corrected_robot
 from gaponet.model.artifact import GapModel
 from gaponet.plot.methods import COLOURS, NAMES
 from gaponet.robot import RobotSpec
+from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
@@ -100,10 +101,10 @@ class SideBySide:
 def pick(
     dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
 ) -> Entry:
-    """The first sequence that fits; among those the first run has not seen, where one of them fits."""
+    """The first sequence that fits; among those that no run has seen, where one of them fits."""
     entries = dataset.select((motion,) if motion else ())
-    known = {h for part in ("train", "val") for h in read_split(runs[0])[part].values()} if runs else set()
-    entries = sorted(entries, key=lambda e: e.hash in known)
+    seen = [Seen.by(run) for run in runs]
+    entries = sorted(entries, key=lambda e: any(e in s for s in seen))
     asked = [
         e for e in entries
         if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
@@ -134,17 +135,14 @@ def side_by_side(
         progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)
-    real, nominal = dataset.read(entry), robot.nominal or robot
-    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (nominal, None)}
-    seen = False
+    real = dataset.read(entry)
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (nominal_of(robot), None)}
     for run in runs:
-        model, simulator = GapModel.load(run), corrected_robot(run, nominal)
+        model, simulator = GapModel.load(run), corrected_robot(run, robot)
         model.require(simulator, real.dt)
         if model.config.kind in simulators:
             raise UsageError(f"{run}: a second {model.config.kind} model; give runs of different kinds")
         simulators[model.config.kind] = (simulator, model.corrector(simulator))
-        split = read_split(run)
-        seen |= any(entry.hash in split[part].values() for part in ("train", "val"))
     target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
     shown = {"target": target}
     for method, (simulator, corrector) in simulators.items():
@@ -153,4 +151,4 @@ def side_by_side(
     shown["recorded"] = real.qpos
     op = robot.operated_index
     motions = tuple(Motion(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
-    return SideBySide(real, robot, motions, seen if runs else None)
+    return SideBySide(real, robot, motions, any(entry in Seen.by(run) for run in runs) if runs else None)

@@ -1,0 +1,42 @@
+"""Whether a robot is the one that a run or a dataset keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gaponet.errors import GAPONetError
+from gaponet.robot import RobotSpec
+from gaponet.robot_folder import KEPT, keeps_robot, kept_robot
+from gaponet.sim.model import model_hash
+
+
+def nominal_of(robot: RobotSpec) -> RobotSpec:
+    """Before identification."""
+    return robot.nominal or robot
+
+
+def require_kept(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str) -> RobotSpec:
+    """Refuse a robot whose nominal simulator is not that of the robot kept, whatever their names.
+
+    Args:
+        holder: Run or dataset; one written before they kept a robot takes the given one.
+        robot: Asked for, or of other data.
+        error: What is raised.
+        hint: What to do about it.
+
+    Returns:
+        The robot kept: nominal, or identified.
+
+    Raises:
+        error: They move differently before identification.
+    """
+    if not keeps_robot(holder):
+        return robot
+    kept = kept_robot(holder, robot.name)
+    ours, theirs = model_hash(nominal_of(kept)), model_hash(nominal_of(robot))
+    if ours != theirs:
+        raise error(
+            f"{holder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "
+            f"gains or inertias. Use --robot {holder / KEPT} where that is the right one, or {hint}"
+        )
+    return kept

@@ -1,0 +1,32 @@
+"""A run folder without training: an operator that corrects nothing yet, a split, a robot."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.data.store import Dataset
+from gaponet.model.artifact import make_card
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import export
+from gaponet.robot import RobotSpec
+from gaponet.robot_folder import save_robot
+
+
+def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]) -> Path:
+    """A run that was trained, validated and tested on these motions of a dataset."""
+    config = ModelConfig(kind=kind, history=2, num_probes=2)  # type: ignore[arg-type]
+    net = build_network(config, len(robot.operated)).eval()
+    motions = {part: sorted(parts.get(part, ())) for part in ("train", "val", "test")}
+    card = make_card(config, robot, dt=[robot.dt], motions=motions, payload_seen=[0.0, 0.2], units=["a"], seed=0)
+    export(net, folder / "model", card, np.zeros((4, net.features.dim), np.float32))
+    split = {part: {e.id: e.hash for e in data.entries if e.meta.motion in names} for part, names in motions.items()}
+    (folder / "split.json").write_text(json.dumps(split))
+    (folder / "delay_offset.json").write_text(
+        json.dumps({"delay": dict.fromkeys(robot.operated, 0.0), "offset": dict.fromkeys(robot.operated, 0.0)})
+    )
+    save_robot(robot, folder / "robot")
+    return folder
