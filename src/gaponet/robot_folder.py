@@ -22,7 +22,7 @@ FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 def save_robot(robot: RobotSpec, folder: Path) -> None:
     """Write the nominal robot's folder again, and [identified.JOINT] tables where parameters were identified.
 
-    The copy needs nothing outside it: an MJCF that includes or names files is written anew without them (sim/bare.py).
+    The copy needs nothing outside it: an MJCF that includes or names files is written anew without them (gaponet.bare).
 
     Args:
         robot: Loaded by load_robot, or made from such a one by with_servos.
