@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
-
 from gaponet.cli.out import Out
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
@@ -31,7 +29,7 @@ def open_dataset(path: Path, robot: str | None, run: Path | None = None) -> tupl
     spec = kept_robot(path, data.robot_name)
     if not keeps_robot(path):
         note = f"{path} keeps no robot (written before November 2026): taking the package's {spec.name}"
-        Out(as_json=True).say(escape(note))  # on stderr
+        Out(as_json=True).say(note)  # on stderr
     return data, spec
 
 

@@ -128,7 +128,9 @@ def evaluate(
         )  # fmt: skip
     save(evaluation, run)
     if not evaluation.result["unseen"]:
-        out.say("", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow")
+        out.say(
+            "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
+        )
     show_methods(out, evaluation.result, spec)
     out.result(evaluation.result)
 
