@@ -1,0 +1,321 @@
+"""Proof that nothing is lost or doubled: commands killed at random moments, on full disks, read-only, and two at once.
+
+    python benchmarks/kills.py WORK [--kills 20] [--only import,train] [--seed 0]
+
+Records a small VIRTUAL SO-101 set in WORK/input, then carries out each command of CASES once undisturbed, and again
+
+    kills      with kill -9 at random moments, started again each time until so many were killed
+    full       on a tmpfs that is too small, then on the same one made larger (root only)
+    read_only  on a tmpfs mounted read-only (root only)
+    races      twice at once into one folder
+    foreign    into a folder that holds a `.git`
+
+What is compared at the end of each is the content of the folder. Prints one JSON object; exits with 1 where a content
+differs, a file is left over, an exit code is not the one meant, or a traceback was printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gaponet.model.export  # what a child needs is there before it is forked
+import gaponet.study.study
+import gaponet.train.run  # noqa: F401
+from gaponet.cli.main import main as gaponet_main
+from gaponet.data.store import Dataset
+from gaponet.files import MARK
+
+TRAIN = ["--model.history", "2", "--warm-start.num-envs", "16", "--warm-start.steps", "40", "--warm-start.rounds", "3",
+         "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
+LIMIT_S = 600.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command: its arguments, what it starts from, and what must be equal in the end."""
+
+    argv: Callable[[Path], list[str]]
+    content: Callable[[Path], Any]
+    begin: Path | None = None  # copied to OUT first
+
+
+def entries(out: Path) -> Any:
+    """Order and hashes of a dataset, and every file in it; samples are read."""
+    data = Dataset(out)
+    data.sequences()
+    return [[(e.id, e.hash) for e in data.entries], names(out)]
+
+
+def names(out: Path) -> list[str]:
+    """Files of a folder, marks left out: which of its subfolders have one depends on nothing of the user's."""
+    return sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != MARK)
+
+
+def digests(out: Path) -> dict[str, str]:
+    """Content of every file."""
+    return {name: hashlib.sha256((out / name).read_bytes()).hexdigest() for name in names(out)}
+
+
+def trained(out: Path) -> Any:
+    """A run without its times."""
+    lines = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
+    curve = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
+    return [curve, digests(out / "model")["weights.npz"], names(out)]
+
+
+def page(out: Path) -> Any:
+    """A run's report is whole, and its evaluation the same."""
+    assert (out / "report.html").read_text().rstrip().endswith("</html>")
+    return [json.loads((out / "metrics.json").read_text())["methods"], names(out)]
+
+
+def result(out: Path) -> Any:
+    """Rows of an experiment."""
+    out = out / "rehearsal"
+    record = json.loads((out / "data.json").read_text())
+    return [record["tables"][0]["rows"], sorted(p.name for p in (out / "cells").iterdir()), names(out)]
+
+
+def cases(given: Path) -> dict[str, Case]:
+    """Every command that writes; `given`: data, bare (data without twins), logs (LeRobot) and a run."""
+    robot = ["--robot", "so101"]
+    data, log, run = (str(given / name) for name in ("data", "logs", "run"))
+    recipe = ["--recipe", str(given / "more.toml")]
+
+    def train(out: Path) -> list[str]:
+        resume = ["--resume"] if (out / "checkpoint.pt").is_file() else []
+        return ["train", data, "--out", str(out), "--budget", "8000", *resume, *TRAIN]
+
+    def experiment(out: Path) -> list[str]:
+        return ["experiment", "data", data, str(out), "--quick", "--models", "mlp", "--seeds", "1", "--shares", "1.0"]
+
+    return {
+        "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
+        "collect": Case(lambda out: ["collect", *robot, *recipe, "--out", str(out)], entries),
+        "pair": Case(lambda out: ["pair", str(out)], entries, given / "bare"),
+        "train": Case(train, trained),
+        "export": Case(lambda out: ["data", "export", data, "--out", str(out)], digests),
+        "artifact": Case(lambda out: ["export", run, "--out", str(out)], names),
+        "report": Case(lambda out: ["report", str(out), "--dataset", data], page, given / "run"),
+        "experiment": Case(experiment, result),
+    }
+
+
+def prepare(given: Path) -> None:
+    """The inputs, once."""
+    recipe = 'motions = ["steps-*", "tour-all-*"]\npayloads = [{}]\nunits = ["virtual-1"]\nvariants = {}\n'
+    given.mkdir(parents=True)
+    for name, payloads, variants in (("few", "0.0", 3), ("more", "0.0, 0.2", 6)):
+        (given / f"{name}.toml").write_text(recipe.format(payloads, variants))
+    for argv in (
+        ["collect", "--robot", "so101", "--recipe", str(given / "few.toml"), "--out", str(given / "data")],
+        ["data", "export", str(given / "data"), "--out", str(given / "logs")],
+        ["train", str(given / "data"), "--out", str(given / "run"), "--budget", "2000", *TRAIN],
+    ):
+        if wait(start(argv, given / "prepare.txt")):
+            raise SystemExit(f"{argv[0]} failed; see {given / 'prepare.txt'}")
+    shutil.copytree(given / "data", given / "bare", ignore=shutil.ignore_patterns("twins"))
+
+
+def start(argv: list[str], log: Path) -> int:
+    """The command in a process of its own, which is forked with everything imported; returns its id."""
+    process = os.fork()
+    if process:
+        return process
+    code = 70
+    try:
+        os.environ["COLUMNS"] = "200"
+        descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(descriptor, 1)
+        os.dup2(descriptor, 2)
+        sys.stdout = sys.stderr = open(1, "w", closefd=False)  # noqa: SIM115
+        code = gaponet_main(argv)
+    except SystemExit as left:
+        code = int(left.code or 0)
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
+
+
+def wait(process: int, until: float = LIMIT_S) -> int | None:
+    """Exit code of a process, None if it still runs after so many seconds."""
+    deadline = time.monotonic() + until
+    while True:
+        ended, status = os.waitpid(process, os.WNOHANG)
+        if ended:
+            return os.waitstatus_to_exitcode(status)
+        if time.monotonic() > deadline:
+            return None
+        time.sleep(0.002)
+
+
+class Trial:
+    """A command under adversity; collects what went wrong."""
+
+    def __init__(self, name: str, case: Case, work: Path, rng: np.random.Generator) -> None:
+        self.name, self.case, self.work, self.rng = name, case, work / name, rng
+        self.log = self.work / "log.txt"
+        self.wrong: list[str] = []
+        self.count: Counter[str] = Counter()
+        self.work.mkdir(parents=True)
+        began = time.monotonic()
+        whole = self.fresh(self.work / "whole")
+        self.expect("whole", wait(start(case.argv(whole), self.log)), 0)
+        self.duration = time.monotonic() - began
+        self.content = case.content(whole)
+        self.size = sum(f.stat().st_size for f in whole.rglob("*") if f.is_file())
+
+    def fresh(self, out: Path) -> Path:
+        """OUT as the command finds it the first time."""
+        if self.case.begin is not None:
+            shutil.copytree(self.case.begin, out, dirs_exist_ok=True)
+        return out
+
+    def expect(self, what: str, code: int | None, *meant: int) -> None:
+        """Note an exit code that is not one of those meant, and a traceback."""
+        self.count[what] += 1
+        text = self.log.read_text(errors="replace") if self.log.is_file() else ""
+        if code not in meant or "Traceback" in text:
+            self.wrong.append(f"{what}: exit {code}: {text.strip().splitlines()[-1:] or ''}")
+        elif code == 2 and text.strip().splitlines()[-1].split(":")[0] not in ("Folder", "File", "Usage", "Dataset"):
+            self.wrong.append(f"{what}: no one-line error: {text.strip().splitlines()[-1]}")
+        self.log.unlink(missing_ok=True)
+
+    def same(self, what: str, out: Path) -> None:
+        """Note content that is not what the undisturbed command left."""
+        try:
+            equal = self.case.content(out) == self.content
+        except Exception as error:
+            equal = False
+            self.wrong.append(f"{what}: {type(error).__name__}: {error}")
+        if not equal:
+            self.wrong.append(f"{what}: {out} is not what the undisturbed command leaves")
+
+    def kills(self, wanted: int) -> None:
+        """Kill, start again, and compare when one comes to its end."""
+        turn = 0
+        while self.count["killed"] < wanted:
+            out = self.fresh(self.work / f"killed-{turn}")
+            turn += 1
+            while True:
+                process = start(self.case.argv(out), self.log)
+                last = self.count["killed"] >= wanted
+                code = wait(process, LIMIT_S if last else self.rng.uniform(0, 1.1 * self.duration))
+                if code is not None:
+                    break
+                os.kill(process, signal.SIGKILL)
+                os.waitpid(process, 0)
+                self.count["killed"] += 1
+                self.log.unlink(missing_ok=True)
+                if self.case.content is entries and (out / "dataset.json").is_file():
+                    Dataset(out).sequences()  # whatever is listed is there
+            self.expect("resumed", code, 0)
+            self.same("killed", out)
+
+    def full(self) -> None:
+        """A disk that fills up at a third, and again at two thirds, of what is needed; then there is room."""
+        for share in (0.02, 0.35, 0.7):
+            place = mounted(self.work / f"full-{share:g}", self.size * (share + (self.case.begin is not None)))
+            try:
+                out = self.fresh(place / "out")
+                code = wait(start(self.case.argv(out), self.log))
+                self.expect("full", code, 0, 2)
+                self.count["refused, full"] += code == 2
+                subprocess.run(["mount", "-o", "remount,size=1g", str(place)], check=True)
+                self.expect("room again", wait(start(self.case.argv(out), self.log)), 0)
+                self.same("full", out)
+            finally:
+                subprocess.run(["umount", str(place)], check=True)
+
+    def read_only(self) -> None:
+        """Nothing can be written."""
+        place = mounted(self.work / "read-only", 1 << 30)
+        try:
+            out = self.fresh(place / "out")
+            subprocess.run(["mount", "-o", "remount,ro", str(place)], check=True)
+            before = digests(place)
+            self.expect("read-only", wait(start(self.case.argv(out), self.log)), 2)
+            if digests(place) != before:
+                self.wrong.append("read-only: changed")
+        finally:
+            subprocess.run(["umount", str(place)], check=True)
+
+    def races(self, turns: int = 5) -> None:
+        """Two at once: one does it, the other is refused, or comes late and finds it done."""
+        for turn in range(turns):
+            out = self.fresh(self.work / f"race-{turn}")
+            logs = [self.log.with_name(f"race-{turn}-{i}.txt") for i in range(2)]
+            both = [start(self.case.argv(out), log) for log in logs]
+            codes = [wait(process) for process in both]
+            for code, log in zip(codes, logs, strict=True):
+                log.rename(self.log)
+                self.expect("raced", code, 0, 2)
+            self.count["refused, second"] += 2 in codes
+            if 0 not in codes:
+                self.wrong.append(f"race: exit codes {codes}")
+            self.same("race", out)
+
+    def foreign(self) -> None:
+        """Somebody else's folder."""
+        if self.case.begin is not None:
+            return
+        out = self.work / "foreign"
+        (out / ".git").mkdir(parents=True)
+        (out / ".git" / "HEAD").write_text("ref: refs/heads/main\n")
+        self.expect("foreign", wait(start(self.case.argv(out), self.log)), 2)
+        if names(out) != [".git/HEAD"] or len(list(out.iterdir())) != 1:
+            self.wrong.append(f"foreign: {out} was changed")
+
+
+def mounted(place: Path, size: float) -> Path:
+    """A tmpfs of that many bytes."""
+    place.mkdir()
+    pages = max(int(size) // 4096, 4)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={pages * 4096}", "tmpfs", str(place)], check=True)
+    return place
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--only", default="", help="some of the commands, separated by commas")
+    parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    args = parser.parse_args()
+    work, found, wrong = args.work.resolve(), {}, 0
+    if not (work / "input").is_dir():
+        prepare(work / "input")
+    for name, case in cases(work / "input").items():
+        if args.only and name not in args.only.split(","):
+            continue
+        trial = Trial(name, case, work, np.random.default_rng(args.seed))
+        trial.kills(args.kills)
+        trial.races()
+        trial.foreign()
+        if os.geteuid() == 0:
+            trial.full()
+            trial.read_only()
+        found[name] = {"whole_s": round(trial.duration, 1), **trial.count, "wrong": trial.wrong}
+        wrong += len(trial.wrong)
+        print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
+    print(json.dumps(found))
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
