@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers fuzz check clean
+.PHONY: setup demo test faults peers fuzz kills check clean
 
 setup: $(VENV)/.done
 
@@ -42,10 +42,14 @@ FUZZ ?=
 fuzz: setup
 	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m fuzzing $(FUZZ)
 
+# Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root.
+kills: setup
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
+
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 clean:
-	rm -rf $(VENV) demo_run .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) demo_run kills_work .pytest_cache .ruff_cache .mypy_cache
