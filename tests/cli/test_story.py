@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 
+import numpy as np
 import pytest
 from arm import recordings, write_arm
 
@@ -122,6 +123,21 @@ def test_a_calibrated_unit_is_shown_without_and_with(place, capsys):
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet", "calibrated"]
     assert result["calibrated_units"] == [found["unit_id"]]
     assert result["unseen"] is True
+
+
+def test_a_run_uses_the_units_calibration_and_refuses_a_payload_never_trained_on(place, capsys):
+    shutil.copytree(place / "gaponet", place / "mine")
+    found, _ = run(place, capsys, "calibrate", str(place / "mine"), str(place / "data"), "--seconds", "8")
+    motion = place / "sway.npz"
+    np.savez(motion, joint_names=["shoulder", "elbow"], ctrl=np.linspace([0.0, 0.0], [0.2, 0.3], 40), dt=0.02)
+    words = ["run", "--motion", str(motion), "--model", str(place / "mine"), "--fast", "--yes", "--blend", "0.2"]
+    played, err = run(place, capsys, *words, "--payload-mass", "0")
+    assert played["calibrated"] is None
+    assert f"calibrations of {found['unit_id']}, none of which is used: --unit-id says which" in err
+    played, err = run(place, capsys, *words, "--payload-mass", "0", "--unit-id", found["unit_id"])
+    assert played["calibrated"] == found["unit_id"]
+    assert main([*words, "--robot", str(place / "arm"), "--payload-mass", "0.3"]) == 2
+    assert "asked for 0.3 kg, where it only guesses" in capsys.readouterr().err
 
 
 def test_the_report_is_one_offline_page(place, capsys):

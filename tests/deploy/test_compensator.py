@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from arm import TOML, XML, commands, write_arm
 
+from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.backends import Bound
+from gaponet.model.calibration import Calibration
 from gaponet.model.config import ModelConfig
 from gaponet.sim.batch import BatchSim
 
@@ -253,3 +255,77 @@ def test_an_identified_robot_with_late_servos_and_zero_errors_reaches_its_target
     for _ in range(150):
         arm.step(compensator.step(target, arm.qpos[0].copy())[None])
     np.testing.assert_allclose(arm.qpos[0], target, atol=0.05 / 16)  # within the friction band
+
+
+def test_payloads_beyond_those_trained_on_are_refused_unless_told(robot):
+    def trained(*seen):
+        return GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02], payload_seen=seen), CONFIG, Exact())
+
+    light, loaded = Compensator(robot, trained(0.0, 0.2)), Compensator(robot, trained(0.1, 0.2))
+    light.reset(np.zeros(2), 0.2)
+    assert light.masses.max() == 0.2
+    for compensator, mass in ((light, 0.3), (loaded, 0.0), (loaded, 0.3)):
+        with pytest.raises(ModelError, match=r"kg, where it only guesses.*extrapolate"):
+            compensator.reset(np.zeros(2), mass)
+    with pytest.raises(ModelError, match=r"asked for 0\.3 kg"):
+        light.set_payload(0.3)
+    for mass in (np.nan, -1.0):
+        with pytest.raises(UsageError, match="payload_mass is"):
+            light.set_payload(mass)
+    beyond = Compensator(robot, trained(0.0, 0.2), extrapolate=True)
+    beyond.reset(np.zeros(2), 0.4)
+    assert beyond.masses.max() == 0.4
+    with pytest.raises(ModelError):
+        AlignedSim(robot, trained(0.0, 0.2), 0.3)
+    AlignedSim(robot, trained(0.0, 0.2), 0.3, extrapolate=True)
+
+
+@pytest.mark.parametrize("payload", [0.2, None], ids=["told", "estimated"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_a_number_is_forgotten_at_once(robot, model, payload, bad):
+    targets = commands(60, 0)
+    one, two = (Compensator(robot, model, NOW, num_envs=2) for _ in range(2))
+    for compensator in (one, two):
+        compensator.reset(np.tile(targets[0], (2, 1)), payload)
+    q = np.tile(targets[0], (2, 1))
+    for k, target in enumerate(np.repeat(targets[:, None], 2, axis=1)):
+        spoilt, state, force = target.copy(), q.copy(), np.zeros((2, 2))
+        if k == 20:
+            spoilt[0, 0], state[0, 1] = bad, bad
+        if k == 25:
+            force[0, 0] = bad
+        whole = two.step(target, q, np.zeros((2, 2)), np.zeros((2, 2)))
+        part = one.step(spoilt, state, np.zeros((2, 2)), force)
+        assert np.isfinite(part).all()
+        np.testing.assert_array_equal(part[1], whole[1])  # the other robot never notices
+        q = q + 0.3 * (target - q)
+    np.testing.assert_allclose(part[0], whole[0], atol=0.02)
+    assert np.isfinite(one.payload_mass).all()
+
+
+def test_a_start_that_is_not_a_number_is_refused(robot, model):
+    with pytest.raises(UsageError, match="target to begin at"):
+        Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
+
+
+def test_a_calibrated_unit_follows_where_the_model_alone_does_not(robot):
+    ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Nothing())
+    targets = np.tile([0.4, 0.8], (200, 1))
+    still = replace(NOW, feedback=0.0)
+    servos = {j: {"kp": WEAK * float(k), "delay": 0.0} for j, k in zip(robot.joint_names, robot.kp, strict=True)}
+    unit = Calibration("a", "weights", servos, (), 30.0, 0.0, 0.0)
+    error = {}
+    for name, calibration in (("common", None), ("unit", unit)):
+        q, _ = play(WeakArm(robot, 0.4), targets, Compensator(robot, ignorant, still, calibration=calibration), 0.4)
+        error[name] = np.abs(q[1:] - targets[:-1])[100:].mean()
+    assert error["unit"] < 0.2 * error["common"]
+
+
+def test_servos_with_other_gains_than_the_data_are_refused_unless_told(robot):
+    card = make_card(CONFIG, robot, dt=[0.02], recorded={"kp": [20.0, 20.0], "kd": None})
+    model = GapModel(Path("exact"), card, CONFIG, Exact())
+    joints, kd = robot.joint_names, np.zeros(2)
+    Compensator(robot, model).require_gains(joints, np.array([20.0, 20.1]), kd)
+    with pytest.raises(ModelError, match="kp 20 of elbow, the servo has 10"):
+        Compensator(robot, model).require_gains(joints, np.array([20.0, 10.0]), kd)
+    Compensator(robot, model, extrapolate=True).require_gains(joints, np.array([20.0, 10.0]), kd)

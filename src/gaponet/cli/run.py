@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
+from rich.markup import escape
 
 from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
@@ -38,7 +39,8 @@ class Reach:
     port: str = "/dev/ttyACM0"
     """so101: serial port."""
     calibration: Path | None = None
-    """so101: calibration file of LeRobot (JSON); default: the middle of the encoder is 0 rad."""
+    """so101: the file that lerobot-calibrate wrote for this arm. It is compared with what the servos hold of it, which
+    counts where no file is given."""
     unit: str = "4"
     """virtual: number or name in the fleet."""
     fleet: str = "default"
@@ -64,6 +66,8 @@ class Request:
     yes: bool = False
     seed: int = 0  # of a virtual robot's noise
     compensation: CompensatorConfig = field(default_factory=CompensatorConfig)
+    unit_id: str = ""
+    extrapolate: bool = False
 
 
 @writes("recordings")
@@ -80,6 +84,8 @@ def run(
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
     safety: SafetyConfig = SafetyConfig(),  # noqa: B008
     compensation: CompensatorConfig = CompensatorConfig(),  # noqa: B008
+    unit_id: str = "",
+    extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False,
     yes: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -99,13 +105,15 @@ def run(
         control: Timing.
         safety: Limits and watchdogs.
         compensation: With a model: how commands are found.
+        unit_id: With a model: which unit this is; what gaponet calibrate found out about it is used.
+        extrapolate: With a model: take payloads and servo gains that its training data do not hold.
         yes: Do not ask before a robot moves.
         json: One JSON object on stdout.
     """
     screen = Out(json)
     asked = Request(
         motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes,
-        compensation=compensation,
+        compensation=compensation, unit_id=unit_id, extrapolate=extrapolate,
     )  # fmt: skip
     recording, played, _ = perform(screen, asked)
     if out:
@@ -127,11 +135,13 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     motion = find_motion(asked, spec)
     driver, facts = make_driver(asked, spec, clock, motion)
     require_commanded(motion, spec, driver)
-    compensator = _compensator(asked, spec)
+    compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
     controller = Controller(
         driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass,
         on_event=lambda event: _tell(screen, event), motion=motion.name, payload_side=asked.payload_side,
-        model=str(asked.model) if asked.model else None, **facts,
+        model=str(asked.model) if asked.model else None, calibrated=calibrated,
+        on_connect=lambda met: compensator.require_gains(met.joint_names, met.kp, met.kd) if compensator else None,
+        **facts,
     )  # fmt: skip
     if asked.driver != "virtual" and not asked.yes:
         _ask(screen, driver, motion)
@@ -192,16 +202,28 @@ def tracking(recording: Recording) -> dict[str, Any]:
     return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
 
 
-def _compensator(asked: Request, robot: RobotSpec) -> Any:
-    """The compensator of a model, or None."""
+def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
+    """The compensator of a model, or None; and the unit whose calibration it uses."""
     if asked.model is None:
-        return None
+        return None, None
     from gaponet.deploy.compensator import Compensator
+    from gaponet.model import calibration
     from gaponet.model.artifact import GapModel
 
-    dt = 1.0 / asked.control.rate
     model = GapModel.load(asked.model)
-    return Compensator(robot, model, asked.compensation, dt, payload_side=asked.payload_side)
+    known = calibration.load(model.path.parent if model.path.name == "model" else model.path, model.weights_hash())
+    if unit in known:
+        screen.say(f"commands are found with the calibration of unit {escape(unit)}")
+    elif known:
+        units = escape(", ".join(known))
+        screen.say(f"the run holds calibrations of {units}, none of which is used: --unit-id says which unit this is")
+    compensator = Compensator(
+        robot, model, asked.compensation, 1.0 / asked.control.rate, payload_side=asked.payload_side,
+        extrapolate=asked.extrapolate, calibration=known.get(unit),
+    )  # fmt: skip
+    if asked.payload_mass is not None:
+        model.require_payload(asked.payload_mass, asked.extrapolate)  # before anything is opened
+    return compensator, unit if unit in known else None
 
 
 def _ask(screen: Out, driver: Driver, motion: Motion) -> None:

@@ -33,8 +33,9 @@ class AlignedSim:
         num_envs: int | None = None,
         nthread: int = 0,
         locked: tuple[str, ...] = (),
+        extrapolate: bool = False,
     ) -> None:
-        """Refuse a robot, simulator, gains, joint set or rate that the model was not trained on (GapModel.require).
+        """Refuse a robot, simulator, gains, joints, rate or payload that the model was not trained on.
 
         Args:
             robot: The simulator that the model corrects: the package's robot, or RUN/robot after an identification.
@@ -45,10 +46,12 @@ class AlignedSim:
             num_envs: Simulations side by side; None for one, with arrays (n,).
             nthread: Threads, 0 for all cores.
             locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them.
+            extrapolate: Take payloads beyond those trained on.
         """
         self.dt = robot.dt if dt is None else dt
         if model is not None:
             model.require(robot, self.dt)
+            model.require_payload(payload_mass, extrapolate)
         self.robot, self.model, self.single = robot, model, num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))

@@ -27,6 +27,7 @@ from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel
+from gaponet.model.calibration import Calibration
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import idle_joints
@@ -98,6 +99,8 @@ class Compensator:
         payload_side: str = "both",
         payload_step: float = 0.25,
         nthread: int = 1,
+        extrapolate: bool = False,
+        calibration: Calibration | None = None,
     ) -> None:
         """
         Args:
@@ -107,17 +110,22 @@ class Compensator:
             dt: Control period, s; default the robot's.
             num_envs: Robots side by side; None for one, with arrays (n,).
             payload_side: Which hands carry it.
-            payload_step: Masses that the shadow can carry are this far apart, up to the model's payload_max, kg.
+            payload_step: Masses that the shadow can carry are this far apart, up to the heaviest trained on, kg.
             nthread: Threads.
+            extrapolate: Take payloads beyond those trained on, up to the model's payload_max.
+            calibration: Of the unit that is commanded (gaponet calibrate): the shadow is that unit.
         """
         self.dt = robot.dt if dt is None else dt
         model.require(robot, self.dt)
         if model.config.delta_hold > 1:
             raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
+        robot = robot if calibration is None else calibration.robot(robot)
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
+        self.extrapolate = extrapolate
         self.num_envs = num = 1 if num_envs is None else num_envs
-        heaviest = model.config.payload_max if robot.payload_mounts else 0.0
-        self.masses = np.linspace(0.0, heaviest, 1 + round(heaviest / payload_step))
+        heaviest = model.config.payload_max if extrapolate else model.heaviest
+        heaviest = heaviest if robot.payload_mounts else 0.0
+        self.masses = np.linspace(0.0, heaviest, 1 + int(np.ceil(heaviest / payload_step - 1e-9)))
         locked = idle_joints(robot, robot.operated)
         # The last rows never move: they hold the model with each mass, to be copied when a payload changes.
         carried = [(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
@@ -135,17 +143,32 @@ class Compensator:
 
     # ---- use
 
+    def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
+        """Refuse servos with gains (n) other than those that the data were recorded with, unless `extrapolate`."""
+        if not self.extrapolate:
+            self.model.require_gains(joint_names, kp, kd)
+
     def reset(self, target: Array, payload_mass: Array | float | None = None) -> None:
         """Begin at rest at a target, uncompensated; commands blend in from there.
 
         Args:
             target: In force, rad.
             payload_mass: kg, one number or (num_envs,); None to estimate it from commands and positions.
+
+        Raises:
+            ModelError: A payload beyond those trained on, without `extrapolate`.
+            UsageError: A target or payload that is not a number.
         """
         self.told = payload_mass is not None or len(self.masses) == 1
         self.estimate.reset(self.num_envs)
-        self.set_payload(0.0 if payload_mass is None else payload_mass)
+        if payload_mass is None:
+            self._carry(np.zeros(self.num_envs))
+        else:
+            self.set_payload(payload_mass)
         a = self._all(target)
+        if not np.isfinite(a).all():
+            raise UsageError("compensator: the target to begin at is not a number")
+        self._asked = a
         self.loop.reset()
         self.offset = np.zeros((self.num_envs, len(self.op)))
         self.integral, self.missing, self.sent = np.zeros_like(self.offset), np.zeros_like(self.offset), a[:, self.op]
@@ -158,8 +181,13 @@ class Compensator:
         self._aimed = [self._shadow_qpos()] * (self.config.lead + 1)  # newest last
 
     def set_payload(self, payload_mass: Array | float) -> None:
-        """A payload was picked up or put down, kg; the shadow carries the nearest of `masses`."""
-        self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
+        """A payload was picked up or put down, kg, one number or (num_envs,); errors as of `reset`."""
+        self.model.require_payload(payload_mass, self.extrapolate)
+        self._carry(np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)))
+
+    def _carry(self, payload_mass: Array) -> None:
+        """The shadow carries the nearest of `masses`."""
+        self.payload_mass = payload_mass
         nearest = np.abs(self.payload_mass[:, None] - self.masses).argmin(axis=1)
         if (nearest != self._carried).any():
             for field in self.shadow.fields.values():
@@ -170,15 +198,19 @@ class Compensator:
         """Commands for the coming control period, rad.
 
         Args:
-            target: What the robot is asked for, rad; with a lead, that many periods from now.
-            qpos, qvel: Measured now, rad, rad/s; qpos None where no fresh state has arrived: feedback then waits.
+            target: What the robot is asked for, rad; with a lead, that many periods from now. Where it is not a number,
+                the last that was one holds.
+            qpos, qvel: Measured now, rad, rad/s; qpos None where no fresh state has arrived: feedback then waits, as it
+                does where one of these is not a number.
             tau: Measured joint torque, N·m, for the payload estimate; default that of the servo law, kp (u − q) − kd q̇.
         """
-        a_all = self._all(target)
+        told = self._all(target)
+        self._asked = a_all = np.where(np.isfinite(told), told, self._asked)
         a = a_all[:, self.op]
         self._aimed = [*self._aimed[1:], self._shadow_qpos()]
         if qpos is not None:
-            self._observe(self._all(qpos)[:, self.op], qvel, tau)
+            v, force = (None if x is None else self._all(x)[:, self.op] for x in (qvel, tau))
+            self._observe(self._all(qpos)[:, self.op], v, force)
         self.moving.update(a)
         wanted = self._wanted(a)
         u = self._solve(wanted) + self.integral
@@ -217,20 +249,22 @@ class Compensator:
             return loop.answer(q, v, wanted, self.payload_mass)
         return loop.solve(q, v, wanted, self.payload_mass, self.offset, gain, self.config.iterations)
 
-    def _observe(self, q: Array, qvel: Array | None, tau: Array | None) -> None:
+    def _observe(self, q: Array, v: Array | None, tau: Array | None) -> None:
         """Integrate what is missing; anti-windup: not further where the command is at a limit."""
         config = self.config
+        v = np.zeros_like(q) if v is None else v
+        seen = np.isfinite(q + v + (0.0 if tau is None else tau)).all(axis=1)  # robots
         if self.periods:
             # A blocked joint misses much; it must not take long to forget.
-            missing = np.clip(self._aimed[0] - q, -config.feedback_limit, config.feedback_limit)
-            self.missing += (missing - self.missing) * min(1.0, self.dt / max(config.feedback_time, self.dt))
-            further = self.missing * self.saturated > 0
-            grown = self.integral + config.feedback * self.dt * np.where(further, 0.0, self.missing)
-            self.integral = np.clip(grown, -config.feedback_limit, config.feedback_limit)
+            wrong = np.clip(self._aimed[0] - q, -config.feedback_limit, config.feedback_limit)
+            missing = self.missing + (wrong - self.missing) * min(1.0, self.dt / max(config.feedback_time, self.dt))
+            further = missing * self.saturated > 0
+            grown = self.integral + config.feedback * self.dt * np.where(further, 0.0, missing)
+            limited = np.clip(grown, -config.feedback_limit, config.feedback_limit)
+            self.missing = np.where(seen[:, None], missing, self.missing)
+            self.integral = np.where(seen[:, None], limited, self.integral)
         if not self.told:
-            v = np.zeros_like(q) if qvel is None else self._all(qvel)[:, self.op]
-            force = None if tau is None else self._all(tau)[:, self.op]
-            self.set_payload(self.estimate.update(q, v, self.sent, force))
+            self._carry(self.estimate.update(q, v, self.sent, tau, seen))
 
     def _shadow_qpos(self) -> Array:
         return self.shadow.qpos[: self.num_envs, self.at]

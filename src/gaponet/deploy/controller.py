@@ -127,6 +127,7 @@ class Controller:
         guard: bool = True,
         payload_mass: float | None = None,
         on_event: Callable[[Event], None] = lambda event: None,
+        on_connect: Callable[[Driver], None] = lambda driver: None,
         **meta: Any,
     ) -> None:
         """
@@ -140,6 +141,7 @@ class Controller:
             guard: Start the process that damps the robot if this one dies, where the driver has one.
             payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
             on_event: Told every change of phase.
+            on_connect: Given the robot once it has answered and nothing was commanded; may refuse it.
             meta: Kept with the recording (unit, model…).
         """
         self.driver, self.robot, self.compensator = driver, robot, compensator
@@ -154,7 +156,7 @@ class Controller:
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
             meta=meta | {"payload_mass": payload_mass},
         )  # fmt: skip
-        self._use_guard, self._on_event = guard, on_event
+        self._use_guard, self._on_event, self._on_connect = guard, on_event, on_connect
         self._guard: Guard | None = None
         self._payload_mass, self._prepared = payload_mass, compensator is None
         self._ctrl: Array | None = None  # commanded joints
@@ -185,6 +187,7 @@ class Controller:
             self.driver.connect()
             self.recording.virtual = self.driver.virtual
             self._adopt_servos()
+            self._on_connect(self.driver)
             gains = {name: getattr(self.driver, name)[self.joints].tolist() for name in ("kp", "kd")}
             self.recording.meta |= gains | self.driver.facts
             self._start_guard(lock, stack)

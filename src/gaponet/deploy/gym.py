@@ -79,7 +79,7 @@ class AlignedActions(gymnasium.Wrapper):
     """Any gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad: aligned."""
 
     def __init__(self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "") -> None:
-        """Refuses other gains, joints or rates, as deploy.mujoco_loop does."""
+        """Refuses other gains, joints, rates or payloads, as deploy.mujoco_loop does."""
         super().__init__(env)
         scene: Any = env.unwrapped
         self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix)

@@ -26,9 +26,15 @@ class MujocoAligner:
     """
 
     def __init__(
-        self, model: GapModel, mj_model: mujoco.MjModel, dt: float, payload_mass: float, prefix: str = ""
+        self,
+        model: GapModel,
+        mj_model: mujoco.MjModel,
+        dt: float,
+        payload_mass: float,
+        prefix: str = "",
+        extrapolate: bool = False,
     ) -> None:
-        """Refuse a model in which a joint, its actuator or its gains are not those trained on, or another rate.
+        """Refuse a scene in which a joint, its actuator or its gains are not those trained on; another rate or payload.
 
         Args:
             model: What training made.
@@ -36,8 +42,10 @@ class MujocoAligner:
             dt: Control period, s.
             payload_mass: kg in each hand. Give the scene that mass as well.
             prefix: Of the robot's names in the scene ("left/").
+            extrapolate: Take a payload beyond those trained on.
         """
         model.require_rate(dt)
+        model.require_payload(payload_mass, extrapolate)
         self.loop, self.payload_mass = model.loop(), payload_mass
         card, names = model.card, [prefix + name for name in model.card["joint_names"]]
         known = [mj_model.joint(j).name for j in range(mj_model.njnt)]

@@ -42,17 +42,18 @@ class PayloadEstimate:
         """Nothing in the hands of num robots."""
         self.mass, self.top, self.weight = np.zeros(num), np.zeros(num), np.zeros(num)
 
-    def update(self, qpos: Array, qvel: Array, sent: Array, tau: Array | None) -> Array:
+    def update(self, qpos: Array, qvel: Array, sent: Array, tau: Array | None, seen: Array) -> Array:
         """One control period; all (num, n operated). Returns kg per robot, (num,).
 
         Args:
             qpos, qvel: Measured, rad, rad/s.
             sent: Command in force, rad.
             tau: Measured torque, N·m; None for the servo law's.
+            seen: Robots (num,) whose state is one; of the others nothing is learned.
         """
         torque = self.kp * (sent - qpos) - self.kd * qvel if tau is None else tau
         keep = np.exp(-self.dt / MEMORY)
-        for i in range(len(self.mass)):
+        for i in np.flatnonzero(seen):
             empty, full = self._gravity(qpos[i])
             per_kg = (full - empty) / self.heaviest
             share = 1.0 / (1.0 + (np.abs(qvel[i]).max() / STILL) ** 2)

@@ -16,7 +16,7 @@ from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
 from gaponet.data.sequence import SequenceMeta
-from gaponet.errors import ModelError
+from gaponet.errors import ModelError, UsageError
 from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
 from gaponet.model.config import ModelConfig
@@ -28,6 +28,7 @@ from gaponet.structure import Json, Name, Number, read_format, read_json, valida
 Array = np.ndarray
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
+RECORDED_TOLERANCE = 0.02  # relative, of gains
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 
 
@@ -98,6 +99,7 @@ class Card(TypedDict):
     dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
     payload_seen: NotRequired[Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(1)]]
     units: NotRequired[tuple[str, ...]]
+    recorded: NotRequired[dict[Literal["kp", "kd"], tuple[float, ...] | None]]
     virtual: NotRequired[bool]
     simulator_only: NotRequired[bool]
     interrupted: NotRequired[bool]
@@ -128,8 +130,9 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     if "simulator" not in card and "simulator_hash" not in card:
         raise ModelError(f"{file}: simulator: is missing; {mend}")
     n = len(card["joint_names"])
-    for name in ("kp", "kd", "qpos_range"):
-        if len(card.get(name, card["kp"])) != n:
+    lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
+    for name, values in (lists | {f"recorded.{k}": v for k, v in card.get("recorded", {}).items()}).items():
+        if values is not None and len(values) != n:
             raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
     for low, high in card.get("qpos_range", []):
         if low is not None and high is not None and not low < high:
@@ -227,6 +230,37 @@ class GapModel:
             )
         if dt is not None:
             self.require_rate(dt)
+
+    @property
+    def heaviest(self) -> float:
+        """Largest payload in its training data, kg; where an old card does not say, the largest it can be told."""
+        return float(max(self.card.get("payload_seen", [self.config.payload_max])))
+
+    def require_payload(self, payload_mass: Array | float, extrapolate: bool = False) -> None:
+        """Refuse payloads (kg) that are none, or lie beyond those trained on unless `extrapolate`."""
+        mass = np.asarray(payload_mass, float)
+        if not (np.isfinite(mass) & (mass >= 0)).all():
+            raise UsageError(f"payload_mass is {payload_mass}; give kg, 0 when empty")
+        least = min(self.card.get("payload_seen", [0.0]))
+        beyond = mass[(mass > self.heaviest * (1 + 1e-6)) | (mass < least * (1 - 1e-6))]
+        if beyond.size and not extrapolate:
+            raise ModelError(
+                f"{self.path}: trained with {least:g} to {self.heaviest:g} kg, asked for {beyond.flat[0]:g} kg, where "
+                "it only guesses; train on such payloads, or extrapolate (--extrapolate, extrapolate=True)"
+            )
+
+    def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
+        """Refuse a real robot whose servos have other gains (n) than those the training data were recorded with."""
+        for name, gains in (("kp", kp), ("kd", kd)):
+            recorded = self.card.get("recorded", {}).get(name)
+            for joint, was in zip(self.card["joint_names"], recorded or (), strict=False):
+                now = float(gains[joint_names.index(joint)])
+                if abs(now - was) > RECORDED_TOLERANCE * max(was, now):
+                    raise ModelError(
+                        f"{self.path}: its data were recorded with {name} {was:g} of {joint}, the servo has {now:.4g}; "
+                        "set the servos as they were, train on recordings with these gains (import with --kp and --kd "
+                        "if the data say them wrongly), or extrapolate (--extrapolate)"
+                    )
 
     def require_rate(self, dt: float) -> None:
         """Refuse a control period, s, that the model was not trained on."""

@@ -122,7 +122,9 @@ def play(
     robots.reset(targets[0], seeds, WARMTH)
     compensator = None
     if driven is not None:
-        compensator = Compensator(driven.robot, driven.model, driven.config, num_envs=count, nthread=nthread)
+        compensator = Compensator(
+            driven.robot, driven.model, driven.config, num_envs=count, nthread=nthread, extrapolate=True
+        )
         compensator.reset(targets[0], mass)
     out = np.empty((6, *targets.shape), np.float32)
     running = np.full(len(targets), count) if lengths is None else (lengths > np.arange(len(targets))[:, None]).sum(1)
