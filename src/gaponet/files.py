@@ -19,8 +19,8 @@ from gaponet.errors import FolderError
 
 MARK = ".gaponet"
 # What tells folders that were written before there was a mark.
-EARLIER = {"dataset": "dataset.json", "run": "split.json", "comparison": "cells/*/setup.json",
-           "experiments": "cells/*/setup.json", "model": "card.json"}  # fmt: skip
+EARLIER = {"dataset": "dataset.json", "run": "split.json", "experiments": "cells/*/setup.json",
+           "model": "card.json"}  # fmt: skip
 
 _held: set[tuple[str, int]] = set()  # folders of this process's threads
 

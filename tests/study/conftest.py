@@ -6,6 +6,7 @@ import pytest
 from arm import commands, record
 
 from gaponet.data.store import Dataset
+from gaponet.study.found import Found
 from gaponet.study.options import Options
 from gaponet.study.study import Study
 
@@ -24,5 +25,16 @@ def make_study(arm, tmp_path):
                         ctrl = commands(40, seed, 1 / rate)
                         data.append(record(robot, ctrl, f"motion{seed}", payload, kp=0.5, delay=2, unit=unit))
         return Study.of(data, arm, tmp_path / "out", Options(**how))
+
+    return make
+
+
+@pytest.fixture
+def make_found():
+    """make_found({word or (word, unit left out): outcomes}, baselines): what cells would have given."""
+
+    def make(runs, base, cells=None):
+        runs = {key if isinstance(key, tuple) else (key, ""): part for key, part in runs.items()}
+        return Found(runs, lambda key: base.get(key, base), cells or {})
 
     return make

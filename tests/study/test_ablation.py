@@ -2,7 +2,7 @@
 
 import pytest
 
-from gaponet.study.ablation import DEFAULT, PAPER, cells, result, rows
+from gaponet.study.ablation import DEFAULT, PAPER, Ablation, rows
 from gaponet.study.options import Options
 
 
@@ -44,26 +44,28 @@ def test_with_two_rates_all_but_the_rows_about_them_are_trained_on_the_slower(ma
 
 def test_settings_that_ask_the_simulator_have_fewer_seeds(make_study):
     study = make_study(seeds=3)
-    made = cells(study, rows(study)[0], bound_seeds=1)
+    made = Ablation(bound_seeds=1).cells(study)
     seeds = {}
     for cell in made:
         seeds.setdefault(cell.variant.name, []).append(cell.seed)
     assert seeds.pop("gaponet:sensors=oracle") == seeds.pop("gaponet:sensors=learned") == [0]
     assert set(map(tuple, seeds.values())) == {(0, 1, 2)}
-    assert {c.variant.name for c in cells(study, rows(study)[0], bound_seeds=0)} == set(seeds)
+    assert {c.variant.name for c in Ablation(bound_seeds=0).cells(study)} == set(seeds)
 
 
-def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study):
-    study = make_study()
-    lines = [r for r in rows(study)[0] if r.factor in ("payload input", "branch")]
+NOMINAL = {"nominal": {"known": {"mpjae": 0.01}}}
+
+
+def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study, make_found):
     data = {DEFAULT: found(0.001, 0.003), "gaponet:payload_input=off": found(0.0041, 0.0039)}
-    made = result(study, lines, data, dict.fromkeys(data, 0.01), ["One failed."])
-    texts = made.tables[0].texts()
-    assert texts[0] == ["payload input: in (default)", "2.00 ± 1.41", "0.20 ± 0.14", "", "2.00 ± 1.41", "10", "1.00",
-                        "0.016 to 0.019"]  # fmt: skip
-    assert texts[1][:4] == ["payload input: out", "4.00 ± 0.14", "0.40 ± 0.01", "2.70 ± 1.98"]  # 4.1 / 1, 3.9 / 3
-    assert texts[3] == ["branch: stacked", "", "", "", "", "", "", ""]  # nothing came of it, and it is not invented
-    assert made.sentences[-1] == "One failed."
+    made = Ablation().result(make_study(), make_found(data, NOMINAL))
+    texts = {row[0]: row[1:] for row in made.tables[0].texts()}
+    assert texts["payload input: in (default)"] == [
+        "2.00 ± 1.41", "0.20 ± 0.14", "", "2.00 ± 1.41", "10", "1.00", "0.016 to 0.019"
+    ]  # fmt: skip
+    assert texts["payload input: out"][:3] == ["4.00 ± 0.14", "0.40 ± 0.01", "2.70 ± 1.98"]  # 4.1 / 1, 3.9 / 3
+    assert texts["branch: stacked"] == [""] * 7  # nothing came of it, and it is not invented
+    assert made.sentences[-1] == "Control rates were not compared: the dataset holds 50 Hz alone."
 
 
 @pytest.mark.parametrize(
@@ -71,11 +73,10 @@ def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study):
     [((0.0030, 0.0031), (0.0040, 0.0041), "disagrees"), ((0.0040, 0.0041), (0.0030, 0.0031), "agrees"),
      ((0.003, 0.005), (0.003, 0.0051), "finds no difference")],
 )  # fmt: skip
-def test_where_the_paper_is_contradicted_the_sentence_says_so(make_study, with_it, without, verdict):
-    study = make_study()
-    lines = [r for r in rows(study)[0] if r.factor == "payload input"]
+def test_where_the_paper_is_contradicted_the_sentence_says_so(make_study, make_found, with_it, without, verdict):
     data = {DEFAULT: found(*with_it), "gaponet:payload_input=off": found(*without)}
-    (sentence,) = (s for s in result(study, lines, data, dict.fromkeys(data, 0.01), []).sentences if "paper" in s)
+    said = Ablation().result(make_study(), make_found(data, NOMINAL)).sentences
+    (sentence,) = (s for s in said if "paper" in s)
     assert f"this run {verdict}" in sentence
     assert "'out' (0.012 to 0.015)" in sentence
 
@@ -84,30 +85,27 @@ def test_the_paper_s_numbers_are_those_that_are_known_and_no_others():
     assert PAPER == {"payload_input=on": (0.016, 0.019), "payload_input=off": (0.012, 0.015)}
 
 
-def test_one_seed_is_called_one_seed(make_study):
-    study = make_study()
-    lines = [r for r in rows(study)[0] if r.factor == "branch"]
+def test_one_seed_is_called_one_seed(make_study, make_found):
     data = {DEFAULT: found(0.002), "gaponet:branch=stacked": found(0.003)}
-    sentences = result(study, lines, data, dict.fromkeys(data, 0.01), []).sentences
+    sentences = Ablation().result(make_study(), make_found(data, NOMINAL)).sentences
     assert "branch: stacked 50 % more than the default (one seed)." in sentences
 
 
-def test_what_a_seed_does_to_both_is_no_difference_and_hides_none(make_study):
-    study = make_study()
-    lines = [r for r in rows(study)[0] if r.factor in ("branch", "payload input")]
+def test_what_a_seed_does_to_both_is_no_difference_and_hides_none(make_study, make_found):
     data = {DEFAULT: found(0.002, 0.003, 0.004), "gaponet:branch=stacked": found(0.0021, 0.0031, 0.0042),
             "gaponet:payload_input=off": found(0.0022, 0.0028, 0.004)}  # fmt: skip
-    sentences = result(study, lines, data, dict.fromkeys(data, 0.01), []).sentences
+    sentences = Ablation().result(make_study(), make_found(data, NOMINAL)).sentences
     assert "branch: stacked 4 % more than the default (seeds ± 1 %)." in sentences
     assert "payload input: out no different from the default (+1 %, seeds ± 8 %)." in sentences
 
 
-def test_a_rehearsal_lies_beside_the_real_thing_and_is_called_one(make_study, tmp_path):
+def test_a_rehearsal_lies_beside_the_real_thing_and_is_called_one(make_study, make_found, tmp_path):
     study = make_study(quick=True)
     assert study.out == tmp_path / "out" / "rehearsal"
     assert study.seeds == 1
     assert len(study.data) < 8 * 3 * 2 + 1
-    made = result(study, rows(study)[0][:2], {DEFAULT: found(0.002)}, {DEFAULT: 0.01}, [])
+    made = Ablation().result(study, make_found({DEFAULT: found(0.002)}, NOMINAL))
     assert "REHEARSAL" in made.title
     assert "mean nothing" in made.facts["rehearsal"]
+    assert any("Oracle and learned sensors were left out" in s for s in made.sentences)
     assert Options().quick is False

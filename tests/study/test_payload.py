@@ -3,7 +3,7 @@
 import pytest
 
 from gaponet.errors import UsageError
-from gaponet.study.payload import ALL, BLIND, cells, questions, result
+from gaponet.study.payload import ALL, BLIND, Payload
 
 
 def found(*mpjae, payloads=("0", "0.1", "0.2")):
@@ -13,9 +13,9 @@ def found(*mpjae, payloads=("0", "0.1", "0.2")):
 
 def test_the_two_heaviest_are_left_out_by_default_and_each_is_asked_blind_too(make_study):
     study = make_study(seeds=1)
-    asked = questions(study.data)
+    asked = Payload().left_out(study.data)
     assert [(q.name, q.payload) for q in asked] == [("between", 0.1), ("beyond", 0.2)]
-    made = cells(study, asked)
+    made = Payload().cells(study)
     assert {c.variant.config.holdout_payloads for c in made} == {(), (0.1,), (0.2,)}
     assert sum(not c.variant.config.model.payload_input for c in made) == 3
 
@@ -23,19 +23,19 @@ def test_the_two_heaviest_are_left_out_by_default_and_each_is_asked_blind_too(ma
 def test_a_payload_that_cannot_be_between_or_beyond_is_refused(make_study):
     data = make_study().data
     with pytest.raises(UsageError, match=r"--between 0\.2: lies not between payloads"):
-        questions(data, between=0.2)
+        Payload(between=0.2).left_out(data)
     with pytest.raises(UsageError, match=r"--beyond 0\.1: is not the lightest or heaviest"):
-        questions(data, beyond=0.1)
+        Payload(beyond=0.1).left_out(data)
 
 
 def test_two_payloads_are_too_few(make_study):
     with pytest.raises(UsageError, match="needs 3"):
-        questions(make_study(payloads=(0.0, 0.2)).data)
+        Payload().left_out(make_study(payloads=(0.0, 0.2)).data)
 
 
-def test_errors_at_the_payload_left_out_are_what_is_said(make_study):
+def test_errors_at_the_payload_left_out_are_what_is_said(make_study, make_found):
     study = make_study()
-    asked = questions(study.data)
+    asked = Payload().left_out(study.data)
     told, blind = asked[0].words
     base = {"nominal": found(0.010)[0], "delay_offset": found(0.008)[0]}
     data = {
@@ -44,7 +44,7 @@ def test_errors_at_the_payload_left_out_are_what_is_said(make_study):
         blind: found(0.006, 0.0061),
         ALL + BLIND: found(0.004),
     }
-    made = result(study, asked, data, base, [])
+    made = Payload().result(study, make_found(data, base))
     # At 0.1 kg everything is doubled: nominal 20 mrad, told 6.1, with it in training 4.1, not told 12.1.
     assert made.sentences == (
         "At 0.1 kg, between the payloads trained on, 0.30 of the nominal 20.00 mrad is left; with it in training 4.10 "

@@ -2,163 +2,106 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from gaponet.cli.experiment_unit import delivery, tracking
 from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out, show_result, writes
-from gaponet.cli.progress import bars
-from gaponet.study.options import Options
+from gaponet.cli.progress import bar, bars
+from gaponet.errors import UsageError
+from gaponet.study.ablation import Ablation
+from gaponet.study.data import Data
+from gaponet.study.found import Question, answer, train_all
+from gaponet.study.options import MODELS, Options
+from gaponet.study.payload import Payload
+from gaponet.study.played.delivery import Delivery
+from gaponet.study.played.session import Playing, Session, study_to_play
+from gaponet.study.played.tracking import Tracking
+from gaponet.study.study import Study, expected_s
+from gaponet.study.unit import Unit
 
 if TYPE_CHECKING:
+    from gaponet.data.store import Dataset
+    from gaponet.robot import RobotSpec
     from gaponet.study.pool import Cell
-    from gaponet.study.result import Result
-    from gaponet.study.study import Show, Study
 
-Shared = Annotated[Options, tyro.conf.arg(name="")]
-MODELS = ("gaponet", "mlp:mlp_match=on")
-
-
-@writes("experiments")
-def ablation(
-    dataset: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    holdout_units: tuple[str, ...] = (),
-    bound_seeds: int = 1,
-    options: Shared = Options(),  # noqa: B008
-) -> None:
-    """Table 2 of the paper and our own switches: what each choice of the operator is worth, one changed at a time.
-
-    The same command again goes on where it was. About an hour and a half on two cores; --quick in under five minutes.
-
-    Args:
-        dataset: Dataset folder.
-        out: Folder of the results; its report.html shows all experiments in it.
-        holdout_units: Units never trained on; shown in a column of their own.
-        bound_seeds: Seeds of oracle and learned sensors, for which the simulator itself is asked: ten times as long.
-            0, or --quick, leaves them out.
-        options: Shared.
-    """
-    import gaponet.study.ablation as table2
-
-    study = _study(dataset, out, options, holdout_units)
-    bound_seeds = 0 if options.quick else bound_seeds
-    cells = table2.cells(study, table2.rows(study)[0], bound_seeds)
-    _carry_out(study, cells, lambda show: table2.run(study, bound_seeds, show), options)
+FLAT = tyro.conf.arg(name="")
+Shared = Annotated[Options, FLAT]
+PLAYED = (Tracking, Delivery)
 
 
-@writes("experiments")
-def payload(
-    dataset: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    between: float | None = None,
-    beyond: float | None = None,
-    holdout_units: tuple[str, ...] = (),
-    options: Shared = Options(),  # noqa: B008
-) -> None:
-    """Payloads never trained on, one between those trained on and one beyond them, told the mass and not told.
-
-    Args:
-        dataset: Dataset folder with three payloads or more.
-        out: Folder of the results.
-        between: kg left out on the inside; default the heaviest but one.
-        beyond: kg left out on the outside; default the heaviest.
-        holdout_units: Units never trained on.
-        options: Shared.
-    """
-    import gaponet.study.payload as experiment
-
-    study = _study(dataset, out, options, holdout_units)
-    asked = experiment.questions(study.data, between, beyond)
-    _carry_out(study, experiment.cells(study, asked), lambda show: experiment.run(study, asked, show), options)
+def carry_out(question: Question, study: Study, json: bool) -> int:
+    """Say how long it will take, train, and show what came out; returns how many trainings failed."""
+    screen, cells = Out(json), question.cells(study)
+    with _trainings(cells, study, screen) as show:
+        result = answer(question, study, show)
+    show_result(result, study.out, screen)
+    return sum(not c.done for c in cells)
 
 
-@writes("experiments")
-def unit(
-    dataset: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    models: tuple[str, ...] = MODELS,
-    options: Shared = Options(),  # noqa: B008
-) -> None:
-    """Leave one unit out, each in turn: how well is a unit served that training never saw?
-
-    Args:
-        dataset: Dataset folder with two units or more.
-        out: Folder of the results.
-        models: As of gaponet compare.
-        options: Shared.
-    """
-    import gaponet.study.unit as experiment
-
-    study = _study(dataset, out, options)
-    cells = [c for fold in experiment.cells(study, models).values() for c in fold]
-    _carry_out(study, cells, lambda show: experiment.run(study, models, show), options)
-
-
-@writes("experiments")
-def data(
-    dataset: tyro.conf.Positional[Path],
-    out: tyro.conf.Positional[Path],
-    models: tuple[str, ...] = MODELS,
-    shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0),
-    holdout_units: tuple[str, ...] = (),
-    options: Shared = Options(),  # noqa: B008
-) -> None:
-    """Error against hours of training data: how much must be recorded?
-
-    Args:
-        dataset: Dataset folder.
-        out: Folder of the results.
-        models: As of gaponet compare.
-        shares: Parts of the training motions.
-        holdout_units: Units never trained on.
-        options: Shared.
-    """
-    import gaponet.study.data as experiment
-
-    study = _study(dataset, out, options, holdout_units)
-    cells = experiment.cells(study, models, shares)
-    _carry_out(study, cells, lambda show: experiment.run(study, models, shares, show), options)
-
-
-# Each is run while the command line is parsed; what is left to call is nothing.
-Action = (
-    Annotated[None, tyro.conf.subcommand("ablation", constructor=ablation)]
-    | Annotated[None, tyro.conf.subcommand("payload", constructor=payload)]
-    | Annotated[None, tyro.conf.subcommand("unit", constructor=unit)]
-    | Annotated[None, tyro.conf.subcommand("data", constructor=data)]
-    | Annotated[None, tyro.conf.subcommand("tracking", constructor=tracking)]
-    | Annotated[None, tyro.conf.subcommand("delivery", constructor=delivery)]
-)
-
-
-def experiment(action: Annotated[tyro.conf.OmitSubcommandPrefixes[Action], tyro.conf.arg(name="")]) -> None:
-    """Experiments with a question each: tables, figures and sentences in OUT, one report.html over all."""
-
-
-def _study(dataset: Path, out: Path, options: Options, holdout_units: tuple[str, ...] = ()) -> Study:
-    from gaponet.study.study import Study
-
-    opened, robot = open_dataset(dataset, options.robot)
-    return Study.of(opened, robot, out, options, holdout_units)
-
-
-def _carry_out(study: Study, cells: list[Cell], run: Callable[[Show], Result], options: Options) -> None:
-    """Say how long it will take, train, and show what came out."""
-    from gaponet.study.study import expected_s
-
-    screen, todo = Out(options.json), sum(not c.done for c in cells)
-    words = len({c.variant.name for c in cells})
+def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
+    todo = sum(not c.done for c in cells)
     minutes = expected_s(cells, study) / 60
     rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
     screen.say(
-        f"{len(cells)} trainings ({words} settings), {len(cells) - todo} there already"
+        f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
         + (f"; the others take {rest}, {study.processes} at a time" if todo else "")
     )
-    with bars("trainings", todo) as show:
-        result = run(show)
-    show_result(result, study.out, screen)
+    return bars("trainings", todo)
+
+
+def _ask(kind: type[Any], dataset: Path, out: Path, question: Any, options: Options) -> None:
+    data, robot = open_dataset(dataset, options.robot)
+    if kind in PLAYED:
+        _play(question, data, robot, out, options)
+    else:
+        carry_out(question, Study.of(data, robot, out, options, question.holdout_units), options.json)
+
+
+def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+    """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
+    data.require_robot(robot)
+    question.require(data)
+    screen, runs, part = Out(options.json), question.runs, data
+    if not runs:
+        study = study_to_play(question, data, robot, out, options)
+        cells = study.cells(MODELS)
+        with _trainings(cells, study, screen) as show:
+            failed = train_all(cells, study, show)
+        if failed:
+            raise UsageError(f"{failed[0]}; run it again to retry")
+        runs, part, out = tuple(c.folder for c in cells), study.data, study.out
+    session = Session.of(question, part, data, robot.nominal or robot, runs, out, options.quick)
+    with bar("playing") as update:
+        result = question.play(session, lambda what, share: update(share, 1.0, what))
+    show_result(result, out, screen)
+
+
+def _command(kind: type[Any]) -> Any:
+    """A question's command: its fields are options."""
+
+    @writes("experiments")
+    def ask(dataset: Any, out: Any, question: Any, options: Any = Options()) -> None:  # noqa: B008
+        _ask(kind, dataset, out, question, options)
+
+    place = tyro.conf.Positional[Path]
+    ask.__annotations__ = {"dataset": place, "out": place, "question": Annotated[kind, FLAT], "options": Shared}
+    trained_on = " that the models were trained on" if kind in PLAYED else ""
+    ask.__doc__ = "\n    ".join((
+        f"{inspect.getdoc(kind)}\n\nArgs:", f"dataset: Dataset folder{trained_on}.",
+        "out: Folder of the results; its report.html shows all experiments in it.", "question: What is asked.",
+        "options: Shared.",
+    ))  # fmt: skip
+    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=ask)]
+
+
+def experiment(action: None) -> None:
+    """Experiments with a question each: tables, figures and sentences in OUT, one report.html over all."""
+
+
+# Each is run while the command line is parsed; what is left to call is nothing.
+ACTION: Any = Union[tuple(_command(kind) for kind in (Ablation, Payload, Unit, Data, *PLAYED))]  # noqa: UP007
+experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

@@ -74,7 +74,7 @@ def show_result(result: Result, out: Path, screen: Out) -> None:
     files = write(result, out)
     screen.say("", result.title)
     screen.say(result.virtual)
-    for table in result.tables:
+    for table in (t for t in result.tables if t.shown):
         screen.table("", list(table.columns), table.texts())
         if table.caption:
             screen.say(table.caption)
@@ -83,7 +83,7 @@ def show_result(result: Result, out: Path, screen: Out) -> None:
     screen.say(f"written: {', '.join(str(f) for f in files)}")
     screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
                    "sentences": list(result.sentences), "files": [str(f) for f in files],
-                   "tables": {t.name: {"columns": t.columns, "rows": t.records()} for t in result.tables}})  # fmt: skip
+                   "tables": {t.name: t.record() for t in result.tables if t.shown}})  # fmt: skip
 
 
 def writes(kind: str) -> Callable[[Command], Command]:

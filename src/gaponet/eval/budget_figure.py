@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
+from textwrap import wrap
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from gaponet.plot.methods import COLOURS
-from gaponet.plot.style import figure, styled
+from gaponet.plot.methods import colour, title
+from gaponet.plot.style import figure, joint_label, styled
 
-TITLES = {
-    "nominal": "nominal", "delay": "delay", "offset": "offset", "identified": "identifi-\ncation", "mlp": "MLP",
-    "gaponet": "GAPONet",
-}  # fmt: skip
-FILL = COLOURS | {"delay": "#d99000", "offset": "#b36b00"}
 COLUMNS = 4  # at most
 
 
@@ -30,11 +26,11 @@ def waterfall(budget: dict[str, Any]) -> Figure:
         ax.set_visible(False)
     for i, (ax, (name, panel)) in enumerate(zip(axes.flat, panels.items(), strict=False)):
         _panel(ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, 1e3 * panel["floor"]["both"])
-        ax.set_title(name.removesuffix("_joint").replace("_", " "))
+        ax.set_title(joint_label(name, wrapped=False))
         if i % columns == 0:
             ax.set_ylabel("MPJAE, mrad")
         bottom = i + columns >= len(panels)
-        ax.set_xticks(range(len(steps) + 1), [*(TITLES[s] for s in steps), "left"] if bottom else [], fontsize=6.5)
+        ax.set_xticks(range(len(steps) + 1), [*(_tick(s) for s in steps), "left"] if bottom else [], fontsize=6.5)
     who = "VIRTUAL " if budget["virtual"] else "real "
     fig.suptitle(
         f"{who}{budget['robot']}, {budget['sequences']} {'held-out ' if budget['unseen'] else ''}recordings: "
@@ -46,12 +42,12 @@ def waterfall(budget: dict[str, Any]) -> Figure:
 
 def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float) -> None:
     before = left[steps[0]]
-    ax.bar(0, before, color=FILL["nominal"])
+    ax.bar(0, before, color=colour("nominal"))
     for k, step in enumerate(steps[1:], 1):
         after = left[step]
         adds = after > before
-        ax.bar(k, abs(before - after), bottom=min(before, after), color="white" if adds else FILL[step],
-               edgecolor=FILL[step], lw=1.0)  # fmt: skip
+        ax.bar(k, abs(before - after), bottom=min(before, after), color="white" if adds else colour(step),
+               edgecolor=colour(step), lw=1.0)  # fmt: skip
         ax.plot([k - 0.6, k + 0.4], [before, before], color="#555555", lw=0.6)
         before = after
     ax.plot([len(steps) - 0.6, len(steps) + 0.4], [before, before], color="#555555", lw=0.6)
@@ -62,3 +58,8 @@ def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float) -> N
         ax.axhline(floor, ls=(0, (4, 2)), lw=0.8, color="#2a9d6f")
     ax.grid(axis="x", visible=False)
     ax.margins(y=0.12)
+
+
+def _tick(step: str) -> str:
+    """The step's name in the width of a bar: a word a line, long ones broken."""
+    return "\n".join("-\n".join(wrap(word, 8)) for word in title(step).removesuffix(" simulator").split())

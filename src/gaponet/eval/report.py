@@ -15,6 +15,7 @@ from gaponet.eval.page import facts_table, figure, page, table
 from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
+from gaponet.plot.methods import title
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
@@ -91,7 +92,7 @@ def _page(
     from gaponet.eval import figures as draw
 
     methods, kind = metrics["methods"], card["model"]["kind"]
-    name = draw.NAMES[kind]
+    name = title(kind)
     tag = (
         '<span class="tag virtual">VIRTUAL robot</span>'
         if metrics["virtual"]
@@ -100,11 +101,11 @@ def _page(
     ratio = metrics["ratio_to_nominal"]
     body = [
         f"<h1>{html.escape(robot.description)}: {name}</h1><p>{tag} {_facts_line(card, metrics)}</p>",
-        f'<p class="lead">{_verdict(draw.NAMES, kind, methods, ratio)}</p>',
+        f'<p class="lead">{_verdict(kind, methods, ratio)}</p>',
         *(f'<div class="warn">{html.escape(text)}</div>' for text in warnings(card, metrics)),
         "<h2>Errors, whole-motion free run on held-out recordings</h2>" if metrics["unseen"]
         else "<h2>Errors, whole-motion free run (some recordings were used in training)</h2>",
-        _totals(methods, draw.NAMES, ratio),
+        _totals(methods, ratio),
         '<div class="row">', figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
         figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
     ]  # fmt: skip
@@ -120,7 +121,7 @@ def _page(
         "<h2>Training</h2>", '<div class="row">',
         figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
         _training_table(card, config), "</div>",
-        "<h2>By motion</h2>", _by_motion(methods, draw.NAMES),
+        "<h2>By motion</h2>", _by_motion(methods),
         "<h2>What exactly</h2>", _facts(card, metrics),
     ]  # fmt: skip
     return page(f"{robot.name} {name}", "".join(body))
@@ -174,11 +175,11 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
     return out
 
 
-def _verdict(names: dict[str, str], kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
+def _verdict(kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
     own, base = methods[kind]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
     change = f"{abs(1 - ratio[kind]) * 100:.0f} % {'less' if ratio[kind] <= 1 else 'MORE'} error"
-    text = f"{names[kind]} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
-    others = [f"{names[n]} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
+    text = f"{title(kind)} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
+    others = [f"{title(n)} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
     return text + (f" ({', '.join(others)} mrad)." if others else ".")
 
 
@@ -190,11 +191,11 @@ def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> str:
     )
 
 
-def _totals(methods: dict[str, Any], names: dict[str, str], ratio: dict[str, float]) -> str:
+def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> str:
     head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static, mrad", "dynamic, mrad",
             "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
     rows = [
-        [names[n], f"{m['mpjae'] * 1e3:.2f}", f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['q_dis']:.3f}",
+        [title(n), f"{m['mpjae'] * 1e3:.2f}", f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['q_dis']:.3f}",
          f"{m['static'] * 1e3:.2f}", f"{m['dynamic'] * 1e3:.2f}", f"{m['large_0.05'] * 100:.1f} %",
          f"{m['large_0.1'] * 100:.2f} %", f"{m['correlation']:.4f}"]
         for n, m in methods.items()
@@ -202,8 +203,8 @@ def _totals(methods: dict[str, Any], names: dict[str, str], ratio: dict[str, flo
     return table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
 
 
-def _by_motion(methods: dict[str, Any], names: dict[str, str]) -> str:
-    head = ["motion, MPJAE in mrad", *(names[n] for n in methods)]
+def _by_motion(methods: dict[str, Any]) -> str:
+    head = ["motion, MPJAE in mrad", *(title(n) for n in methods)]
     keys = methods["nominal"]["by_motion"]
     return table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
 

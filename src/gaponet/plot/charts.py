@@ -1,16 +1,18 @@
-"""The figures of experiments: dots with error bars by choice, lines over an amount, bars by group."""
+"""What is drawn more than once: bars by group, dots by choice, lines over an amount, motions against a reference."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from gaponet.plot.methods import COLOURS
-from gaponet.plot.style import figure, styled
+from gaponet.plot.style import DASHED, figure, legend, styled
 
 
 class Spread(Protocol):
@@ -22,8 +24,90 @@ class Spread(Protocol):
     def std(self) -> float: ...
 
 
+@dataclass(frozen=True)
+class Once:
+    """A number measured once."""
+
+    mean: float
+    std: float = math.nan
+
+
+Array = np.ndarray
+
+Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
 Dot = tuple[str, str, Spread, bool]  # group, name, value, whether it is the default
 GAP = 0.7  # between groups, rows
+
+
+@styled
+def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
+    """Bars with error bars, the methods of each group side by side."""
+    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7), 3.3)
+    ax = fig.subplots()
+    draw_bars(ax, groups, methods)
+    ax.set_ylabel(axis)
+    ax.set_title(title)
+    legend(fig)
+    return fig
+
+
+def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
+    """The same into axes that are there, with labels of a size of their own."""
+    width = 0.84 / len(methods)
+    for i, (label, (colour, values)) in enumerate(methods.items()):
+        x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=spreads(values), color=colour, label=label,
+               error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
+    ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
+    ax.tick_params(axis="x", length=0)
+    ax.grid(axis="x", visible=False)
+
+
+def spreads(values: ListOf[Spread]) -> Array | None:
+    """Lengths of error bars; None where nothing was measured twice."""
+    std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+    return std if std.any() else None
+
+
+@styled
+def against(
+    time: Array,
+    joints: Mapping[str, tuple[Mapping[str, Array], Array]],
+    looks: Mapping[str, tuple[str, str]],
+    reference: str,
+    title: str = "",
+    corrections: Mapping[str, Mapping[str, Array]] | None = None,
+) -> Figure:
+    """Positions by method over time, a column per joint; below them how far each is from the reference.
+
+    Args:
+        time: (T,) s.
+        joints: What the column is called → positions by method, (T,) rad, and the reference's, (T,) rad.
+        looks: Label and colour of each method and of the reference.
+        reference: Its key in looks.
+        title: Above all.
+        corrections: In a third row, Δa by method, (up to T,) rad, for each column.
+    """
+    fig = figure(3.6 * len(joints), 4.2 if corrections is None else 4.6)
+    heights = [1.6, 1] if corrections is None else [2, 1.2, 1]
+    axes = fig.subplots(len(heights), len(joints), sharex=True, squeeze=False, height_ratios=heights)
+    for column, (joint, (found, base)) in zip(axes.T, joints.items(), strict=True):
+        for method, values in found.items():
+            label, colour = looks[method]
+            column[0].plot(time, values, color=colour, label=label)
+            column[1].plot(time, (values - base) * 1e3, color=colour, lw=1.0)
+        label, colour = looks[reference]
+        column[0].plot(time, base, color=colour, ls=DASHED, lw=1.0, label=label)
+        column[1].axhline(0, color="#111111", lw=0.6)
+        for method, values in ({} if corrections is None else corrections[joint]).items():
+            column[2].plot(time[: len(values)], values * 1e3, color=looks[method][1], lw=0.9)
+        column[0].set_title(joint)
+        column[-1].set_xlabel("time, s")
+    for ax, label in zip(axes[:, 0], ("position, rad", "error, mrad", "Δa, mrad"), strict=False):
+        ax.set_ylabel(label)
+    fig.align_ylabels(axes[:, 0])
+    legend(fig, title)
+    return fig
 
 
 @styled
@@ -110,13 +194,13 @@ def lines(
                         textcoords="offset points", ha="center", va="bottom", fontsize=8, color="#555555")  # fmt: skip
         apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
         drawn = 0  # of those with error bars
-        spreading = sum(any(v.std > 0 for v in values) for _, _, values in methods.values())
+        spreading = sum(spreads(values) is not None for _, _, values in methods.values())
         for label, (colour, x, values) in methods.items():
-            std = np.array([v.std if v.std == v.std else 0.0 for v in values])
-            shift = (drawn - (spreading - 1) / 2) * apart if std.any() else 0.0
-            drawn += bool(std.any())
+            std = spreads(values)
+            shift = 0.0 if std is None else (drawn - (spreading - 1) / 2) * apart
+            drawn += std is not None
             ax.errorbar(
-                np.add(x, shift), [v.mean for v in values], yerr=std if std.any() else None, fmt="o-", ms=3.5,
+                np.add(x, shift), [v.mean for v in values], yerr=std, fmt="o-", ms=3.5,
                 color=colour, elinewidth=0.9, capsize=2, label=label,
             )  # fmt: skip
         if log:
@@ -128,35 +212,5 @@ def lines(
         ax.set_xlabel(axes[0])
         ax.set_title(title)
     fig.axes[0].set_ylabel(axes[1])
-    _legend(fig)
+    legend(fig)
     return fig
-
-
-@styled
-def bars(groups: ListOf[str], methods: Mapping[str, tuple[str, ListOf[Spread]]], axis: str, title: str) -> Figure:
-    """Bars with error bars: {label: (colour, value of each group)}."""
-    fig = figure(max(5.2, 0.2 * len(groups) * len(methods) + 1.6), 3.3)
-    ax = fig.subplots()
-    width = 0.8 / len(methods)
-    for i, (label, (colour, values)) in enumerate(methods.items()):
-        x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
-        std = np.array([v.std if v.std == v.std else 0.0 for v in values])
-        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=std if std.any() else None, color=colour,
-               error_kw={"lw": 0.8}, label=label)  # fmt: skip
-    ax.set_xticks(np.arange(len(groups)), groups)
-    ax.grid(axis="x", visible=False)
-    ax.set_ylabel(axis)
-    ax.set_title(title)
-    _legend(fig)
-    return fig
-
-
-def _legend(fig: Figure) -> None:
-    """Above the plot, in as many columns as fit; methods of all panels once."""
-    found: dict[str, Any] = {}
-    for ax in fig.axes:
-        found |= dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True))
-    columns = max(1, min(len(found), int(fig.get_figwidth() / 1.9)))
-    fig.legend(
-        list(found.values()), list(found), loc="outside upper left", ncols=columns, columnspacing=1.1, handlelength=1.4
-    )

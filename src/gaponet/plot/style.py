@@ -1,16 +1,20 @@
-"""How every figure looks, and how it is written to a file."""
+"""How every figure looks, where its legend stands, and how it is written to a file."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from gaponet.files import whole
 
-STYLE = {
+P = ParamSpec("P")
+
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -28,6 +32,8 @@ STYLE = {
     "svg.hashsalt": "gaponet",
     "figure.constrained_layout.use": True,
 }
+DASHED = (0, (4, 1.5))
+ENTRY = 1.9  # inches that a legend's entry takes
 
 
 def figure(width: float, height: float) -> Figure:
@@ -35,22 +41,40 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height))
 
 
-def styled(draw: Any) -> Any:
+def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     """Decorator: draw under STYLE."""
 
-    def wrapped(*args: Any, **kwargs: Any) -> Figure:
-        with mpl.rc_context(STYLE):  # type: ignore[arg-type]
+    @wraps(draw)
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        with mpl.rc_context(STYLE):
             return draw(*args, **kwargs)
 
-    wrapped.__doc__ = draw.__doc__
     return wrapped
+
+
+def legend(fig: Figure, title: str = "", below: bool = False) -> None:
+    """Each label of all axes once, in as many columns as fit, never over the data; with a title, one for the figure."""
+    found: dict[str, Any] = {}
+    for ax in fig.axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    fig.legend(
+        list(found.values()), list(found), loc="outside lower left" if below else "outside upper left",
+        ncols=max(1, min(len(found), int(fig.get_figwidth() / ENTRY))), columnspacing=1.1, handlelength=1.4,
+        title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
+    )  # fmt: skip
+
+
+def joint_label(joint: str, wrapped: bool = True) -> str:
+    """left_shoulder_pitch_joint → left shoulder pitch, wrapped: a word a line, since tick labels stand side by side."""
+    return joint.removesuffix("_joint").replace("_", "\n" if wrapped else " ")
 
 
 def save(fig: Figure, path: Path) -> list[Path]:
     """SVG with letters as outlines, so that it looks the same everywhere, and PNG for screens and slides."""
     files = [path.with_suffix(".svg"), path.with_suffix(".png")]
     how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
-    with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):  # type: ignore[arg-type]
+    with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):
         for file, options in zip(files, how, strict=True):
             with whole(file) as temporary:
                 fig.savefig(temporary, **options)

@@ -5,13 +5,15 @@ A setting that is the default is the default's own cells, trained once, in whate
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from gaponet.plot.charts import dots
+from gaponet.study.found import Found, spread
 from gaponet.study.pool import Cell
-from gaponet.study.result import Result, label
-from gaponet.study.study import Found, Show, Study, baselines, outcomes, rates_of, spread, train_all
-from gaponet.study.table import Cell as TableCell
+from gaponet.study.result import Result
+from gaponet.study.study import Study, rates_of
 from gaponet.study.table import Spread, Table, compared_by_seed
 from gaponet.study.variant import parse_variant
 from gaponet.train.config import TrainConfig
@@ -40,6 +42,9 @@ FACTORS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("warm start", (("on", ""), ("off, PPO alone", COLD))),
     ("correction limit", tuple((f"{d:g} rad", f"delta_max={d:g}") for d in (0.1, 0.3, 0.6))),
 )
+
+
+Seeds = dict[str, dict[int, float]]  # word → seed → MPJAE of nominal
 
 
 @dataclass(frozen=True)
@@ -83,64 +88,64 @@ def _word(change: str, config: TrainConfig) -> str:
     return DEFAULT if same else word
 
 
-def cells(study: Study, lines: list[Row], bound_seeds: int = 1) -> list[Cell]:
-    """One for each distinct setting and seed.
+@dataclass(frozen=True)
+class Ablation:
+    """Table 2 of the paper and our own switches: what each choice of the operator is worth, one changed at a time.
 
-    Args:
-        study: What is run.
-        lines: Of rows().
-        bound_seeds: Seeds of settings in which the simulator itself answers; they take many times as long. 0: none.
+    The same command again goes on where it was. About an hour and a half on two cores; --quick in under five minutes.
     """
-    words = list(dict.fromkeys([DEFAULT, *(r.word for r in lines)]))
-    bound = [w for w in words if study.variant(w).config.model.asks_simulator]
-    made = study.cells([w for w in words if w not in bound])
-    return made + (study.cells(bound, min(bound_seeds, study.seeds)) if bound and bound_seeds else [])
+
+    bound_seeds: int = 1
+    """Seeds of oracle and learned sensors, for which the simulator itself is asked: ten times as long. 0, or --quick,
+    leaves them out."""
+    holdout_units: tuple[str, ...] = ()
+    """Units never trained on; shown in a column of their own."""
+
+    def cells(self, study: Study) -> list[Cell]:
+        """One for each distinct setting and seed; fewer seeds where the simulator itself answers."""
+        words = list(dict.fromkeys([DEFAULT, *(r.word for r in rows(study)[0])]))
+        bound = [w for w in words if study.variant(w).config.model.asks_simulator]
+        made = study.cells([w for w in words if w not in bound])
+        seeds = 0 if study.rehearsal else min(self.bound_seeds, study.seeds)
+        return made + (study.cells(bound, seeds) if bound and seeds else [])
+
+    def result(self, study: Study, found: Found) -> Result:
+        """A row per setting."""
+        lines, missing = rows(study)
+        if study.rehearsal or not self.bound_seeds:
+            missing.append("Oracle and learned sensors were left out (--bound-seeds 0, --quick).")
+        seeds = {
+            word: {run["seed"]: run["known"]["mpjae"] / nominal for run in runs}
+            for (word, _), runs in found.runs.items()
+            for nominal in (found.base("nominal", "known", "mpjae", word=word, scale=1).mean,)
+        }
+        default = Spread.of([1.0])
+        worth = {w: default if w == DEFAULT else _paired(seeds, w, DEFAULT) for w in seeds}
+        figure = dots(
+            [(r.factor, r.setting, worth[r.word], r.word == DEFAULT) for r in lines
+             if r.word in worth and DEFAULT in seeds],
+            "MPJAE of the default's with the same seed", f"What each choice is worth\n{study.who}",
+        )  # fmt: skip
+        table = _table(lines, found, seeds, worth)
+        said = [*_sentences(lines, seeds, worth), *missing]
+        return found.result(study, "ablation", "Ablation of the operator", [table], {"ablation": figure}, said)
 
 
-def run(study: Study, bound_seeds: int, show: Show) -> Result:
-    """Train what is missing and make the table."""
-    lines, missing = rows(study)
-    if not bound_seeds:
-        missing.append("Oracle and learned sensors were left out (--bound-seeds 0, --quick).")
-    trained = cells(study, lines, bound_seeds)
-    missing += train_all(trained, study, show)
-    found = outcomes(trained)
-    first = {c.variant.name: c for c in reversed(trained) if c.done}
-    nominal = {word: baselines(cell, study)["nominal"]["known"]["mpjae"] for word, cell in first.items()}
-    return result(study, lines, found, nominal, missing)
-
-
-def result(
-    study: Study, lines: list[Row], found: dict[str, list[Found]], nominal: dict[str, float], missing: list[str]
-) -> Result:
-    """Table, figure and sentences.
-
-    Args:
-        study: What was run.
-        lines: Of the table.
-        found: Word → what each seed gave.
-        nominal: Word → the nominal simulator's MPJAE on the same test motions, rad.
-        missing: What is to be said about lines that are not there.
-    """
-    new = any("new" in f for part in found.values() for f in part)
-    columns = ["choice", "MPJAE, mrad", "of nominal", "of default, by seed", "Q_dis, mrad·s"]
-    columns += [*(["new unit, mrad"] * new), "weights", "minutes", "paper"]
-    table: list[tuple[TableCell, ...]] = []
-    ratio: dict[str, Spread] = {}
-    seeds = {word: _by_seed(cells, nominal[word]) for word, cells in found.items()}
+def _table(lines: list[Row], found: Found, seeds: Seeds, worth: Mapping[str, Spread]) -> Table:
+    new = any("new" in f for part in found.runs.values() for f in part)
+    table: list[tuple[Any, ...]] = []
     for row in lines:
-        cells = found.get(row.word, [])
-        if cells:
-            ratio[row.word] = Spread.of(seeds[row.word].values())
+        cells = found.of_word(row.word)
         table.append((
             f"{row.factor}: {row.setting}{' (default)' if row.word == DEFAULT else ''}",
-            spread(cells, "known", "mpjae"), ratio.get(row.word),
-            _paired(seeds, row.word, DEFAULT) if cells and row.word != DEFAULT else None,
-            spread(cells, "known", "q_dis"),
+            spread(cells, "known", "mpjae"), Spread.of(seeds[row.word].values()) if cells else None,
+            worth[row.word] if cells and row.word != DEFAULT else None, spread(cells, "known", "q_dis"),
             *([spread(cells, "new", "mpjae")] * new), cells[0]["parameters"] if cells else None,
-            Spread.of([f["seconds"] for f in cells], 1 / 60).mean if cells else None,
+            spread(cells, "seconds", scale=1 / 60).mean if cells else None,
             f"{row.paper[0]:g} to {row.paper[1]:g}" if row.paper else None,
         ))  # fmt: skip
+    columns = ("choice", "MPJAE, mrad", "of nominal", "of default, by seed", "Q_dis, mrad·s",
+               *(["new unit, mrad"] * new), "weights", "minutes", "paper")  # fmt: skip
     caption = (
         "MPJAE: mean over joints and held-out motions of the whole-motion free run, mean ± std over seeds; of nominal: "
         "on the same motions at the same rate; of default: the ratio of both with the same seed, which does not "
@@ -148,56 +153,31 @@ def result(
         "not known here; blank where no number of it is. Oracle and learned sensors ask the simulator itself, which "
         "no robot can."
     )
-    one = Spread.of([1.0])
-    shown = [
-        (r.factor, r.setting, one if r.word == DEFAULT else _paired(seeds, r.word, DEFAULT), r.word == DEFAULT)
-        for r in lines
-        if r.word in ratio and DEFAULT in ratio
-    ]
-    return Result(
-        "ablation",
-        f"Ablation of the operator, {study.who}",
-        label(study.data),
-        study.facts(found),
-        (Table("table2", tuple(columns), tuple(table), caption),),
-        {
-            "ablation": dots(
-                shown, "MPJAE of the default's with the same seed", f"What each choice is worth\n{study.who}"
-            )
-        },
-        (*_sentences(lines, ratio, seeds), *missing),
-    )
+    return Table("table2", columns, tuple(table), caption)
 
 
-def _by_seed(cells: list[Found], nominal: float) -> dict[int, float]:
-    """Seed → MPJAE of nominal."""
-    return {c["seed"]: c["known"]["mpjae"] / nominal for c in cells}
-
-
-def _paired(seeds: dict[str, dict[int, float]], word: str, other: str) -> Spread:
+def _paired(seeds: Seeds, word: str, other: str) -> Spread:
     """The ratio of two settings, seed by seed: both have drawn the same states and start weights."""
     a, b = seeds[word], seeds.get(other, {})
     return Spread.of([a[seed] / b[seed] for seed in a if seed in b])
 
 
-def _sentences(lines: list[Row], ratio: dict[str, Spread], seeds: dict[str, dict[int, float]]) -> list[str]:
+def _sentences(lines: list[Row], seeds: Seeds, worth: Mapping[str, Spread]) -> list[str]:
     """The best and the worst of each choice against the default, and where the paper found otherwise."""
-    if DEFAULT not in ratio:
+    if DEFAULT not in seeds:
         return []
-    out = [f"The default leaves {ratio[DEFAULT].mean:.2f} of the nominal error."]
+    out = [f"The default leaves {Spread.of(seeds[DEFAULT].values()).mean:.2f} of the nominal error."]
     for factor in dict.fromkeys(r.factor for r in lines):
-        mine = [r for r in lines if r.factor == factor and r.word in ratio and r.word != DEFAULT]
-        if not mine:
-            continue
-        by = {r.setting: _paired(seeds, r.word, DEFAULT) for r in mine}
-        ends = dict.fromkeys([min(by, key=lambda s: by[s].mean), max(by, key=lambda s: by[s].mean)])
-        out.append(f"{factor}: {'; '.join(compared_by_seed(s, by[s], 'the default') for s in ends)}.")
-    return [*out, *_against_paper(lines, ratio, seeds)]
+        by = {r.setting: worth[r.word] for r in lines if r.factor == factor and r.word in seeds and r.word != DEFAULT}
+        if by:
+            ends = dict.fromkeys([min(by, key=lambda s: by[s].mean), max(by, key=lambda s: by[s].mean)])
+            out.append(f"{factor}: {'; '.join(compared_by_seed(s, by[s], 'the default') for s in ends)}.")
+    return [*out, *_against_paper(lines, seeds)]
 
 
-def _against_paper(lines: list[Row], ratio: dict[str, Spread], seeds: dict[str, dict[int, float]]) -> list[str]:
+def _against_paper(lines: list[Row], seeds: Seeds) -> list[str]:
     """Pairs of settings that the paper orders, beside our order."""
-    known = [(r, r.paper) for r in lines if r.paper and r.word in ratio]
+    known = [(r, r.paper) for r in lines if r.paper and r.word in seeds]
     out = []
     for i, (a, first) in enumerate(known):
         for b, second in known[i + 1 :]:
@@ -212,6 +192,10 @@ def _against_paper(lines: list[Row], ratio: dict[str, Spread], seeds: dict[str, 
             out.append(
                 f"{a.factor}: the paper has less error with '{low.setting}' ({less[0]:g} to {less[1]:g}) than with "
                 f"'{high.setting}' ({more[0]:g} to {more[1]:g}); this run {verdict} "
-                f"({ratio[low.word].mean:.2f} against {ratio[high.word].mean:.2f} of nominal)."
+                f"({_left(seeds, low):.2f} against {_left(seeds, high):.2f} of nominal)."
             )
     return out
+
+
+def _left(seeds: Seeds, row: Row) -> float:
+    return Spread.of(seeds[row.word].values()).mean

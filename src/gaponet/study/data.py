@@ -7,32 +7,64 @@ stay the same, and so does the training budget.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
 
 from gaponet.errors import UsageError
 from gaponet.plot.charts import lines
-from gaponet.study.compare import palette
+from gaponet.plot.methods import palette, title
+from gaponet.study.found import Found
+from gaponet.study.options import MODELS
 from gaponet.study.pool import Cell
-from gaponet.study.result import Result, label
-from gaponet.study.study import Found, Show, Study, baselines, outcomes, spread, title, train_all
-from gaponet.study.table import Cell as TableCell
+from gaponet.study.result import Result
+from gaponet.study.study import Study
 from gaponet.study.table import Spread, Table
 
-SHARES = (0.125, 0.25, 0.5, 1.0)
 ENOUGH = 1.1  # of the error with all recordings
+BASELINES = ("nominal", "delay_offset")
 
 
-def cells(study: Study, words: ListOf[str], shares: ListOf[float] = SHARES) -> list[Cell]:
-    """Each model on each share of the training motions.
+@dataclass(frozen=True)
+class Data:
+    """Error against hours of training data: how much must be recorded?"""
 
-    Raises:
-        UsageError: A share is not above 0 and up to 1.
-    """
-    if not shares or min(shares) <= 0 or max(shares) > 1:
-        raise UsageError(
-            f"--shares {' '.join(f'{s:g}' for s in shares)}: give parts of the training motions, above 0, up to 1"
+    models: tuple[str, ...] = MODELS
+    """As of gaponet compare."""
+    shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
+    """Parts of the training motions."""
+    holdout_units: tuple[str, ...] = ()
+    """Units never trained on."""
+
+    def cells(self, study: Study) -> list[Cell]:
+        """Each model on each share of the training motions.
+
+        Raises:
+            UsageError: A share is not above 0 and up to 1.
+        """
+        if not self.shares or min(self.shares) <= 0 or max(self.shares) > 1:
+            given = " ".join(f"{s:g}" for s in self.shares)
+            raise UsageError(f"--shares {given}: give parts of the training motions, above 0, up to 1")
+        return study.cells([at(word, share) for word in self.models for share in sorted(set(self.shares))])
+
+    def result(self, study: Study, found: Found) -> Result:
+        """A row per share."""
+        motions, minutes = _recorded(self, found)
+        error = {w: {s: found.spread(at(w, s), "known", "mpjae") for s in minutes} for w in self.models}
+        for name in BASELINES:
+            error[name] = {s: found.base(name, "known", "mpjae", word=_word(self, found, s)) for s in minutes}
+        order = [*BASELINES, *self.models]
+        heads = (f"{title(m).removesuffix(' simulator')}, mrad" for m in order)
+        rows = tuple((f"{motions[s]}", minutes[s], *(error[m][s] for m in order)) for s in minutes)
+        caption = (
+            "MPJAE of the same held-out motions in whole-motion free run, mean ± std over seeds, all trained for the "
+            "same budget; minutes of recordings trained on, all units and payloads together."
         )
-    return study.cells([at(word, share) for word in words for share in sorted(set(shares))])
+        x, colours = list(minutes.values()), palette(order)
+        methods = {title(m): (colours[m], x, list(error[m].values())) for m in order}
+        figure = lines([(f"Error against recordings trained on\n{study.who}", methods)],
+                       ("minutes trained on", "MPJAE, mrad"), [(v, f"{v:.3g}") for v in x], log=True)  # fmt: skip
+        table = Table("data", ("training motions", "minutes", *heads), rows, caption)
+        said = [_sentence(title(w), error[w], error["nominal"], minutes) for w in self.models]
+        return found.result(study, "data", "How much must be recorded", [table], {"data": figure}, said)
 
 
 def at(word: str, share: float) -> str:
@@ -40,72 +72,23 @@ def at(word: str, share: float) -> str:
     return word if share == 1 else f"{word}:train_share={share:g}"
 
 
-def run(study: Study, words: ListOf[str], shares: ListOf[float], show: Show) -> Result:
-    """Train what is missing and make table and figure."""
-    trained = cells(study, words, shares)
-    failed = train_all(trained, study, show)
-    hours, motions, base = {}, {}, {}
-    for share in sorted(set(shares)):
-        cell = next((c for c in trained if c.done and c.variant.config.train_share == share), None)
-        if cell is not None:
-            card = json.loads((cell.folder / "model" / "card.json").read_text(encoding="utf-8"))
-            hours[share], motions[share] = card["hours"], len(card["motions"]["train"])
-            base[share] = baselines(cell, study)
-    return result(study, words, hours, motions, outcomes(trained), base, failed)
+def _word(asked: Data, found: Found, share: float) -> str:
+    """A model of which something came out with this share."""
+    return next((at(w, share) for w in asked.models if found.of_word(at(w, share))), "")
 
 
-def result(
-    study: Study,
-    words: ListOf[str],
-    hours: dict[float, float],
-    motions: dict[float, int],
-    found: dict[str, list[Found]],
-    base: dict[float, Found],
-    failed: list[str],
-) -> Result:
-    """Table, figure and sentences.
-
-    Args:
-        study: What was run.
-        words: Models.
-        hours, motions: Of training, by share.
-        found: Word with share → what each seed gave.
-        base: Share → of evaluate_baselines.
-        failed: What is to be said about cells that are not there.
-    """
-    error = {w: {s: spread(found.get(at(w, s), []), "known", "mpjae") for s in hours} for w in words}
-    nominal = {s: spread([base[s]["nominal"]], "known", "mpjae") for s in hours}
-    delayed = {s: spread([base[s]["delay_offset"]], "known", "mpjae") for s in hours}
-    columns = (
-        "training motions",
-        "minutes",
-        "nominal, mrad",
-        "delay + offset, mrad",
-        *(f"{title(w)}, mrad" for w in words),
-    )
-    rows: list[tuple[TableCell, ...]] = [
-        (f"{motions[s]}", hours[s] * 60, nominal[s], delayed[s], *(error[w][s] for w in words)) for s in hours
-    ]
-    caption = (
-        "MPJAE of the same held-out motions in whole-motion free run, mean ± std over seeds, all trained for the same "
-        "budget; minutes of recordings trained on, all units and payloads together."
-    )
-    colours = palette({w: {"kind": study.variant(w).kind} for w in words} | {k: {"kind": k} for k in
-                      ("nominal", "delay_offset")})  # fmt: skip
-    x = [h * 60 for h in hours.values()]
-    methods = {"nominal simulator": (colours["nominal"], x, list(nominal.values())),
-               "delay + offset": (colours["delay_offset"], x, list(delayed.values()))}  # fmt: skip
-    methods |= {title(w): (colours[w], x, list(error[w].values())) for w in words}
-    panel = (f"Error against recordings trained on\n{study.who}", methods)
-    figure = lines([panel], ("minutes trained on", "MPJAE, mrad"), [(v, f"{v:.3g}") for v in x], log=True)
-    return Result(
-        "data", f"How much must be recorded, {study.who}", label(study.data), study.facts(found),
-        (Table("data", columns, tuple(rows), caption),), {"data": figure},
-        (*(_sentence(title(w), error[w], nominal, hours) for w in words), *failed),
-    )  # fmt: skip
+def _recorded(asked: Data, found: Found) -> tuple[dict[float, int], dict[float, float]]:
+    """Motions and minutes trained on, by share, as the models' cards say."""
+    motions, minutes = {}, {}
+    for share in sorted(set(asked.shares)):
+        if word := _word(asked, found, share):
+            card = found.cells[word, ""][0].folder / "model" / "card.json"
+            told = json.loads(card.read_text(encoding="utf-8"))
+            motions[share], minutes[share] = len(told["motions"]["train"]), told["hours"] * 60
+    return motions, minutes
 
 
-def _sentence(name: str, error: dict[float, Spread], nominal: dict[float, Spread], hours: dict[float, float]) -> str:
+def _sentence(name: str, error: dict[float, Spread], nominal: dict[float, Spread], minutes: dict[float, float]) -> str:
     """How little is enough."""
     known = {s: e for s, e in error.items() if e.count}
     if not known:
@@ -114,12 +97,11 @@ def _sentence(name: str, error: dict[float, Spread], nominal: dict[float, Spread
     enough = min(s for s, e in known.items() if e.mean <= ENOUGH * known[whole].mean)
     least = min(known)
     left = {s: known[s].mean / nominal[s].mean for s in (least, whole)}
-    text = f"{name}: {left[whole]:.2f} of the nominal error is left with {hours[whole] * 60:.3g} minutes of recordings"
+    text = f"{name}: {left[whole]:.2f} of the nominal error is left with {minutes[whole]:.3g} minutes of recordings"
     if least != whole:
-        text += f" and {left[least]:.2f} with {hours[least] * 60:.3g}"
+        text += f" and {left[least]:.2f} with {minutes[least]:.3g}; "
         text += (
-            f"; {hours[enough] * 60:.3g} minutes come within {ENOUGH - 1:.0%} of the whole".replace("%", " %")
-            if enough != whole
-            else "; less than all of it costs more than a tenth, so more would help"
-        )
+            f"{minutes[enough]:.3g} minutes come within {100 * (ENOUGH - 1):.0f} % of the whole" if enough != whole
+            else "less than all of it costs more than a tenth, so more would help"
+        )  # fmt: skip
     return text + "."

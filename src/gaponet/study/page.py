@@ -20,7 +20,6 @@ from gaponet.eval import page as html_page
 from gaponet.files import write_text, writing
 from gaponet.plot.style import save
 from gaponet.study.result import Result, fact_rows
-from gaponet.study.table import Table, to_csv
 
 FORMAT = "gaponet experiment 1"
 KIND = "experiments"
@@ -43,7 +42,7 @@ def _write(result: Result, folder: Path) -> list[Path]:
     files: list[Path] = []
     for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
         files.append(folder / f"{stem}.csv")
-        write_text(files[-1], to_csv(table))
+        write_text(files[-1], table.csv())
     pictures = stems(result.name, list(result.figures))
     for figure, stem in zip(result.figures.values(), pictures, strict=True):
         files += save(figure, folder / f"{stem}.svg")
@@ -53,7 +52,7 @@ def _write(result: Result, folder: Path) -> list[Path]:
     record = {
         "format": FORMAT, "name": result.name, "title": result.title, "virtual": result.virtual,
         "facts": dict(result.facts), "sentences": list(result.sentences),
-        "tables": [_table_record(t) for t in result.tables], "figures": figures,
+        "tables": [t.record() for t in result.tables if t.shown], "figures": figures,
     }  # fmt: skip
     write_json(files[-1], record)
     return [*files, write_report(folder)]
@@ -64,21 +63,11 @@ def stems(name: str, parts: list[str]) -> list[str]:
     return [name if i == 0 else f"{name}-{part}" for i, part in enumerate(parts)]
 
 
-def _table_record(table: Table) -> dict[str, Any]:
-    return {"name": table.name, "caption": table.caption, "columns": list(table.columns), "rows": table.records(),
-            "texts": table.texts()}  # fmt: skip
-
-
 def _markdown(result: Result, pictures: list[str]) -> str:
     parts = [f"# {result.title}", f"**{result.virtual}**"]
     if result.sentences:
         parts.append("\n".join(f"- {s}" for s in result.sentences))
-    for table in result.tables:
-        ruler = ["---", *["---:"] * (len(table.columns) - 1)]
-        lines = [list(table.columns), ruler, *table.texts()]
-        parts.append("\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines))
-        if table.caption:
-            parts.append(table.caption)
+    parts += [t.markdown() for t in result.tables if t.shown]
     parts += [f"![]({stem}.svg)" for stem in pictures]
     parts.append("\n".join(f"- {key}: {value}" for key, value in fact_rows(result.facts)))
     return "\n\n".join(parts) + "\n"

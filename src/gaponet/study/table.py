@@ -28,13 +28,14 @@ class Spread:
         std = float(found.std(ddof=1)) if len(found) > 1 else math.nan
         return cls(float(found.mean()) if len(found) else math.nan, std, len(found))
 
+    def over(self, value: float) -> Spread:
+        """The same in units of a number that is known exactly."""
+        return Spread(self.mean / value, self.std / value, self.count)
+
     @property
     def error(self) -> float:
         """Standard error of the mean; NaN for a single value."""
         return self.std / math.sqrt(self.count) if self.count else math.nan
-
-
-Cell = str | int | float | Spread | None
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,13 @@ class Table:
     name: str
     columns: tuple[str, ...]
     """With units: "MPJAE, mrad"."""
-    rows: tuple[tuple[Cell, ...], ...]
+    rows: tuple[tuple[Any, ...], ...]
     """Text, whole numbers, numbers, Spread; None is blank."""
     caption: str = ""
     digits: int = 2
     """Behind the point, where people read it; files hold what was measured."""
+    shown: bool = True
+    """Whether people read it; else it is in its CSV alone."""
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -59,12 +62,38 @@ class Table:
         """Rows as people read them."""
         return [[text(cell, self.digits) for cell in row] for row in self.rows]
 
-    def records(self) -> list[list[Any]]:
-        """Rows as JSON: a spread is an object."""
-        return [[asdict(c) if isinstance(c, Spread) else c for c in row] for row in self.rows]
+    def record(self) -> dict[str, Any]:
+        """The table as JSON: a spread is an object."""
+        rows = [[asdict(c) if isinstance(c, Spread) else c for c in row] for row in self.rows]
+        return {"name": self.name, "caption": self.caption, "columns": list(self.columns), "rows": rows,
+                "texts": self.texts()}  # fmt: skip
+
+    def markdown(self) -> str:
+        """The table as people read it, its caption below."""
+        ruler = ["---", *["---:"] * (len(self.columns) - 1)]
+        lines = [list(self.columns), ruler, *self.texts()]
+        found = "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines)
+        return f"{found}\n\n{self.caption}" if self.caption else found
+
+    def csv(self) -> str:
+        """All that was measured, at full precision; a column with spreads is followed by its std and count."""
+        spread = [any(isinstance(row[i], Spread) for row in self.rows) for i in range(len(self.columns))]
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        head: list[str] = []
+        for column, wide in zip(self.columns, spread, strict=True):
+            head += [column, f"{column}: std", f"{column}: n"] if wide else [column]
+        writer.writerow(head)
+        for row in self.rows:
+            line: list[Any] = []
+            for cell, wide in zip(row, spread, strict=True):
+                parts = [cell.mean, cell.std, cell.count] if isinstance(cell, Spread) else [cell, None, None]
+                line += parts if wide else parts[:1]
+            writer.writerow(["" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v for v in line])
+        return out.getvalue()
 
 
-def text(cell: Cell, digits: int = 2) -> str:
+def text(cell: Any, digits: int = 2) -> str:
     """A cell as people read it: 12.28 ± 0.08, 1,234, blank."""
     if isinstance(cell, Spread):
         mean, std = text(cell.mean, digits), text(cell.std, digits)
@@ -104,21 +133,3 @@ def noise(a: Spread, b: Spread) -> float:
         return math.nan
     first, second = (s if s == s else std[0] for s in (a.std, b.std))
     return 2 * math.sqrt(first**2 / max(a.count, 1) + second**2 / max(b.count, 1))
-
-
-def to_csv(table: Table) -> str:
-    """Full precision; a column with spreads is followed by its std and count."""
-    spread = [any(isinstance(row[i], Spread) for row in table.rows) for i in range(len(table.columns))]
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    head: list[str] = []
-    for column, wide in zip(table.columns, spread, strict=True):
-        head += [column, f"{column}: std", f"{column}: n"] if wide else [column]
-    writer.writerow(head)
-    for row in table.rows:
-        line: list[Any] = []
-        for cell, wide in zip(row, spread, strict=True):
-            parts = [cell.mean, cell.std, cell.count] if isinstance(cell, Spread) else [cell, None, None]
-            line += parts if wide else parts[:1]
-        writer.writerow(["" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v for v in line])
-    return out.getvalue()

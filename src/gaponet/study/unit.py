@@ -3,22 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
-from pathlib import Path
-
-import numpy as np
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.plot.charts import bars
-from gaponet.study.compare import palette
+from gaponet.plot.methods import palette, shade, title
+from gaponet.study.found import Found, spread
+from gaponet.study.options import MODELS
 from gaponet.study.pool import Cell
-from gaponet.study.result import Result, label
-from gaponet.study.study import Found, Show, Study, baselines, outcomes, spread, title, train_all
-from gaponet.study.table import Cell as TableCell
+from gaponet.study.result import Result
+from gaponet.study.study import Study
 from gaponet.study.table import Spread, Table, text
 
-Folds = dict[str, dict[str, list[Found]]]  # unit left out → word → what each seed gave
+BASELINES = ("nominal", "delay_offset")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Leave one unit out, each in turn: how well is a unit served that training never saw?"""
+
+    models: tuple[str, ...] = MODELS
+    """As of gaponet compare."""
+    holdout_units: ClassVar[tuple[str, ...]] = ()
+
+    def cells(self, study: Study) -> list[Cell]:
+        """Of each fold, in OUT/without-UNIT/cells."""
+        folds = (
+            replace(study, holdout_units=(u,)).cells(self.models, into=f"without-{u}") for u in units_of(study.data)
+        )
+        return [cell for fold in folds for cell in fold]
+
+    def result(self, study: Study, found: Found) -> Result:
+        """A row per unit left out."""
+        units = [u for u in units_of(study.data) if any(left_out == u for _, left_out in found.runs)]
+        never = {w: [found.spread(w, "new", "mpjae", left_out=u) for u in units] for w in self.models}
+        known = {w: [seen(found, u, w) for u in units] for w in self.models}
+        base = {b: [found.base(b, "new", "mpjae", left_out=u) for u in units] for b in BASELINES}
+        parts = [(f"{title(b).removesuffix(' simulator')}, mrad", values) for b, values in base.items()]
+        for word in self.models:
+            shares = [v.over(n.mean) for v, n in zip(never[word], base["nominal"], strict=True)]
+            parts += [(f"{title(word)}: never seen, mrad", never[word]), ("trained on, mrad", known[word]),
+                      ("never seen, of nominal", shares)]  # fmt: skip
+        rows = [(u, *(p[i] for _, p in parts)) for i, u in enumerate(units)]
+        rows.append(("mean ± std over units", *(Spread.of([v.mean for v in p]) for _, p in parts)))
+        caption = (
+            "MPJAE of held-out motions in whole-motion free run, mean ± std over seeds. Never seen: trained on the "
+            "other units; trained on: the same unit and motions in the folds that left another unit out."
+        )
+        colours = palette([*BASELINES, *self.models])
+        methods = {title(b): (colours[b], values) for b, values in base.items()}
+        for word in self.models:
+            methods[f"{title(word)}, never seen"] = (colours[word], never[word])
+            methods[f"{title(word)}, trained on"] = (shade(colours[word], 0.55), known[word])
+        table = Table("unit", ("unit left out", *(name for name, _ in parts)), tuple(rows), caption)
+        figure = bars(units, methods, "MPJAE, mrad", f"Leave one unit out\n{study.who}")
+        said = _sentences(self.models, never, known, base["nominal"])
+        return found.result(study, "unit", "A unit never trained on", [table], {"unit": figure}, said)
 
 
 def units_of(data: Dataset) -> list[str]:
@@ -33,63 +75,9 @@ def units_of(data: Dataset) -> list[str]:
     return units
 
 
-def cells(study: Study, words: ListOf[str]) -> dict[str, list[Cell]]:
-    """Of each fold, in OUT/without-UNIT/cells."""
-    return {
-        unit: replace(study, holdout_units=(unit,)).cells(words, into=str(Path(f"without-{unit}")))
-        for unit in units_of(study.data)
-    }
-
-
-def run(study: Study, words: ListOf[str], show: Show) -> Result:
-    """Train what is missing and make table and figure."""
-    folds = cells(study, words)
-    failed = train_all([c for fold in folds.values() for c in fold], study, show)
-    found = {unit: outcomes(fold) for unit, fold in folds.items()}
-    base = {
-        u: baselines(next(c for c in fold if c.done), study) for u, fold in folds.items() if any(c.done for c in fold)
-    }
-    return result(study, words, found, base, failed)
-
-
-def result(study: Study, words: ListOf[str], found: Folds, base: dict[str, Found], failed: list[str]) -> Result:
-    """Table, figure and sentences; base: unit left out → of evaluate_baselines."""
-    units = list(base)
-    never = {w: [spread(found[u].get(w, []), "new", "mpjae") for u in units] for w in words}
-    known = {w: [seen(found, u, w) for u in units] for w in words}
-    nominal = [spread([base[u]["nominal"]], "new", "mpjae") for u in units]
-    delayed = [spread([base[u]["delay_offset"]], "new", "mpjae") for u in units]
-    columns = ["unit left out", "nominal, mrad", "delay + offset, mrad"]
-    parts: list[list[Spread]] = [nominal, delayed]
-    for word in words:
-        columns += [f"{title(word)}: never seen, mrad", "trained on, mrad", "never seen, of nominal"]
-        shares = [Spread(v.mean / n.mean, v.std / n.mean, v.count) for v, n in zip(never[word], nominal, strict=True)]
-        parts += [never[word], known[word], shares]
-    rows: list[tuple[TableCell, ...]] = [(u, *(p[i] for p in parts)) for i, u in enumerate(units)]
-    rows.append(("mean ± std over units", *(Spread.of([v.mean for v in p]) for p in parts)))
-    caption = (
-        "MPJAE of held-out motions in whole-motion free run, mean ± std over seeds. Never seen: trained on the other "
-        "units; trained on: the same unit and motions in the folds that left another unit out."
-    )
-    colours = palette({w: {"kind": study.variant(w).kind} for w in words} | {k: {"kind": k} for k in
-                      ("nominal", "delay_offset")})  # fmt: skip
-    methods = {"nominal simulator": (colours["nominal"], nominal), "delay + offset": (colours["delay_offset"], delayed)}
-    for word in words:
-        pale = tuple(1 - 0.45 * (1 - np.array(colours[word])))
-        methods[f"{title(word)}, never seen"] = (colours[word], never[word])
-        methods[f"{title(word)}, trained on"] = (pale, known[word])
-    return Result(
-        "unit", f"A unit never trained on, {study.who}", label(study.data),
-        study.facts({u: [f for part in of.values() for f in part] for u, of in found.items()}),
-        (Table("unit", tuple(columns), tuple(rows), caption),),
-        {"unit": bars(units, methods, "MPJAE, mrad", f"Leave one unit out\n{study.who}")},
-        (*_sentences(words, never, known, nominal), *failed),
-    )  # fmt: skip
-
-
-def seen(found: Folds, unit: str, word: str) -> Spread:
-    """Error on a unit among those trained on, over the seeds and folds that left another one out."""
-    runs = [f for other, of in found.items() if other != unit for f in of.get(word, [])]
+def seen(found: Found, unit: str, word: str) -> Spread:
+    """Error on a unit among those trained on, over the seeds and folds that left another one out, mrad."""
+    runs = [f for (name, left_out), part in found.runs.items() if name == word and left_out != unit for f in part]
     return spread(runs, "known", "by_unit", unit, "mpjae")
 
 

@@ -15,7 +15,7 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import Seen, corrected_robot
 from gaponet.model.artifact import GapModel
-from gaponet.plot.methods import COLOURS, NAMES
+from gaponet.plot.methods import colour, title
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
@@ -28,7 +28,7 @@ class Motion:
     """One copy of the robot.
 
     Attributes:
-        method: Key of eval.colours.
+        method: Key of plot.methods.
         qpos: (T, n), rad; row t at t·dt.
         error: Mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start.
     """
@@ -40,12 +40,12 @@ class Motion:
     @property
     def name(self) -> str:
         """For people."""
-        return NAMES[self.method]
+        return title(self.method)
 
     @property
     def colour(self) -> str:
         """#rrggbb."""
-        return COLOURS[self.method]
+        return colour(self.method)
 
     @property
     def mpjae(self) -> float:

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from arm import write_arm
-from weak_arm import trained, weak_unit
+from weak_arm import session, trained, weak_unit
 
-from gaponet.study.played.delivery import Delivery, deliver
-from gaponet.study.played.delivery_result import offsets, result, sentences
+from gaponet.study.played.deliver import Placed, deliver
+from gaponet.study.played.delivery import offsets, result, sentences
 from gaponet.study.played.goals import Planner
 
 
@@ -53,7 +53,7 @@ def test_holding_a_load_costs_torque(delivered):
 
 def score(method, seed, payload, x, z, near=False):
     off = np.array([x, 0.01, z])
-    return Delivery(method, seed, payload, off, off, near, near, 0.5 if near else np.nan, "lift", off)
+    return Placed(method, seed, payload, off, off, near, near, 0.5 if near else np.nan, "lift", off)
 
 
 def test_the_table_holds_centimetres_and_shares_worked_by_hand():
@@ -80,7 +80,7 @@ def test_sentences_say_what_became_better_and_what_worse():
     assert said[1] == "At 0 kg, GAPONet is WORSE than raw targets along X."
 
 
-def test_figures_are_drawn(delivered):
-    made = result(*delivered, "VIRTUAL arm.", {})
+def test_figures_are_drawn(robot, delivered):
+    made = result(session(robot), *delivered)
     assert list(made.figures) == ["offsets", "example"]
     assert [ax.get_title(loc="left") for ax in made.figures["offsets"].axes] == ["X, forward", "Y, left", "Z, up"]

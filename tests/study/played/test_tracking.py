@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from arm import commands, write_arm
-from weak_arm import trained, weak_unit
+from weak_arm import session, trained, weak_unit
 
-from gaponet.study.played.tracking import Score, track
-from gaponet.study.played.tracking_result import by_payload, joint_sets, result, sentences
+from gaponet.study.played.track import Score, track
+from gaponet.study.played.tracking import by_payload, joint_sets, result, sentences
 from gaponet.study.played.unseen import Unseen
 
 
@@ -78,7 +78,7 @@ def test_a_defeat_is_said(robot):
 
 def test_figures_show_every_method(robot, tracked):
     motions, scores, example = tracked
-    made = result(robot, scores, example, motions, "VIRTUAL arm.", {})
+    made = result(session(robot), scores, example, motions)
     assert list(made.figures) == ["joints", "example"]
     labels = {t.get_text() for t in made.figures["joints"].legends[0].get_texts()}
     assert labels == {"nominal simulator", "raw targets", "nominal model's feed-forward alone", "MLP", "GAPONet"}

@@ -7,172 +7,185 @@ that the encoders tell.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from gaponet.deploy.compensator import CompensatorConfig
-from gaponet.robot import RobotSpec
-from gaponet.sim.model import model_hash
-from gaponet.study.played.goals import Plan, Planner
-from gaponet.study.played.kept import Kept, revived
-from gaponet.study.played.play import Driven, Played, Progress, of_seed, play, side_by_side, with_payloads
-from gaponet.study.played.tracking import compensations
-from gaponet.study.played.trained import Trained
-from gaponet.virtual.physics import Physics
+from gaponet.data.store import Dataset
+from gaponet.errors import UsageError
+from gaponet.plot.charts import Once, draw_bars
+from gaponet.plot.methods import COLOURS, colour, title
+from gaponet.plot.style import DASHED, figure, legend, styled
+from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Example, Placed, deliver
+from gaponet.study.played.goals import STOPS, Planner
+from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, over_seeds, payloads, percent, series
+from gaponet.study.played.session import Playing, Session, Tell
+from gaponet.study.result import Result
+from gaponet.study.table import Spread, Table
 
-Array = np.ndarray
-
-LAST = 1.0  # s at the end of a hold in which offsets are averaged
-NEAR = 0.01  # m: delivered
-CLIMB = 0.05  # m: less of a rise is neither lifting nor lowering
-# Holding is what counts: the integral is twice as quick as by default, its low-pass half as long.
-HOLD = CompensatorConfig(dynamics=True, feedback=1.0, feedback_time=0.25)
+QUICK_PLANS = 5
+AXES = ("X", "Y", "Z")
+SIDES = ("forward", "left", "up")
 
 
 @dataclass(frozen=True)
-class Delivery:
-    """One hand at one goal.
+class Delivery(Playing):
+    """Table 1 of the paper: hands at goals under load, X, Y and Z offsets, success, settling, torque and heat.
 
-    Attributes:
-        method, seed: Seed None where nothing was trained.
-        payload: kg per hand.
-        offset: Mean |hand − goal| by axis in the last second, (3,) m; true place.
-        measured: The same of the place that the encoders tell.
-        near, measured_near: Whether it stayed within 1 cm of the goal for that second.
-        settle: s from the end of the way until it stays within 1 cm; NaN where it does not.
-        way: lift, lower or across: the direction of the way.
-        moving: Mean |hand − its target| by axis on the way, (3,) m.
+    A VIRTUAL unit, targets from inverse kinematics, sent raw and through the compensator. About fifteen minutes on one
+    core with models that are there; --quick in under five with training.
     """
 
-    method: str
-    seed: int | None
-    payload: float
-    offset: Array
-    measured: Array
-    near: bool
-    measured_near: bool
-    settle: float
-    way: str
-    moving: Array
+    goals: int = 100
+    """Per payload, over the space that the hands reach and can hold the heaviest payload in."""
+    hold: float = 3.0
+    """At each goal, s."""
+    front: float = 0.1
+    """Goals lie at least so far in front of the robot's base, m."""
+    goal_seed: int = 0
+    """Of the goals."""
+
+    def require(self, data: Dataset) -> None:
+        """Refuse short holds, and recordings of real robots, of which no unit can be played."""
+        if self.hold < LAST + 0.5:
+            raise UsageError(f"--hold {self.hold:g}: offsets are those of the last second; hold for 1.5 s or more")
+        if not any(e.meta.virtual for e in data.entries):
+            raise UsageError(
+                f"{data.path}: holds recordings of real robots; delivery plays a virtual unit, give its dataset"
+            )
+
+    def play(self, session: Session, tell: Tell) -> Result:
+        """Every goal with every payload by every method."""
+        _, physics, payloads = session.cast
+        tell("goals", 0.0)
+        planner = Planner(session.robot, max(payloads), self.goal_seed, self.hold, self.front)
+        each = STOPS * len(planner.arms)
+        plans = planner.plans(QUICK_PLANS if session.quick else -(-self.goals // each))
+        found = deliver(session.robot, physics, planner, plans, payloads, session.trained, tell, session.parts)
+        return result(session, *found, config=HOLD, goals_per_payload=len(plans) * each, hold_s=self.hold)
 
 
-@dataclass(frozen=True)
-class Cost:
-    """Of one trajectory: motor torque over the holds, RMS of the operated joints, N·m; mean rise of windings, K."""
-
-    method: str
-    seed: int | None
-    payload: float
-    torque: float
-    warming: float
+def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: Example, **told: Any) -> Result:
+    """Everything, ready to be written."""
+    heading = "Goal-directed delivery: hands at goals under load (VIRTUAL robot)"
+    figures = {"offsets": draw_offsets(found), "example": draw_example(example)}
+    tables = [offsets(found), moving(found), spent(costs)]
+    return session.result("delivery", heading, tables, figures, sentences(found), **told)
 
 
-@dataclass(frozen=True)
-class Example:
-    """One hand on one trajectory: its target's place and its true place by method, (T, 3) m; goals (stops, 3) m,
-    held from row arrive to row leave."""
-
-    payload: float
-    dt: float
-    goals: Array
-    arrive: Array
-    leave: Array
-    target: Array
-    places: dict[str, Array]
+def by_method(name: str, found: ListOf[M], columns: Mapping[str, Callable[[list[M]], Spread]], caption: str) -> Table:
+    """A row per payload and method."""
+    rows = [
+        (f"{p:g} kg, {title(m)}", *(value(of(found, m, p)) for value in columns.values()))
+        for p in payloads(found)
+        for m in methods(found)
+    ]
+    return Table(name, ("payload per hand", *columns), tuple(rows), caption)
 
 
-def deliver(
-    robot: RobotSpec,
-    unit: Physics,
-    planner: Planner,
-    plans: ListOf[Plan],
-    payloads: tuple[float, ...],
-    trained: ListOf[Trained],
-    progress: Progress = lambda method, share: None,
-    folder: Path | None = None,
-) -> tuple[list[Delivery], list[Cost], Example]:
-    """Play every trajectory with every payload, by every method.
-
-    Args:
-        robot: The nominal robot.
-        unit: Who plays.
-        planner: That made the plans.
-        plans: Trajectories.
-        payloads: kg per hand.
-        trained: Models.
-        progress: Of each method.
-        folder: Where each method's part is kept when it is done.
-    """
-    pairs = with_payloads(plans, payloads)
-    lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), side_by_side([p.ctrl for p, _ in pairs])
-    mass = np.array([p for _, p in pairs])
-    asked = {id(plan): planner.places(plan.ctrl) for plan in plans}
-    last, shown = round(LAST / robot.dt), len(pairs) // 2 // len(payloads) * len(payloads) + len(payloads) - 1
-    kept = Kept(folder, "delivery", model_hash(robot), unit, plans, payloads)
-    found: list[Delivery] = []
-    costs: list[Cost] = []
-    places: dict[str, Array] = {}
-    for method, seed, way in compensations(robot, trained):
-        driven = None if way is None else replace(way, config=replace(HOLD, iterations=way.config.iterations))
-
-        def work(method: str = method, seed: int | None = seed, driven: Driven | None = driven) -> Any:
-            told = partial(progress, of_seed(method, seed))
-            played = play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, told)
-            delivered: list[Delivery] = []
-            cost: list[Cost] = []
-            place = np.empty((0, 3))
-            for i, (plan, payload) in enumerate(pairs):
-                rows = slice(0, len(plan.ctrl))
-                hand, seen = planner.places(played.true[rows, i]), planner.places(played.qpos[rows, i])
-                delivered += _delivered(plan, hand, seen, asked[id(plan)], method, seed, payload, last, robot.dt)
-                cost.append(_cost(plan, played, i, method, seed, payload, robot))
-                if i == shown:
-                    place = hand[:, 0]
-            return {"found": delivered, "costs": cost, "place": place}
-
-        part = kept(method, seed, driven and driven.facts, make=work)
-        found += [revived(Delivery, d) for d in part["found"]]
-        costs += [revived(Cost, c) for c in part["costs"]]
-        if seed in (None, trained[0].seed):
-            places[method] = np.array(part["place"])
-    plan, payload = pairs[shown]
-    target = asked[id(plan)][:, 0]
-    return found, costs, Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, target, places)
+def offsets(found: ListOf[Placed]) -> Table:
+    """Offsets by axis, success, settling; by the true place and by the encoders'."""
+    columns: dict[str, Any] = {f"{a}, cm": _along("offset", i) for i, a in enumerate(AXES)}
+    columns["within 1 cm, %"] = lambda some: over_seeds(some, lambda d: d.near, 1e2)
+    columns["settled in, s"] = lambda some: over_seeds(some, lambda d: d.settle, middle=np.median)
+    columns |= {f"{a} by encoders, cm": _along("measured", i) for i, a in enumerate(AXES)}
+    columns["within 1 cm by encoders, %"] = lambda some: over_seeds(some, lambda d: d.measured_near, 1e2)
+    caption = (
+        "Mean |hand − goal| by axis in the last second of a hold (X forward, Y left, Z up); ± is the spread of "
+        "training seeds. Where the hand is, zero errors of the encoders included; and where the encoders say that it "
+        "is. Within 1 cm: for all of that second. Settled: median of the goals at which it stays within 1 cm until "
+        "the end."
+    )
+    return by_method("offsets", found, columns, caption)
 
 
-def _delivered(
-    plan: Plan, hand: Array, told: Array, asked: Array, method: str, seed: int | None, payload: float, last: int,
-    dt: float,
-) -> list[Delivery]:  # fmt: skip
-    out = []
-    for k, goals in enumerate(plan.goals):
-        start, arrive, leave = plan.start[k], plan.arrive[k], plan.leave[k]
-        end = slice(leave - last, leave)
-        for h, goal in enumerate(goals):
-            off, seen = hand[arrive:leave, h] - goal, told[end, h] - goal
-            away = np.linalg.norm(off, axis=1) > NEAR
-            settled = 0 if not away.any() else int(np.flatnonzero(away)[-1]) + 1
-            rise = plan.rise[k, h]
-            out.append(Delivery(
-                method, seed, payload, np.abs(hand[end, h] - goal).mean(axis=0), np.abs(seen).mean(axis=0),
-                not away[-last:].any(), bool((np.linalg.norm(seen, axis=1) <= NEAR).all()),
-                settled * dt if settled < len(away) else np.nan,
-                "lift" if rise > CLIMB else "lower" if rise < -CLIMB else "across",
-                np.abs(hand[start:arrive, h] - asked[start:arrive, h]).mean(axis=0),
-            ))  # fmt: skip
-    return out
+def moving(found: ListOf[Placed]) -> Table:
+    """How far the hand is from its target while it lifts and lowers."""
+    columns = {f"{way}ing, {a}, cm": _along("moving", i, way) for way in ("lift", "lower") for i, a in enumerate(AXES)}
+    return by_method("moving", found, columns, "Mean |hand − its target| on ways that rise or fall by 5 cm or more.")
 
 
-def _cost(
-    plan: Plan, played: Played, row: int, method: str, seed: int | None, payload: float, robot: RobotSpec
-) -> Cost:
-    op = robot.operated_index
-    holds = np.concatenate([np.arange(a, b) for a, b in zip(plan.arrive, plan.leave, strict=True)])
-    torque = played.tau[holds, row][:, op].astype(float)
-    heat = played.temperature[[0, len(plan.ctrl) - 1], row][:, op].astype(float)
-    return Cost(method, seed, payload, float(np.sqrt((torque**2).mean())), float((heat[1] - heat[0]).mean()))
+def spent(costs: ListOf[Cost]) -> Table:
+    """Torque and heat."""
+    columns: dict[str, Any] = {
+        "motor torque, N·m RMS": lambda some: over_seeds(some, lambda c: c.torque),
+        "windings warm by, K": lambda some: over_seeds(some, lambda c: c.warming),
+    }
+    return by_method("cost", costs, columns, "Operated joints: torque while holding, warming over a trajectory.")
+
+
+def _along(field: str, a: int, way: str | None = None) -> Callable[[list[Placed]], Spread]:
+    """One axis of a field, cm; on ways that lift or lower alone where that is said."""
+    return lambda some: over_seeds([d for d in some if way in (None, d.way)], lambda d: getattr(d, field)[a], 1e2)
+
+
+def axis(found: ListOf[Placed], method: str, payload: float, a: int) -> float:
+    """Mean offset along one axis, m."""
+    return over_seeds(of(found, method, payload), lambda d: d.offset[a]).mean
+
+
+def sentences(found: ListOf[Placed]) -> list[str]:
+    """What the numbers say."""
+    names, masses = methods(found), payloads(found)
+    light, heavy, said = masses[0], masses[-1], []
+    for m in names[1:]:
+        parts = []
+        for a, label in enumerate(AXES):
+            value, raw = axis(found, m, heavy, a), axis(found, "raw", heavy, a)
+            parts.append(f"{label} {percent(cut(value, raw))} ({raw * 1e2:.1f} → {value * 1e2:.1f} cm)")
+        said.append(f"At {heavy:g} kg, {title(m)} against raw targets: {', '.join(parts)}.")
+    for m in names[1:]:
+        worse = [x for a, x in enumerate(AXES) if axis(found, m, light, a) > axis(found, "raw", light, a)]
+        if worse:
+            said.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
+    if not any("WORSE" in s for s in said):
+        said.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
+    if {"mlp", "gaponet"} <= set(names):
+        length = lambda m, p: float(np.hypot.reduce([axis(found, m, p, a) for a in range(3)]))  # noqa: E731
+        off = {p: {m: length(m, p) for m in ("mlp", "gaponet")} for p in masses}
+        said.append(f"{duel(off)} (length of the mean offsets).")
+    return said
+
+
+@styled
+def draw_offsets(found: ListOf[Placed]) -> Figure:
+    """Mean |hand − goal| by axis, a group of bars per payload; standard error over goals."""
+    fig, masses = figure(10.2, 3.5), payloads(found)
+    for a, ax in enumerate(fig.subplots(1, 3)):
+
+        def over_goals(method: str, payload: float, a: int = a) -> Once:
+            values = np.array([d.offset[a] for d in of(found, method, payload)]) * 1e2
+            goals = max(len(values) / len({d.seed for d in of(found, method)}), 1)
+            return Once(float(values.mean()), float(values.std() / np.sqrt(goals)))
+
+        draw_bars(ax, [f"{p:g} kg" for p in masses], series(found, masses, over_goals))
+        ax.axhline(NEAR * 1e2, color="#111111", lw=0.7, ls=DASHED)
+        ax.set_title(f"{AXES[a]}, {SIDES[a]}")
+    fig.axes[0].set_ylabel("|hand − goal|, cm")
+    legend(fig, "Offset at the goal, VIRTUAL robot; mean and standard error over goals; dashed: 1 cm")
+    return fig
+
+
+@styled
+def draw_example(shown: Example) -> Figure:
+    """The hand's true place over time, axis by axis, goals with 1 cm on both sides."""
+    fig = figure(10.2, 3.4)
+    time = np.arange(len(shown.target)) * shown.dt
+    for a, ax in enumerate(fig.subplots(1, 3, sharex=True)):
+        for m, place in shown.places.items():
+            if m not in LEFT_OUT:
+                ax.plot(time, place[:, a] * 1e2, color=colour(m), label=title(m))
+        ax.plot(time, shown.target[:, a] * 1e2, color=colour("target"), ls=DASHED, lw=1.0, label=title("target"))
+        for goal, arrive, leave in zip(shown.goals, shown.arrive, shown.leave, strict=True):
+            low, high = (goal[a] - NEAR) * 1e2, (goal[a] + NEAR) * 1e2
+            span = [arrive * shown.dt, leave * shown.dt]
+            ax.fill_between(span, low, high, color=COLOURS["target"], alpha=0.18, lw=0)
+        ax.set_title(f"{AXES[a]}, {SIDES[a]}")
+        ax.set_xlabel("time, s")
+    fig.axes[0].set_ylabel("hand, cm")
+    legend(fig, f"One hand, two goals, {shown.payload:g} kg in each hand, VIRTUAL robot; shaded: goal ± 1 cm")
+    return fig

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -13,13 +13,13 @@ from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import idle_joints, model_hash
+from gaponet.study.played.trained import Trained
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.unit import VirtualRobot
 
 Array = np.ndarray
 
-Progress = Callable[[str, float], None]  # method and seed, share of it done
-
+PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
 WARMTH = 12.0  # K above ambient at the start: a robot that has been working (virtual/play.py)
 
 
@@ -70,6 +70,17 @@ class Played:
     sent: Array
     tau: Array
     temperature: Array
+
+
+def compensations(robot: RobotSpec, trained: ListOf[Trained]) -> Iterable[tuple[str, int | None, Driven | None]]:
+    """Ways to drive the robot: raw; by the simulators' own physics alone; and through each model."""
+    yield "raw", None, None
+    bare = replace(PLANNED, iterations=0)
+    first = {t.robot.nominal is not None: t for t in reversed(trained)}
+    for fitted, t in sorted(first.items()):
+        yield ("identified feedforward" if fitted else "feedforward"), None, Driven(t.model, t.robot, bare)
+    for t in trained:
+        yield t.method, t.seed, Driven(t.model, t.robot, PLANNED)
 
 
 def of_seed(method: str, seed: int | None) -> str:

@@ -9,217 +9,220 @@ not, when a motion begins. e_t compares the target of a moment with the joint at
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.deploy.compensator import CompensatorConfig
+from gaponet.eval.evaluate import choose
+from gaponet.plot.charts import Once, against, draw_bars
+from gaponet.plot.methods import colour, title
+from gaponet.plot.style import figure, joint_label, legend, styled
 from gaponet.robot import RobotSpec
-from gaponet.sim.model import model_hash
-from gaponet.sim.replay import replay
-from gaponet.study.played.kept import Kept, revived
-from gaponet.study.played.play import Driven, Played, Progress, of_seed, play, side_by_side, with_payloads
-from gaponet.study.played.trained import Trained
-from gaponet.study.played.unseen import Unseen
-from gaponet.virtual.physics import Physics
+from gaponet.study.played.measured import LEFT_OUT, cut, duel, methods, of, over_seeds, payloads, percent, series
+from gaponet.study.played.play import PLANNED
+from gaponet.study.played.session import Playing, Session, Tell
+from gaponet.study.played.track import Example, Score, align, track
+from gaponet.study.played.unseen import Unseen, from_files, generated, require_unseen
+from gaponet.study.result import Result
+from gaponet.study.table import Spread, Table
 
-Array = np.ndarray
+Joints = tuple[str, list[int]]  # how they are called, columns
 
-REST = 2.0  # s under the first target before a motion begins: time for a compensator to blend in
-PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
-HOLDING = CompensatorConfig()
-
-
-@dataclass(frozen=True)
-class Score:
-    """One motion with one payload.
-
-    Attributes:
-        part: alignment or compensation.
-        method, seed: Of the model; seed None where nothing was trained.
-        source: generated or files, of the motion.
-        motion: Name.
-        payload: kg per hand.
-        q_dis: Of each operated joint, (n) rad·s.
-        seconds: The motion's length.
-    """
-
-    part: str
-    method: str
-    seed: int | None
-    source: str
-    motion: str
-    payload: float
-    q_dis: Array
-    seconds: float
+QUICK_MOTIONS = 4
+BASE = {"alignment": "nominal", "compensation": "raw"}
+SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
+WHAT = {
+    "alignment": "between simulator and robot under the same targets, free run",
+    "compensation": "between targets and robot",
+}
+HEADS = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
 
 
 @dataclass(frozen=True)
-class Example:
-    """One motion of the compensation: targets and where the joints were by method, (T, n operated) rad."""
+class Tracking(Playing):
+    """Figure 3 of the paper: Q_dis on motions never trained on, joint by joint and payload by payload.
 
-    motion: str
-    payload: float
-    dt: float
-    target: Array
-    qpos: dict[str, Array]
-
-
-def track(
-    robot: RobotSpec,
-    unit: Physics,
-    unit_id: str,
-    motions: ListOf[Unseen],
-    payloads: tuple[float, ...],
-    trained: ListOf[Trained],
-    progress: Progress = lambda method, share: None,
-    folder: Path | None = None,
-) -> tuple[list[Score], Example]:
-    """Play every motion with every payload on the unit, raw and compensated, and in every simulator.
-
-    Args:
-        robot: The nominal simulator.
-        unit, unit_id: Who plays.
-        motions: What.
-        payloads: kg per hand.
-        trained: Models.
-        progress: Of each method.
-        folder: Where each method's part is kept when it is done.
+    Alignment (simulator to robot) and compensation (robot to target) on a VIRTUAL unit; of real recordings, alignment
+    on the test motions. About ten minutes on one core with models that are there; --quick in under five with training.
     """
-    pairs = with_payloads(motions, payloads)
-    rest = round(REST / robot.dt)
-    ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
-    lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)
-    mass = np.array([p for _, p in pairs])
-    kept = Kept(folder, "tracking", model_hash(robot), unit, unit_id, list(motions), payloads)
 
-    def drive(name: str, driven: Driven | None) -> Played:
-        return play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, partial(progress, name))
+    motions: Path | None = None
+    """Folder of motion files (SAGE txt, csv, npz) to play too, reported apart."""
+    count: int = 10
+    """How many motions are made for the experiment."""
 
-    @cache
-    def raw() -> Played:
-        return drive("raw", None)
+    def play(self, session: Session, tell: Tell) -> Result:
+        """On the unit; with recordings of a real robot, alignment alone."""
+        robot, trained = session.robot, session.trained
+        if not any(e.meta.virtual for e in session.data.entries):
+            entries, unseen = choose([t.run for t in trained], session.data)
+            sequences = session.data.sequences(entries)
+            scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, tell)
+            told: dict[str, Any] = {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
+            return result(session, scores, None, [], **told)
+        who, physics, payloads = session.cast
+        tell("motions", 0.0)
+        motions = self._motions(session, max(payloads))
+        scores, example = track(robot, physics, who, motions, payloads, trained, tell, session.parts)
+        more: dict[str, Any] = {"unit_trained_on": True} if who in session.known_units else {}
+        return result(session, scores, example, motions, config=PLANNED, **more)
 
-    def recorded() -> list[Sequence]:
-        return [_recording(robot, unit_id, m, p, raw(), i, rest) for i, (m, p) in enumerate(pairs)]
-
-    scores = align(recorded, [m.source for m, _ in pairs], robot, trained, progress, kept)
-    shown = int(kept("shown", make=lambda: {"row": _shown(pairs, robot, targets, raw())})["row"])
-    example: dict[str, Array] = {}
-    for method, seed, driven in compensations(robot, trained):
-
-        def work(method: str = method, seed: int | None = seed, driven: Driven | None = driven) -> Any:
-            played = raw() if driven is None else drive(of_seed(method, seed), driven)
-            found = _tracked(pairs, played, targets, lengths, rest, robot, method, seed)
-            return {"scores": found, "qpos": played.qpos[rest : lengths[shown], shown][:, robot.operated_index]}
-
-        part = kept("compensation", method, seed, driven and driven.facts, make=work)
-        scores += [revived(Score, s) for s in part["scores"]]
-        if seed in (None, trained[0].seed):
-            example[method] = np.array(part["qpos"])
-    target = targets[rest : lengths[shown], shown][:, robot.operated_index]
-    return scores, Example(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
+    def _motions(self, session: Session, heaviest: float) -> list[Unseen]:
+        few = QUICK_MOTIONS if session.quick else None
+        made = generated(session.robot, few or self.count, heaviest)
+        made += from_files(session.robot, self.motions, heaviest)[:few] if self.motions else []
+        return require_unseen(made, session.data, session.robot, session.trained, session.whole)
 
 
-def compensations(robot: RobotSpec, trained: ListOf[Trained]) -> Iterable[tuple[str, int | None, Driven | None]]:
-    """Ways to drive the robot: raw; by the simulators' own physics alone; and through each model."""
-    yield "raw", None, None
-    bare = replace(PLANNED, iterations=0)
-    first = {t.robot.nominal is not None: t for t in reversed(trained)}
-    for fitted, t in sorted(first.items()):
-        yield ("identified feedforward" if fitted else "feedforward"), None, Driven(t.model, t.robot, bare)
-    for t in trained:
-        yield t.method, t.seed, Driven(t.model, t.robot, PLANNED)
+def result(
+    session: Session, scores: ListOf[Score], example: Example | None, motions: ListOf[Unseen], **told: Any
+) -> Result:
+    """Everything, ready to be written; no example where recordings of a real robot are all there is."""
+    robot, parts = session.robot, list(dict.fromkeys(s.part for s in scores))
+    sets, tag = joint_sets(robot), "real robot" if example is None else "VIRTUAL robot"
+    tables = [by_payload(scores, part, sets) for part in parts]
+    tables += [by_joint(scores, part, robot) for part in parts]
+    tables += [_motions(motions, robot)] if motions else []
+    figures: dict[str, Figure] = {}
+    for source, some in by_source(scores).items():
+        figures["joints" if not figures else source] = draw_joints(some, robot, f"{SOURCES[source]}, {tag}")
+    if example is not None:
+        figures["example"] = draw_example(example, robot, tag)
+    said = [s for part in parts for s in sentences(scores, part, sets[0])]
+    zero_shot = example is not None and not told.get("unit_trained_on")
+    who = ", unit never trained on" if zero_shot else ""
+    heading = f"Zero-shot tracking of motions never trained on{who} ({tag})"
+    name = "tracking" if example is not None else "tracking-real"
+    told |= {"motions": len(motions)} if motions else {}
+    return session.result(name, heading, tables, figures, said, **told)
 
 
-def align(
-    recorded: Callable[[], ListOf[Sequence]],
-    sources: ListOf[str],
-    robot: RobotSpec,
-    trained: ListOf[Trained],
-    progress: Progress = lambda method, share: None,
-    kept: Kept = Kept(None),  # noqa: B008
-) -> list[Score]:
-    """Free runs of every simulator under the recordings' targets, from their first state.
-
-    Args:
-        recorded: What the robot did; asked for when there is something to do.
-        sources: Of each motion.
-        robot: The nominal simulator.
-        trained: Models; the identified simulator comes from those that correct it.
-        progress: Of each method.
-        kept: What is done already.
-    """
-    simulators: list[tuple[str, int | None, RobotSpec, Trained | None]] = [("nominal", None, robot, None)]
-    simulators += [("identified", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]
-    simulators += [(t.method, t.seed, t.robot, t) for t in trained]
-    scores: list[Score] = []
-    for method, seed, simulator, model in simulators:
-
-        def work(
-            method: str = method, seed: int | None = seed, simulator: RobotSpec = simulator,
-            model: Trained | None = model,
-        ) -> Any:  # fmt: skip
-            corrector = None if model is None else model.model.corrector(simulator)
-            tell = lambda done, total: progress(f"{method} simulator", done / total)  # noqa: E731
-            done = recorded()
-            twins = replay(done, simulator, corrector, nthread=1, progress=tell, lock_idle=True)
-            return {"scores": [
-                _score("alignment", method, seed, source, s.meta.motion, s.meta.payload_mass,
-                       (twin.qpos - s.qpos)[1:, robot.operated_index], s.dt)
-                for s, twin, source in zip(done, twins, sources, strict=True)
-            ]}  # fmt: skip
-
-        weights = model and model.model.weights_hash
-        part = kept("alignment", method, seed, model_hash(simulator), weights, make=work)
-        scores += [revived(Score, s) for s in part["scores"]]
-    return scores
+def joint_sets(robot: RobotSpec) -> list[Joints]:
+    """Without wrists, as the paper's figure; and all."""
+    plain = [i for i, name in enumerate(robot.operated) if "wrist" not in name]
+    every = list(range(len(robot.operated)))
+    sets = [(f"{len(every)} joints", every)]
+    return sets if len(plain) in (0, len(every)) else [(f"{len(plain)} joints", plain), *sets]
 
 
-def _recording(
-    robot: RobotSpec, unit: str, motion: Unseen, payload: float, raw: Played, row: int, rest: int
-) -> Sequence:
-    """What the robot itself measured while it played a motion raw."""
-    meta = SequenceMeta(robot.name, unit, motion.name, payload, virtual=True, source="experiment tracking")
-    span = slice(rest, rest + len(motion.ctrl))
-    return Sequence(meta, robot.joint_names, robot.dt, motion.ctrl, raw.qpos[span, row], raw.qvel[span, row])
+def by_source(scores: ListOf[Score]) -> dict[str, list[Score]]:
+    """Generated motions, motion files and recordings apart."""
+    return {source: [s for s in scores if s.source == source] for source in dict.fromkeys(s.source for s in scores)}
 
 
-def _tracked(
-    pairs: ListOf[tuple[Unseen, float]],
-    played: Played,
-    targets: Array,
-    lengths: Array,
-    rest: int,
-    robot: RobotSpec,
-    method: str,
-    seed: int | None,
-) -> list[Score]:
-    op = robot.operated_index
-    scores = []
-    for i, (motion, payload) in enumerate(pairs):
-        span = slice(rest, lengths[i])
-        error = (played.qpos[span, i] - targets[span, i])[:, op]
-        scores.append(_score("compensation", method, seed, motion.source, motion.name, payload, error, robot.dt))
-    return scores
+def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
+    """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
+    of_part = [s for s in scores if s.part == part]
+    names, masses = methods(of_part), payloads(of_part)
+    learned = [m for m in ("mlp", "gaponet") if m in names]
+    rows: list[tuple[Any, ...]] = []
+    for source, some in by_source(of_part).items():
+        for label, columns in sets:
+            for payload in [*masses, None] if len(masses) > 1 else masses:
+                values = {m: q_dis(of(some, payload=payload), m, columns) for m in names}
+                cuts = (f"{cut(values[m].mean, values[BASE[part]].mean):.0f} %" for m in learned)
+                where = f"{SOURCES[source]}, {label}, " + ("all payloads" if payload is None else f"{payload:g} kg")
+                rows.append((where, *values.values(), *cuts))
+    heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
+    caption = f"Mean Q_dis per joint, rad·s, {WHAT[part]}; ± is the spread of training seeds."
+    return Table(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
 
 
-def _score(
-    part: str, method: str, seed: int | None, source: str, motion: str, payload: float, error: Array, dt: float
-) -> Score:
-    q_dis = np.abs(error.astype(float)).sum(axis=0) * dt
-    return Score(part, method, seed, source, motion, payload, q_dis, len(error) * dt)
+def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> Table:
+    """The same joint by joint and payload by payload."""
+    of_part = [s for s in scores if s.part == part]
+    names = methods(of_part)
+    rows = [
+        (f"{SOURCES[source]}, {p:g} kg, {joint}", *(q_dis(of(some, payload=p), m, [i]) for m in names))
+        for source, some in by_source(of_part).items()
+        for p in payloads(of_part)
+        for i, joint in enumerate(robot.operated)
+    ]
+    head = ("Q_dis, rad·s", *(title(m) for m in names))
+    return Table(f"{part}-joints", head, tuple(rows), f"Q_dis {WHAT[part]}, joint by joint.", digits=4)
 
 
-def _shown(pairs: ListOf[tuple[Unseen, float]], robot: RobotSpec, targets: Array, raw: Played) -> int:
-    """The heaviest payload's motion of median error: neither the best nor the worst."""
-    heaviest = [i for i, (_, p) in enumerate(pairs) if p == max(p for _, p in pairs)]
-    op = robot.operated_index
-    error = [np.abs(raw.qpos[:, i][:, op] - targets[:, i][:, op]).mean() for i in heaviest]
-    return heaviest[int(np.argsort(error)[len(heaviest) // 2])]
+def _motions(motions: ListOf[Unseen], robot: RobotSpec) -> Table:
+    rows = [(m.name, SOURCES[m.source], len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions]
+    caption = (
+        "None was trained or chosen on: the motion of training or validation that is most like it, and how far apart "
+        "their targets are."
+    )
+    return Table("motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1)
+
+
+def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> Spread:
+    """Mean over motions and joints, over seeds."""
+    return over_seeds(of(scores, method), lambda s: s.q_dis[columns].mean())
+
+
+def sentences(scores: ListOf[Score], part: str, joints: Joints) -> list[str]:
+    """What the numbers of one part say, for one set of joints."""
+    label, columns = joints
+    of_part = [s for s in scores if s.part == part]
+    names, masses, said = methods(of_part), payloads(of_part), []
+    for source, some in by_source(of_part).items():
+        error = {p: {m: q_dis(of(some, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
+        cuts = []
+        for m in names[1:]:
+            all_of, heavy = (percent(cut(error[p][m], error[p][BASE[part]])) for p in (None, masses[-1]))
+            cuts.append(f"{title(m)} {all_of}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
+        said.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASE[part])}: {'; '.join(cuts)}.")
+        if "gaponet" in names and "mlp" in names:
+            said.append(f"{part}, {SOURCES[source]}: {duel({p: error[p] for p in masses})}.")
+    return said
+
+
+def _pick(values: dict[str, list[Once]], method: str, joint: int) -> Once:
+    return values[method][joint]
+
+
+@styled
+def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
+    """Q_dis per joint, a row per payload, alignment beside compensation; standard error over motions."""
+    parts, masses = list(dict.fromkeys(s.part for s in scores)), payloads(scores)
+    wide = 0.52 * len(robot.operated) + 0.8
+    fig = figure(max(6.0, wide * len(parts)), 1.55 * len(masses) + 1.5)
+    axes = fig.subplots(len(masses), len(parts), sharex=True, sharey="col", squeeze=False)
+    names, joints = [joint_label(n) for n in robot.operated], list(range(len(robot.operated)))
+    for column, part in zip(axes.T, parts, strict=True):
+        for ax, payload in zip(column, masses, strict=True):
+            some = of([s for s in scores if s.part == part], payload=payload)
+            values = {m: over_motions(of(some, m)) for m in methods(some)}
+            draw_bars(ax, names, series(some, joints, partial(_pick, values)), 7)
+            ax.annotate(f"{payload:g} kg", (0.995, 0.97), xycoords="axes fraction", ha="right", va="top",
+                        fontweight="bold")  # fmt: skip
+        column[0].set_title(HEADS[part])
+    for ax in axes[:, 0]:
+        ax.set_ylabel("Q_dis, rad·s")
+    legend(fig, f"{robot.name}, {label}; mean and standard error over motions")
+    return fig
+
+
+def over_motions(scores: ListOf[Score]) -> list[Once]:
+    """Of each joint the mean over motions, seeds averaged, and its standard error."""
+    by_motion: dict[str, list[Any]] = {}
+    for s in scores:
+        by_motion.setdefault(s.motion, []).append(s.q_dis)
+    values = np.array([np.mean(v, axis=0) for v in by_motion.values()])  # (motions, n)
+    error = values.std(axis=0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(values.shape[1], np.nan)
+    return [Once(float(m), float(e)) for m, e in zip(values.mean(axis=0), error, strict=True)]
+
+
+def draw_example(shown: Example, robot: RobotSpec, tag: str) -> Figure:
+    """Targets and joints by method, and the error below: of joints that move the three with the largest raw error."""
+    moves = np.ptp(shown.target, axis=0) > 0.1
+    raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
+    drawn = {m: qpos for m, qpos in shown.qpos.items() if m not in LEFT_OUT}
+    joints = {
+        joint_label(robot.operated[j], wrapped=False): ({m: q[:, j] for m, q in drawn.items()}, shown.target[:, j])
+        for j in sorted(np.argsort(-raw)[:3].tolist())
+    }
+    looks = {m: (title(m), colour(m)) for m in (*drawn, "target")}
+    heading = f"{shown.motion}, {shown.payload:g} kg in each hand, {tag}"
+    return against(np.arange(len(shown.target)) * shown.dt, joints, looks, "target", heading)
