@@ -7,7 +7,7 @@ import pytest
 from arm import recordings
 
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError, FolderError
 from gaponet.plot.style import figure
 from gaponet.study.page import write, write_report
 from gaponet.study.result import Result, command_line, facts, label
@@ -48,7 +48,7 @@ def test_every_form_is_written_and_files_are_exact(result, tmp_path):
     files = [f.name for f in write(result, tmp_path / "out")]
     assert files == ["thing.csv", "thing-by_joint.csv", "thing.svg", "thing.png", "thing-curve.svg", "thing-curve.png",
                      "thing.md", "thing.json", "report.html"]  # fmt: skip
-    assert sorted(f.name for f in (tmp_path / "out").iterdir()) == sorted(files)
+    assert sorted(f.name for f in (tmp_path / "out").iterdir()) == sorted([".gaponet", *files])
     rows = list(csv.reader((tmp_path / "out" / "thing.csv").open()))
     assert rows[0] == ["method", "MPJAE, mrad", "MPJAE, mrad: std", "MPJAE, mrad: n", "runs"]
     assert rows[1] == ["A|B", "2.0", pytest.approx("1.4142135623730951"), "2", "1234"]
@@ -82,7 +82,7 @@ def test_a_folder_without_results_and_a_result_without_its_figure_are_named(resu
     (tmp_path / "thing-curve.svg").unlink()
     with pytest.raises(DatasetError, match=r"thing-curve\.svg: is missing"):
         write_report(tmp_path)
-    with pytest.raises(UsageError, match="is a file"):
+    with pytest.raises(FolderError, match="is no folder"):
         write(result, tmp_path / "thing.md")
 
 

@@ -83,7 +83,6 @@ def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options
 def _command(kind: type[Any]) -> Any:
     """A question's command: its fields are options."""
 
-    @writes("experiments")
     def ask(dataset: Any, out: Any, question: Any, options: Any = Options()) -> None:  # noqa: B008
         _ask(kind, dataset, out, question, options)
 
@@ -95,7 +94,7 @@ def _command(kind: type[Any]) -> Any:
         "out: Folder of the results; its report.html shows all experiments in it.", "question: What is asked.",
         "options: Shared.",
     ))  # fmt: skip
-    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=ask)]
+    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=writes("experiments")(ask))]
 
 
 def experiment(action: None) -> None:
