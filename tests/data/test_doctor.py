@@ -159,14 +159,14 @@ def test_a_zero_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_pa
     s, shift = hanging(arm), turn * np.eye(2)[joint]
     finding = found(weigh(arm, tmp_path, replace(s, ctrl=s.ctrl + shift, qpos=s.qpos + shift)), "gravity", "warning")
     assert finding.joints == (arm.joint_names[joint],)
-    assert "fit the weight of the arm better with its zero turned by" in finding.message
+    assert finding.message.startswith("with its zero turned by")
 
 
 def test_a_sign_wrong_in_command_and_state_alike_shows_in_the_torque(arm, tmp_path):
     s, sign = hanging(arm), np.array([1, -1])
     wrong = replace(s, ctrl=s.ctrl * sign, qpos=s.qpos * sign, qvel=s.qvel * sign)
     finding = found(weigh(arm, tmp_path, wrong), "gravity", "warning")
-    assert "mirrored at" in finding.message
+    assert finding.message.startswith("with its angle mirrored at")
 
 
 def test_commands_beyond_the_joint_range_are_a_warning(arm, tmp_path):

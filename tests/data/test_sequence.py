@@ -52,6 +52,45 @@ def test_channels_that_do_not_overlap_are_refused(arm):
         to_sequence(arm_log(time, ctrl_time=time + 10), arm, META)
 
 
+JUMPED = np.r_[0.02 * np.arange(25), 3600 + 0.02 * np.arange(25)]  # an hour, twice the samples of a second
+BURSTS = (0.1 * np.arange(10)[:, None] + 2e-4 * np.arange(5)).ravel()  # five samples at once, ten times a second
+
+
+@pytest.mark.parametrize(
+    ("time", "complaint"),
+    [
+        (
+            JUMPED,
+            r"wave\.csv:26: 3600 s after the row before it; longer gaps than 2 s are not filled: cut the log there",
+        ),
+        (
+            BURSTS,
+            r"wave\.csv: 50 rows lie in bursts over 0\.9008 s: at their median period of 0\.2 ms there would be 4504",
+        ),
+        (
+            2e-8 * np.arange(ROWS),
+            r"wave\.csv: the median period is 2e-08 s, expected 0\.0001 to 1; is the unit of time",
+        ),
+        (5.0 * np.arange(ROWS), r"wave\.csv: the median period is 5 s"),
+        (np.r_[0.02 * np.arange(49), 1e13], r"wave\.csv:50: 1e\+13 s after the row before it"),
+    ],
+    ids=["clock jumps an hour", "bursts", "seconds read as microseconds", "too slow", "633 GiB"],
+)
+def test_a_clock_that_cannot_be_right_is_refused_before_rows_are_made(arm, time, complaint):
+    with pytest.raises(LogError, match=complaint):
+        to_sequence(arm_log(time), arm, META)
+
+
+def test_half_a_second_without_samples_is_still_filled(arm):
+    time = np.delete(0.02 * np.arange(100), slice(40, 65))
+    assert len(to_sequence(arm_log(time), arm, META)) == 100
+
+
+def test_a_stated_period_that_the_timestamps_contradict_is_refused(arm):
+    with pytest.raises(LogError, match=r"the period is said to be 0\.0333333 s, but the timestamps are 0\.02 s apart"):
+        to_sequence(arm_log(0.02 * np.arange(ROWS), dt=1 / 30), arm, META)
+
+
 def test_joints_go_into_the_robots_order_and_absent_ones_stand_at_home(arm):
     log = arm_log(0.02 * np.arange(ROWS))
     one = Log("arm", ("elbow",), {k: Channel(c.time, c.values[:, 1:]) for k, c in log.channels.items()}, "wave.csv")

@@ -77,3 +77,40 @@ def test_a_stranger_is_named_with_the_valid_joints(arm, tmp_path):
     file.write_text("knee\n0\n1\n")
     with pytest.raises(JointMismatchError, match=r"names joint 'knee', but robot 'arm' has: shoulder, elbow"):
         read_motion(file, arm)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"joint_names": np.array("shoulder")}, "array 'joint_names' must hold text in 1 dimensions"),
+        ({"joint_names": np.array(["shoulder"], object)}, "not a readable npz file"),
+        ({"ctrl": np.array([["x"], ["y"]])}, "array 'ctrl' must hold numbers in 2 dimensions"),
+        ({"ctrl": np.full((3, 1), np.nan)}, r"ctrl has shape \(3, 1\) or holds NaN"),
+        ({"ctrl": np.full((3, 1), 1e9)}, "command 1 of shoulder is .* must be in radians"),
+        ({"dt": [1, 2]}, "array 'dt' must hold numbers in 0 dimensions"),
+        ({"dt": 1e-30}, r"its period is 1e-30 s; expected 0\.0001 to 1"),
+        ({"dt": np.nan}, "its period is nan s"),
+    ],
+)
+def test_arrays_that_are_no_motion_are_refused(arm, tmp_path, arrays, message):
+    np.savez(tmp_path / "bad.npz", **({"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1))} | arrays))
+    with pytest.raises(LogError, match=rf"bad\.npz: {message}"):
+        read_motion(tmp_path / "bad.npz", arm)
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_unread(arm, tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("ctrl.npy", bytes(80 << 20))
+    with pytest.raises(LogError, match=r"bomb\.npz: unpacks to more than 64 MiB"):
+        read_motion(tmp_path / "bomb.npz", arm)
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04nothing")
+    with pytest.raises(LogError, match=r"bad\.npz: not a readable npz file \(BadZipFile"):
+        read_motion(tmp_path / "bad.npz", arm)
+
+
+def test_commands_in_degrees_are_refused(arm, tmp_path):
+    (tmp_path / "deg.txt").write_text("shoulder,elbow\n0,0\n45,0\n")
+    with pytest.raises(LogError, match=r"deg\.txt: command 2 of shoulder is 45\.000, outside its range"):
+        read_motion(tmp_path / "deg.txt", arm)

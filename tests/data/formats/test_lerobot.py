@@ -244,3 +244,128 @@ def test_joints_without_names_are_refused(so101, tmp_path):
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(LogError, match=r"info\.json: action does not name its \[6\] values; write the joints' names"):
         read_stock(folder, so101, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "../other/data/file-{file_index:03d}.parquet",
+        "data/{file_index}/../../../other/file-000.parquet",
+        "/etc/passwd",
+        "data/{chunk_index:0999999999d}",
+        "data/{chunk_index.__class__}",
+        "data/{0}",
+        "data/\x00",
+    ],
+)
+def test_a_data_path_cannot_leave_the_set_or_fill_the_memory(so101, tmp_path, place):
+    folder = stock(tmp_path / "set", data_path=place)
+    stock(tmp_path / "other")
+    with pytest.raises(LogError, match=r"info\.json: data_path .* is not a path inside the set"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"features": []}, "features: should be an object"),
+        ({"features": {"action": 3}}, r"features\.action: should be an object"),
+        ({"fps": "30"}, "fps: should be a valid number"),
+        ({"fps": float("nan")}, "fps: "),
+        ({"data_path": None}, "data_path: should be a valid string"),
+        ({"codebase_version": 3.0}, "codebase_version: should be a valid string"),
+    ],
+)
+def test_metadata_of_other_types_are_refused_by_field(so101, tmp_path, change, complaint):
+    with pytest.raises(LogError, match=rf"info\.json: {complaint}"):
+        read_stock(stock(tmp_path / "set", **change), so101, tmp_path / "data")
+
+
+def rewrite(file, **columns):
+    """A Parquet file with columns replaced, or gone where None."""
+    table = pq.read_table(file)
+    for name, values in columns.items():
+        table = table.drop_columns([name])
+        table = table if values is None else table.append_column(name, values)
+    pq.write_table(table, file)
+
+
+@pytest.mark.parametrize(
+    ("columns", "complaint"),
+    [
+        ({"length": pa.array([-1, 50])}, r"\[0\]\.length: should be greater than or equal to 1, not -1"),
+        ({"length": pa.array(["x", "y"])}, r"\[0\]\.length: should be a valid integer, not 'x'"),
+        ({"data/file_index": pa.array([None, 0])}, r"\[0\]\.data/file_index: should be a valid integer, not None"),
+        ({"episode_index": None}, "column 'episode_index' is missing"),
+        ({"tasks": pa.array([1, 2])}, r"\[0\]\.tasks: should be a valid (array|list), not 1"),
+        ({"length": pa.array([1, 2], pa.timestamp("ns"))}, r"not readable"),
+    ],
+)
+def test_episodes_of_other_types_are_refused_by_field(so101, tmp_path, columns, complaint):
+    folder = stock(tmp_path / "set")
+    rewrite(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", **columns)
+    with pytest.raises(LogError, match=rf"file-000\.parquet: {complaint}"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("columns", "complaint"),
+    [
+        ({"timestamp": None}, "column 'timestamp' is missing"),
+        ({"action": pa.array(["x"] * 90)}, "action is string, not 6 numbers a row"),
+        ({"frame_index": pa.array([None] * 90, pa.int64())}, "frame_index is not 1 numbers"),
+        ({"action": pa.array([[1.0] * 5] * 90)}, "action is not 6 numbers"),
+        ({"action": pa.array([[1.0] * 5 + [None]] * 90)}, "action is not 6 numbers"),
+    ],
+)
+def test_frames_of_other_types_are_refused_by_feature(so101, tmp_path, columns, complaint):
+    folder = stock(tmp_path / "set")
+    rewrite(folder / "data" / "chunk-000" / "file-000.parquet", **columns)
+    with pytest.raises(LogError, match=rf"file-000\.parquet(:1)?: {complaint}"):
+        read_stock(folder, so101, tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "complaint"),
+    [
+        ("payload_mass", float("nan"), "payload_mass"),
+        ("payload_mass", 1e30, "payload_mass"),
+        ("notes", "[1", "notes: "),
+        ("notes", "3", "notes: should be an object"),
+        ("level", "legs", "level"),
+        ("kp", '["x"]', r"kp: \[0\]: should be a valid number"),
+    ],
+)
+def test_what_an_export_says_of_a_recording_is_checked(dataset, arm, tmp_path, column, value, complaint):
+    export_lerobot(dataset, tmp_path / "out")
+    rewrite(
+        tmp_path / "out" / "meta" / "episodes" / "chunk-000" / "file-000.parquet", **{column: pa.array([value] * 3)}
+    )
+    with pytest.raises(LogError, match=rf"episode 0: .*{complaint}"):
+        back(tmp_path / "out", arm, tmp_path / "again")
+    assert not (tmp_path / "again").exists()
+
+
+@pytest.mark.parametrize(
+    "change", [{"dt": 0}, {"dt": "x"}, {"dataset": {"joint_names": []}, "dt": 0.02}, {"dataset": 3}]
+)
+def test_gaponet_json_cannot_say_what_it_likes(dataset, arm, tmp_path, change):
+    export_lerobot(dataset, tmp_path / "out")
+    file = tmp_path / "out" / "meta" / "gaponet.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    if "joint_names" in str(change):
+        back(tmp_path / "out", arm, tmp_path / "again")
+        assert Dataset(tmp_path / "again").joint_names == arm.joint_names
+    else:
+        with pytest.raises(LogError, match=r"gaponet\.json: "):
+            back(tmp_path / "out", arm, tmp_path / "again")
+
+
+def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
+    export_lerobot(dataset, tmp_path / "out")
+    file = tmp_path / "out" / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    info["features"]["action"]["info"] = {"unit": {"x": 1}}
+    file.write_text(json.dumps(info))
+    with pytest.raises(UsageError, match="unit of positions is not written in the set"):
+        back(tmp_path / "out", arm, tmp_path / "again")

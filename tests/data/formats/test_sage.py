@@ -194,3 +194,41 @@ def test_real_logs_run_at_their_own_rate(sage_so101, so101):
     assert name == "actuator_bandwidth"
     assert np.median(np.diff(log.channels["qpos"].time)) == pytest.approx(0.02006, abs=1e-5)
     assert log.meta["events"][0] == ["0", "CONTROL_MODE_ENABLE"]
+
+
+def test_swapped_files_are_known_by_the_type_of_their_rows(motion, so101):
+    control, state = motion / "control.csv", motion / "state_motor.csv"
+    texts = control.read_text(), state.read_text()
+    control.write_text(texts[1])
+    state.write_text(texts[0])
+    with pytest.raises(
+        LogError, match=r"control\.csv:2: a row of type 'STATE_MOTOR', not CONTROL: are the files swapped"
+    ):
+        list(read_logs(motion, so101))
+
+
+def test_one_row_of_another_type_is_named(motion, so101):
+    edit(motion / "state_motor.csv", 7, "STATE_MOTOR", "CONTROL")
+    with pytest.raises(LogError, match=r"state_motor\.csv:7: a row of type 'CONTROL', not STATE_MOTOR"):
+        list(read_logs(motion, so101))
+
+
+def test_a_header_with_positions_twice_is_refused(motion, so101):
+    edit(motion / "state_motor.csv", 1, "velocities", "positions")
+    with pytest.raises(
+        LogError, match=r"state_motor\.csv:1: a column stands twice in the header type, timestamp, positions, positions"
+    ):
+        list(read_logs(motion, so101))
+
+
+@pytest.mark.parametrize(("column", "unit"), [(1, "rad/s"), (2, "N·m")])
+def test_what_no_joint_does_is_refused(tmp_path, so101, column, unit):
+    folder = write_so101(tmp_path / "wave")
+    state = folder / "state_motor.csv"
+    lines = state.read_text().split("\n")
+    cells = lines[8].split('","')
+    cells[column] = cells[column].replace("0.0", "1e30", 1)
+    lines[8] = '","'.join(cells)
+    state.write_text("\n".join(lines))
+    with pytest.raises(LogError, match=rf"state_motor\.csv:9: .* of shoulder_pan is 1e\+30 {unit}: no joint does that"):
+        list(read_logs(folder, so101))

@@ -217,3 +217,26 @@ def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
         list(read_logs(tmp_path / "nowhere", arm))
     with pytest.raises(LogError, match="unknown format 'rosbag'; use one of sage, table"):
         list(read_logs(tmp_path, arm, "rosbag"))
+
+
+def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, arm):
+    file = write(tmp_path / "wave.csv", arm_columns(), "\n0.04,", "\n" + "9" * 140_000 + "x,")
+    with pytest.raises(LogError, match=r"wave\.csv:4: field larger than field limit \(131072\); repair or cut the row"):
+        only(file, arm)
+    file.write_text("x" * 140_000 + "\n1\n2\n")
+    with pytest.raises(LogError, match=r"wave\.csv:1: not a header of a table"):
+        only(file, arm)
+
+
+def test_names_in_a_parquet_file_that_are_no_text_are_refused(tmp_path, arm):
+    file = write_parquet(tmp_path / "wave.parquet", arm_columns())
+    file.write_bytes(file.read_bytes().replace(b"ctrl.elbow", b"ctrl.\xff\xfebow"))
+    with pytest.raises(LogError, match=r"wave\.parquet: not a readable Parquet file"):
+        only(file, arm)
+
+
+@pytest.mark.parametrize("toml", ["time = 1", "columns = 3", '[joint_units]\nelbow = ["deg"]', "x = " + "9" * 5000])
+def test_a_column_map_of_other_types_is_refused(tmp_path, arm, toml):
+    (tmp_path / "map.toml").write_text(toml)
+    with pytest.raises(UsageError, match=r"map\.toml: "):
+        only(write(tmp_path / "wave.csv", arm_columns()), arm, columns=tmp_path / "map.toml")

@@ -57,10 +57,11 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
     if best.evidence > EVIDENCE and best.otherwise > ENOUGH:
         sign, turn, _ = best.how
         what = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
+        what = "its angle mirrored" if sign < 0 else what
         text = (
-            f"the torques fit the weight of the arm better with {'its angle mirrored' if sign < 0 else what} "
-            f"at {best.joint} ({best.otherwise:.0%} explained) than as logged ({best.as_logged:.0%}): a sign or zero may be "
-            "wrong in command and state alike; check it against the model"
+            f"with {what} at {best.joint} the torques fit the weight of the arm better ({best.otherwise:.0%} explained) "
+            f"than as logged ({best.as_logged:.0%}): a sign or zero may be wrong in command and state alike; check "
+            "it against the model"
         )
         yield Finding("warning", "gravity", text, (best.joint,), {"evidence": best.evidence})
     else:

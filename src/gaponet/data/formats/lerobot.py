@@ -308,7 +308,8 @@ class _Frames:
             "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
         }
         if self.part.ours:
-            meta |= {"stated": row["stated"], "dataset": self.part.ours["dataset"]}
+            said = self.part.ours["dataset"]
+            meta |= {"stated": row["stated"], "dataset": {k: v for k, v in said.items() if k in Stated.__annotations__}}
         return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
 
     def _time(self, where: Array) -> Array:
