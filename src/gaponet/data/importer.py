@@ -106,9 +106,9 @@ def import_logs(
     )
     with writing(out, KIND):
         known = Dataset.peek(out, robot)
-        if known:
+        if known is not None:
             read_offsets(known)  # a damaged one is said before anything is read
-        dataset, added, present = _import(src, out, robot, given, known, fmt, progress, options)
+        dataset, added, present = _import(src, out, robot, given, fmt, progress, options)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
         offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
         for unit, fitted in offsets.items():
@@ -121,7 +121,6 @@ def _import(
     out: Path,
     robot: RobotSpec,
     given: _Given,
-    known: Dataset | None,
     fmt: str | None,
     progress: Progress | None,
     options: dict[str, Any],
@@ -146,7 +145,7 @@ def _import(
             progress(len(digests), total, sequence.meta.motion)
     _refuse_twice(digests)
     again = (s for s, _ in _sequences(src, robot, given, fmt, options))
-    dataset = known or Dataset.create(out, robot)
+    dataset = Dataset.create(out, robot)
     if facts and not dataset.entries:
         dataset.state(**facts)
     present = [entry for digest, _ in digests if (entry := dataset.find(digest))]

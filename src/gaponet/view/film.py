@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.errors import UsageError
+from gaponet.files import whole
 from gaponet.view.picture import Camera
 from gaponet.view.side_by_side import SideBySide
 
@@ -75,6 +76,11 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
         Number of pictures.
     """
     require_kind(path)
+    with whole(path) as temporary:
+        return _write(camera, clip, temporary, progress)
+
+
+def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None]) -> int:
     kind = path.suffix.lower()
     if kind == ".png":
         camera.picture(_furthest(camera.scene.shown, clip)).save(path)
