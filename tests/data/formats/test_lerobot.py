@@ -369,3 +369,11 @@ def test_a_unit_that_is_no_text_is_no_unit(dataset, arm, tmp_path):
     file.write_text(json.dumps(info))
     with pytest.raises(UsageError, match="unit of positions is not written in the set"):
         back(tmp_path / "out", arm, tmp_path / "again")
+
+
+@pytest.mark.parametrize("column", [pa.array([1], pa.timestamp("ns")), pa.array([[1]]), pa.array([None], pa.int64())])
+def test_tasks_of_other_types_are_refused(so101, tmp_path, column):
+    folder = stock(tmp_path / "set")
+    rewrite(folder / "meta" / "tasks.parquet", task_index=column)
+    with pytest.raises(LogError, match=r"tasks\.parquet: "):
+        read_stock(folder, so101, tmp_path / "data")

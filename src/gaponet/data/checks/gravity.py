@@ -59,7 +59,7 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
         what = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
         what = "its angle mirrored" if sign < 0 else what
         text = (
-            f"with {what} at {best.joint} the torques fit the weight of the arm better ({best.otherwise:.0%} explained) "
+            f"with {what} at {best.joint} the torques fit the weight of the arm better ({best.otherwise:.0%}) "
             f"than as logged ({best.as_logged:.0%}): a sign or zero may be wrong in command and state alike; check "
             "it against the model"
         )

@@ -83,6 +83,13 @@ Episode = TypedDict("Episode", {
 NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
 
 
+class Task(TypedDict):
+    """One row of meta/tasks."""
+
+    index: Count
+    text: str
+
+
 class Stated(TypedDict):
     """What a dataset says of itself."""
 
@@ -195,10 +202,7 @@ def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     said = STATED if ours else ()
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
     table = _table(file, (*NEEDED, *(n for n in said if n not in LATER)), ("tasks", *(LATER if ours else ())), hint)
-    try:
-        rows = table.to_pylist()
-    except ValueError as error:  # a date that Python cannot hold
-        raise LogError(f"{file}: not readable ({error}); {AGAIN}") from None
+    rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
 
@@ -216,6 +220,13 @@ def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
     return row | {"stated": {name: stated[name] for name in STATED}}
 
 
+def _rows(file: Path, table: Any) -> list[dict[str, Any]]:
+    try:
+        return cast("list[dict[str, Any]]", table.to_pylist())
+    except ValueError as error:  # a date that Python cannot hold
+        raise LogError(f"{file}: not readable ({error}); {AGAIN}") from None
+
+
 def _tasks(part: Set) -> dict[int, str]:
     """{task_index: text}; the text stands in the index of a pandas table, under either name."""
     file = part.path / "meta" / "tasks.parquet"
@@ -224,7 +235,8 @@ def _tasks(part: Set) -> dict[int, str]:
     table = _table(file, ("task_index",), ("task", "__index_level_0__"))
     if table.num_columns != 2:
         raise LogError(f"{file}: no task and task_index in it; {AGAIN}")
-    return dict(zip(table["task_index"].to_pylist(), map(str, table.column(1).to_pylist()), strict=True))
+    rows = validated(list[Task], _rows(file, table.rename_columns(["index", "text"])), file, LogError, AGAIN)
+    return {row["index"]: row["text"] for row in rows}
 
 
 def _unit(part: Set, given: str | None) -> str:
