@@ -248,3 +248,11 @@ def test_a_journal_from_before_gains_were_kept_still_opens(logs, so101, tmp_path
     journal.write_text("".join(json.dumps(line) + "\n" for line in old))
     data = Dataset(tmp_path / "data")
     assert data.read(data.entries[0]).meta.kp is None
+
+
+@pytest.mark.parametrize("payload", [float("nan"), float("inf"), -1.0, 1e30])
+def test_a_payload_that_is_no_mass_is_refused(so101, tmp_path, payload):
+    write_so101(tmp_path / "logs" / "wave")
+    with pytest.raises(LogError, match=r"wave: payload_mass is .*; give kg, 0 when empty"):
+        import_logs(tmp_path / "logs", so101, "lab", payload, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

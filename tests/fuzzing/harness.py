@@ -207,7 +207,10 @@ def _work(
     sys.addaudithook(_watch)
     _limit_memory()
     pipe.send("begin")
+    parent = os.getppid()
     for index, number in plan:
+        if os.getppid() != parent:  # it was killed
+            return
         outcome, failure = _attempt(targets[index], untouched[index], number, seed, room)
         if failure and keep:
             to = keep / f"{failure.kind}-{failure.target}-{number}"

@@ -184,7 +184,7 @@ def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha
     stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items() if v is not None}
     for name, value in vars(given).items():
         flag = "--" + name.replace("_", "-")
-        if value is not None and stated.get(name, value) != value:
+        if value is not None and name in stated and stated[name] != value:
             raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
         if value is None and name in ("unit_id", "payload_mass") and name not in stated:
             example = "0 (kg in each hand, 0 when empty)" if name == "payload_mass" else "NAME"
