@@ -176,9 +176,9 @@ def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) ->
     reach = asked.reach
     if asked.driver == "unitree":
         options: dict[str, Any] = {n: getattr(reach, n) for n in ("topic", "joints", "domain", "interface")}
-        return open_driver("unitree", robot.mjcf.parent, **options), {}
+        return open_driver("unitree", robot.folder, **options), {}
     if asked.driver == "so101":
-        return open_driver("so101", robot.mjcf.parent, port=reach.port, calibration=reach.calibration), {}
+        return open_driver("so101", robot.folder, port=reach.port, calibration=reach.calibration), {}
     from gaponet.deploy.drivers.virtual import VirtualDriver
     from gaponet.virtual.fleet import load_fleet
 

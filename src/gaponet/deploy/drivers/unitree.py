@@ -241,7 +241,7 @@ class UnitreeDriver:
     def guard(self) -> dict[str, object] | None:
         """A second participant that is connected from the start and silent while the controller lives."""
         return {
-            "kind": "unitree", "robot": str(self.robot.mjcf.parent), "early": True, "topic": self.topic,
+            "kind": "unitree", "robot": str(self.robot.folder), "early": True, "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
         }  # fmt: skip
 
