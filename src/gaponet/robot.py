@@ -229,7 +229,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         name=table.name,
         description=table.description or table.name,
         mjcf=mjcf,
-        folder=folder,
+        folder=folder.absolute(),  # told to other processes
         joint_names=tuple(j.name for j in joints),
         operated=tuple(j.name for j in joints if j.operated),
         kp=np.array([j.kp for j in joints]),
