@@ -12,10 +12,10 @@ from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 
-from fuzzing import readers
+from fuzzing import readers, structures
 from fuzzing.harness import Failure, run
 
-GROUPS = {"readers": readers.TARGETS}
+GROUPS = {"readers": readers.TARGETS, "structures": structures.TARGETS}
 
 
 def grouped(failures: list[Failure]) -> list[tuple[str, int, Failure]]:

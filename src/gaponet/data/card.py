@@ -15,6 +15,7 @@ from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
+from gaponet.structure import read_json
 
 Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
@@ -142,7 +143,9 @@ def _identity(dataset: Dataset) -> dict[str, Any]:
         "licence": dataset.header.get("licence", NOT_STATED),
         "source": dataset.header.get("source", NOT_STATED),
         "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
-        "collected": json.loads(made.read_text(encoding="utf-8")) if made.is_file() else None,
+        "collected": read_json(dict[str, Any], made, DatasetError, "restore it or delete it")
+        if made.is_file()
+        else None,
         "dataset_hash": dataset_hash(dataset.entries),
         "format": dataset.header["format"],
         "bytes": sum(f.stat().st_size for f in (dataset.path / "sequences").iterdir()),

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from gaponet.data.card import NOT_STATED
+from gaponet.text import markdown
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}
 ASK = "set with `gaponet data card DIR --{0} …`"
@@ -13,7 +14,9 @@ ASK = "set with `gaponet data card DIR --{0} …`"
 
 def card_text(card: dict[str, Any]) -> str:
     """All of it; the first line says whether robots were virtual."""
-    return "\n".join([f"# {headline(card)}", "", *_facts(card), *_shares(card), *_repeatability(card), *_signals(card)])
+    return "\n".join(
+        [f"# {markdown(headline(card))}", "", *_facts(card), *_shares(card), *_repeatability(card), *_signals(card)]
+    )
 
 
 def headline(card: dict[str, Any]) -> str:
@@ -28,12 +31,13 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     total = card["total"]
     for name in ("licence", "source"):
         value = card[name]
-        yield f"- {name}: {value}" + (f"; {ASK.format(name)}" if value == NOT_STATED else "")
+        yield f"- {name}: {markdown(value)}" + (f"; {ASK.format(name)}" if value == NOT_STATED else "")
     recorded = card["recorded"]
-    yield f"- recorded: {recorded if isinstance(recorded, str) else ' to '.join(dict.fromkeys(recorded))}"
+    dates = recorded if isinstance(recorded, str) else " to ".join(dict.fromkeys(recorded))
+    yield f"- recorded: {markdown(dates)}"
     if card["collected"]:
-        how = card["collected"]
-        yield f"- made by gaponet collect: fleet {how.get('fleet')}, seed {how.get('seed')}"
+        fleet, seed = (markdown(str(card["collected"].get(name))) for name in ("fleet", "seed"))
+        yield f"- made by gaponet collect: fleet {fleet}, seed {seed}"
     yield f"- {total['frames']:,} frames of {len(card['joints'])} joints, {total['motions']} motions"
     yield f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, gaponet {card['gaponet']}"
     yield ""
@@ -87,10 +91,10 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
 
 
 def _table(columns: list[str], rows: list[list[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(columns)} |"
+    yield f"| {' | '.join(map(markdown, columns))} |"
     yield "| --- |" + " ---: |" * (len(columns) - 1)
     for row in rows:
-        yield f"| {' | '.join(row)} |"
+        yield f"| {' | '.join(map(markdown, row))} |"
     yield ""
 
 

@@ -11,9 +11,11 @@ from gaponet.files import write_text
 
 
 def finite(value: Any) -> Any:
-    """The same value with NaN and infinities as None and numpy scalars as Python's, so that it is valid JSON."""
+    """The same value as valid JSON: NaN and infinities as None, numpy scalars as Python's, text that UTF-8 can say."""
+    if isinstance(value, str):  # a file's name may hold bytes that are no letters
+        return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, dict):
-        return {str(k): finite(v) for k, v in value.items()}
+        return {finite(str(k)): finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite(v) for v in value]
     if hasattr(value, "tolist"):

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 from typing import TYPE_CHECKING
+
+from markupsafe import Markup, escape
+
+from gaponet.text import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,31 +38,40 @@ code { background: #f4f4f4; padding: 0 .25rem }
 """
 
 
-def page(title: str, body: str) -> str:
+def element(name: str, *content: str, css: str = "") -> Markup:
+    """One element of a page. Content that is not Markup is text, whatever it holds: this is where it is escaped."""
+    inside = Markup("").join(c if isinstance(c, Markup) else escape(plain(c)) for c in content)
+    kind = Markup(' class="{}"').format(css) if css else ""
+    return Markup("<{0}{1}>{2}</{0}>").format(name, kind, inside)
+
+
+def page(title: str, body: Markup) -> str:
     """A whole document."""
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{CSS}</style></head><body>{body}</body></html>\n"
-    )
+    head = Markup('<meta charset="utf-8">') + element("title", title) + element("style", Markup(CSS))
+    inside = element("head", head) + element("body", body)
+    return Markup('<!doctype html><html lang="en">{}</html>\n').format(inside)
 
 
-def facts_table(rows: list[list[str]]) -> str:
+def facts_table(rows: list[list[str]]) -> Markup:
     """Name and value in each row."""
-    body = "".join(f"<tr><td>{html.escape(k)}</td><td>{html.escape(v)}</td></tr>" for k, v in rows)
-    return f'<table class="facts">{body}</table>'
+    return element("table", *(element("tr", *(element("td", c) for c in row)) for row in rows), css="facts")
 
 
-def table(head: list[str], rows: list[list[str]], best: int | None = None) -> str:
+def table(head: list[str], rows: list[list[str]], best: int | None = None) -> Markup:
     """The first column is text, the others are numbers; the row of the best in bold."""
-    cells = "".join(f"<th>{html.escape(h)}</th>" for h in head)
-    body = "".join(
-        f"<tr{' class=best' if i == best else ''}>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>"
-        for i, row in enumerate(rows)
+    body = (
+        element("tr", *(element("td", c) for c in row), css="best" if i == best else "") for i, row in enumerate(rows)
     )
-    return f"<table><tr>{cells}</tr>{body}</table>"
+    return element("table", element("tr", *(element("th", h) for h in head)), *body)
 
 
-def figure(fig: Figure, caption: str) -> str:
+def tag(virtual: bool) -> Markup:
+    """Whose numbers these are."""
+    name = "virtual" if virtual else "real"
+    return element("span", "VIRTUAL robot" if virtual else "real robot", css=f"tag {name}")
+
+
+def figure(fig: Figure, *caption: str) -> Markup:
     """Inline SVG where it is small, PNG where a plot has many points."""
     buffer = io.BytesIO()
     fig.savefig(buffer, format="svg")
@@ -67,7 +79,12 @@ def figure(fig: Figure, caption: str) -> str:
     if len(data) > 400_000:
         buffer = io.BytesIO()
         fig.savefig(buffer, format="png", dpi=150)
-        image = f'<img src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+        image = picture(buffer.getvalue(), "image/png")
     else:
-        image = data[data.index("<svg") :]
-    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
+        image = Markup(data[data.index("<svg") :])
+    return element("figure", image, element("figcaption", *caption))
+
+
+def picture(data: bytes, kind: str) -> Markup:
+    """A picture inside the page; a script in somebody's SVG does not run there."""
+    return Markup('<img src="data:{};base64,{}">').format(kind, base64.b64encode(data).decode())

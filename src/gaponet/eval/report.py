@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError
-from gaponet.eval.page import facts_table, figure, page, table
+from gaponet.eval.page import element, facts_table, figure, page, table, tag
 from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
@@ -93,41 +93,41 @@ def _page(
 
     methods, kind = metrics["methods"], card["model"]["kind"]
     name = title(kind)
-    tag = (
-        '<span class="tag virtual">VIRTUAL robot</span>'
-        if metrics["virtual"]
-        else '<span class="tag real">real robot</span>'
-    )
     ratio = metrics["ratio_to_nominal"]
-    body = [
-        f"<h1>{html.escape(robot.description)}: {name}</h1><p>{tag} {_facts_line(card, metrics)}</p>",
-        f'<p class="lead">{_verdict(kind, methods, ratio)}</p>',
-        *(f'<div class="warn">{html.escape(text)}</div>' for text in warnings(card, metrics)),
-        "<h2>Errors, whole-motion free run on held-out recordings</h2>" if metrics["unseen"]
-        else "<h2>Errors, whole-motion free run (some recordings were used in training)</h2>",
-        _totals(methods, ratio),
-        '<div class="row">', figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
+    held_out = "on held-out recordings" if metrics["unseen"] else "(some recordings were used in training)"
+    bars = [
+        figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
         figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
-    ]  # fmt: skip
+    ]
     if len(methods["nominal"]["by_payload"]) > 1:
-        body.append(figure(draw.by_payload(methods), "Payload in each hand."))
-    body += ["</div>", "<h2>Trajectories</h2>", *_trajectories(arrays, metrics, robot)]
+        bars.append(figure(draw.by_payload(methods), "Payload in each hand."))
+    body = [
+        element("h1", f"{robot.description}: {name}"),
+        element("p", tag(metrics["virtual"]), " ", *_facts_line(card, metrics)),
+        element("p", _verdict(kind, methods, ratio), css="lead"),
+        *(element("div", text, css="warn") for text in warnings(card, metrics)),
+        element("h2", f"Errors, whole-motion free run {held_out}"),
+        _totals(methods, ratio),
+        element("div", *bars, css="row"),
+        element("h2", "Trajectories"), *_trajectories(arrays, metrics, robot),
+    ]  # fmt: skip
     if budget is not None:
         body += [
-            "<h2>Where the gap comes from</h2>",
+            element("h2", "Where the gap comes from"),
             figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (hollow: adds to it)."),
         ]
+    curve_figure = figure(
+        draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."
+    )
     body += [
-        "<h2>Training</h2>", '<div class="row">',
-        figure(draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."),
-        _training_table(card, config), "</div>",
-        "<h2>By motion</h2>", _by_motion(methods),
-        "<h2>What exactly</h2>", _facts(card, metrics),
+        element("h2", "Training"), element("div", curve_figure, _training_table(card, config), css="row"),
+        element("h2", "By motion"), _by_motion(methods),
+        element("h2", "What exactly"), _facts(card, metrics),
     ]  # fmt: skip
-    return page(f"{robot.name} {name}", "".join(body))
+    return page(f"{robot.name} {name}", Markup("").join(body))
 
 
-def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[str]:
+def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[Markup]:
     from gaponet.eval import figures as draw
 
     caption = (
@@ -137,8 +137,8 @@ def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: Robo
         errors = np.abs(arrays[f"{row}/nominal"] - arrays[f"{row}/recorded"]).mean(axis=0)
         worst = sorted(np.argsort(-errors)[:3].tolist())
         fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(metrics["methods"]), shown["dt"])
-        where = html.escape(f"unit {shown['unit_id']}, {shown['payload_mass']:g} kg")
-        yield figure(fig, f"<b>{html.escape(shown['motion'])}</b> ({where}): {caption}")
+        where = f" (unit {shown['unit_id']}, {shown['payload_mass']:g} kg): {caption}"
+        yield figure(fig, element("b", shown["motion"]), where)
 
 
 def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
@@ -183,15 +183,16 @@ def _verdict(kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str
     return text + (f" ({', '.join(others)} mrad)." if others else ".")
 
 
-def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> str:
-    return (
+def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
+    gains = ", ".join(f"{v:g}" for v in sorted(set(card["kp"])))
+    return [
         f"{metrics['sequences']} recordings, {len(metrics['motions'])} motions; trained {card['hours']:.2f} h of logs, "
-        f"{card['steps']:,} control steps; simulator <code>{metrics['simulator_hash']}</code>, kp "
-        f"{', '.join(f'{v:g}' for v in sorted(set(card['kp'])))} N·m/rad"
-    )
+        f"{card['steps']:,} control steps; simulator ", element("code", metrics["simulator_hash"]),
+        f", kp {gains} N·m/rad",
+    ]  # fmt: skip
 
 
-def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> str:
+def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> Markup:
     head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static, mrad", "dynamic, mrad",
             "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
     rows = [
@@ -203,13 +204,13 @@ def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> str:
     return table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
 
 
-def _by_motion(methods: dict[str, Any]) -> str:
+def _by_motion(methods: dict[str, Any]) -> Markup:
     head = ["motion, MPJAE in mrad", *(title(n) for n in methods)]
     keys = methods["nominal"]["by_motion"]
     return table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
 
 
-def _training_table(card: dict[str, Any], config: dict[str, Any]) -> str:
+def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
     r2, shape, ppo, motions = card.get("sensor_r2"), card["model"], config["ppo"], card["motions"]
     rows = [
         ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
@@ -235,7 +236,7 @@ def _r2(found: dict[str, Any] | float | None) -> str:
     return f"{found['mean']:.3f} on held-out states ({joints})"
 
 
-def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> str:
+def _facts(card: dict[str, Any], metrics: dict[str, Any]) -> Markup:
     rows = [
         ["robot, joints", f"{card['robot']}: {', '.join(card['joint_names'])}"],
         ["simulator", f"{metrics['simulator_hash']}; kp {card['kp']}, kd {card['kd']}"],

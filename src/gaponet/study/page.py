@@ -9,20 +9,47 @@ The first table and the first figure are NAME.csv and NAME.svg, the others carry
 
 from __future__ import annotations
 
-import html
-import json
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+from typing_extensions import TypedDict
+
 from gaponet.data.json_file import write_json
 from gaponet.errors import DatasetError
-from gaponet.eval import page as html_page
+from gaponet.eval.page import element, facts_table, page, picture, tag
+from gaponet.eval.page import table as html_table
 from gaponet.files import write_text, writing
 from gaponet.plot.style import save
+from gaponet.structure import Json, Name, read_json, validated
 from gaponet.study.result import Result, fact_rows
+from gaponet.text import markdown, plain
 
 FORMAT = "gaponet experiment 1"
 KIND = "experiments"
+
+
+class TableRecord(TypedDict):
+    """A table of a result's .json; texts is what people read, rows the exact numbers."""
+
+    name: str
+    caption: str
+    columns: list[str]
+    rows: list[list[Json]]
+    texts: list[list[str]]
+
+
+class Record(TypedDict):
+    """A result's .json; figures: name → file without suffix."""
+
+    format: str
+    name: Name
+    title: str
+    virtual: str
+    facts: dict[str, Json]
+    sentences: list[str]
+    tables: list[TableRecord]
+    figures: dict[str, Name]
 
 
 def write(result: Result, folder: Path) -> list[Path]:
@@ -64,12 +91,12 @@ def stems(name: str, parts: list[str]) -> list[str]:
 
 
 def _markdown(result: Result, pictures: list[str]) -> str:
-    parts = [f"# {result.title}", f"**{result.virtual}**"]
+    parts = [f"# {markdown(result.title)}", f"**{markdown(result.virtual)}**"]
     if result.sentences:
-        parts.append("\n".join(f"- {s}" for s in result.sentences))
+        parts.append("\n".join(f"- {markdown(s)}" for s in result.sentences))
     parts += [t.markdown() for t in result.tables if t.shown]
     parts += [f"![]({stem}.svg)" for stem in pictures]
-    parts.append("\n".join(f"- {key}: {value}" for key, value in fact_rows(result.facts)))
+    parts.append("\n".join(f"- {markdown(key)}: {markdown(value)}" for key, value in fact_rows(result.facts)))
     return "\n\n".join(parts) + "\n"
 
 
@@ -82,45 +109,37 @@ def write_report(folder: Path) -> Path:
     records = found(folder)
     if not records:
         raise DatasetError(f"{folder}: no result of gaponet experiment here; run one with this folder as OUT")
-    contents = "".join(f'<li><a href="#{html.escape(r["name"])}">{html.escape(r["title"])}</a></li>' for r in records)
-    body = f"<h1>Experiments</h1><ul>{contents}</ul>" if len(records) > 1 else ""
+    contents = [Markup('<li><a href="#{}">{}</a></li>').format(plain(r["name"]), plain(r["title"])) for r in records]
+    body = element("h1", "Experiments") + element("ul", *contents) if len(records) > 1 else Markup("")
     path = folder / "report.html"
-    write_text(path, html_page.page("gaponet experiments", body + "".join(_section(r, folder) for r in records)))
+    write_text(path, page("gaponet experiments", body + Markup("").join(_section(r, folder) for r in records)))
     return path
 
 
-def found(folder: Path) -> list[dict[str, Any]]:
+def found(folder: Path) -> list[Record]:
     """The results of a folder as their .json files hold them; other JSON files are passed over."""
-    records = []
+    records, hint = [], "delete it and run its experiment again"
     for file in sorted(folder.glob("*.json")):
-        try:
-            record = json.loads(file.read_text(encoding="utf-8"))
-        except json.JSONDecodeError as error:
-            raise DatasetError(f"{file}: damaged ({error}); delete it and run its experiment again") from None
+        record = read_json(Any, file, DatasetError, hint)
         if isinstance(record, dict) and record.get("format") == FORMAT:
-            records.append(record)
+            records.append(validated(Record, record, file, DatasetError, hint))
     return records
 
 
-def _section(record: dict[str, Any], folder: Path) -> str:
-    virtual = "VIRTUAL" in record["virtual"]
-    tag = f'<span class="tag {"virtual" if virtual else "real"}">{"VIRTUAL robot" if virtual else "real robot"}</span>'
+def _section(record: Record, folder: Path) -> Markup:
+    head = Markup('<h1 id="{}">{}</h1>').format(plain(record["name"]), plain(record["title"]))
     parts = [
-        f'<h1 id="{html.escape(record["name"])}">{html.escape(record["title"])}</h1>',
-        f"<p>{tag} {html.escape(record['virtual'])}</p>",
-        "<ul>" + "".join(f"<li>{html.escape(s)}</li>" for s in record["sentences"]) + "</ul>",
+        head,
+        element("p", tag("VIRTUAL" in record["virtual"]), " ", record["virtual"]),
+        element("ul", *(element("li", sentence) for sentence in record["sentences"])),
         *(_figure(folder / f"{stem}.svg") for stem in record["figures"].values()),
     ]
     for t in record["tables"]:
-        parts += [
-            html_page.table(t["columns"], t["texts"]),
-            f"<p>{html.escape(t['caption'])}</p>" if t["caption"] else "",
-        ]
-    return "".join([*parts, html_page.facts_table(fact_rows(record["facts"]))])
+        parts += [html_table(t["columns"], t["texts"]), element("p", t["caption"]) if t["caption"] else Markup("")]
+    return Markup("").join([*parts, facts_table(fact_rows(record["facts"]))])
 
 
-def _figure(file: Path) -> str:
+def _figure(file: Path) -> Markup:
     if not file.is_file():
         raise DatasetError(f"{file}: is missing; run its experiment again, or delete its .json")
-    text = file.read_text(encoding="utf-8")
-    return f"<figure>{text[text.index('<svg') :]}</figure>"
+    return element("figure", picture(file.read_bytes(), "image/svg+xml"))

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.text import markdown
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -71,9 +73,9 @@ class Table:
     def markdown(self) -> str:
         """The table as people read it, its caption below."""
         ruler = ["---", *["---:"] * (len(self.columns) - 1)]
-        lines = [list(self.columns), ruler, *self.texts()]
-        found = "\n".join("| " + " | ".join(c.replace("|", "\\|") for c in line) + " |" for line in lines)
-        return f"{found}\n\n{self.caption}" if self.caption else found
+        lines = [map(markdown, self.columns), ruler, *(map(markdown, row) for row in self.texts())]
+        found = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return f"{found}\n\n{markdown(self.caption)}" if self.caption else found
 
     def csv(self) -> str:
         """All that was measured, at full precision; a column with spreads is followed by its std and count."""
