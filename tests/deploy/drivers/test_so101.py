@@ -133,9 +133,10 @@ def test_a_port_that_is_not_there_is_said(so101):
 def test_a_reply_that_was_lost_is_asked_for_again(driver, servos):
     lost = iter([True, False])
     servos.adversary = lambda servo, reply: b"" if servo == 3 and next(lost, False) else reply
-    before = driver.read().time
-    assert driver.read().time > before
-    assert servos.heard[-1][5:-1] == bytes([56, 15, 1, 2, 3, 4, 5, 6])
+    servos.set(3, "position", 2345)
+    assert driver.read().qpos[2] == pytest.approx(345 * STEP)
+    whole, again = servos.heard[-2:]
+    assert (whole[7:-1], again[7:-1]) == (bytes([1, 2, 3, 4, 5, 6]), bytes([3]))
 
 
 def test_a_servo_that_falls_silent_makes_the_state_old(driver, servos):
@@ -184,17 +185,36 @@ def test_whatever_single_byte_is_changed_a_state_is_true_or_old(driver, servos):
     assert len(true) > 10
 
 
-def test_an_answer_that_comes_too_late_is_not_taken_for_the_next_one(so101, wire, servos):
+def test_answers_that_come_late_are_never_taken_for_those_to_a_later_question(driver, servos, wire):
+    """Every reply of a period arrives in the next one, before or after that one's own."""
+    kept: list[bytes] = []
+    arriving = b""
+
+    def late(servo: int, reply: bytes) -> bytes:
+        kept.append(reply)
+        out = arriving if len(kept) == 1 else b""  # with the first reply to a request
+        return out + reply if own else out
+
+    servos.adversary = late
+    for period in range(40):
+        own = period % 3 == 0  # its own replies come in time as well
+        arriving, kept[:] = b"".join(kept), []
+        for servo in range(1, 7):
+            servos.set(servo, "position", 1100 + 10 * period + servo)
+        before, state = driver._state, driver.read()
+        assert (state.time != before.time) == own
+        if own:
+            np.testing.assert_array_equal(driver.steps.steps(state.qpos), 1100 + 10 * period + np.arange(1, 7))
+
+
+def test_a_late_reply_is_not_taken_for_the_next_registers(wire, servos):
     bus = reg.ServoBus(wire, SILENCE, retries=0)
-    servos.set(1, "position", 1111)
-    stale = bytearray()
-    servos.adversary = lambda servo, reply: bytes(stale.extend(reply) or b"")
-    assert not bus.sync_read([1], reg.PRESENT)
+    servos.adversary = lambda servo, reply: b""
+    with pytest.raises(DriverError):
+        bus.read(1, reg.P)
     servos.adversary = lambda servo, reply: reply
-    servos.set(1, "position", 2222)
-    wire.buffer = bytes(stale)  # arrives before the next request, or while it waits
-    (block,) = bus.sync_read([1], reg.PRESENT).values()
-    assert int.from_bytes(block[:2], "little") == 2222
+    wire.buffer = bytes.fromhex("ff ff 01 03 00 10 eb")  # P of 16, late
+    assert bus.read(1, reg.I) == 0
 
 
 def test_a_bus_that_never_stops_talking_is_not_listened_to_for_ever(driver, servos):

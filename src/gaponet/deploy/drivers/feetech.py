@@ -19,6 +19,8 @@ BROADCAST = 0xFE
 ERRORS = ("voltage", "angle sensor", "overheat", "overcurrent", "", "overload")  # status bits; bit 4: torque is on
 FAULTY = sum(1 << bit for bit, word in enumerate(ERRORS) if word)
 RETRIES = 2  # what LeRobot's num_read_retries is
+TAGS = 8  # requests that replies can be told apart for
+LONGEST = 64  # bytes behind the length of a reply
 CHATTER = 4  # times the bytes that were asked for: a bus that says more is not listened to
 
 
@@ -108,6 +110,7 @@ class ServoBus:
         self.refused = 0  # replies with a wrong checksum
         self.errors: dict[int, int] = {}  # servo → error bits of all its replies so far
         self._owed = False  # replies were asked for that have not come; they may come late
+        self._tag = 0
 
     def ping(self, servo: int) -> bool:
         """Whether it answers."""
@@ -119,14 +122,14 @@ class ServoBus:
         Raises:
             DriverError: No answer, or damaged ones only.
         """
-        found = self._ask(READ, [servo], bytes([register.address, register.size]), register.size)
+        found = self._ask(READ, [servo], bytes([register.address]), register.size)
         if not found:
             raise DriverError(f"servo {servo} does not answer; is it powered and is its number {servo}?")
         return register.decode(found[servo])
 
     def sync_read(self, servos: Iterable[int], block: Register) -> dict[int, bytes]:
         """The same block of several servos in one exchange; those that never answered well are missing."""
-        return self._ask(SYNC_READ, list(servos), bytes([block.address, block.size]), block.size)
+        return self._ask(SYNC_READ, list(servos), bytes([block.address]), block.size, TAGS)
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """One register of several servos; nobody acknowledges."""
@@ -137,47 +140,60 @@ class ServoBus:
         """One register of every servo there is, whatever its number; nobody acknowledges."""
         self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
 
-    def _ask(self, instruction: int, servos: list[int], parameters: bytes, size: int) -> dict[int, bytes]:
-        """Replies by servo; those that are missing after a silence are asked for again."""
-        if self._owed:
+    def _ask(
+        self, instruction: int, servos: list[int], parameters: bytes, size: int, tags: int = 1
+    ) -> dict[int, bytes]:
+        """Replies by servo; those that are missing after a silence are asked for again.
+
+        A reply does not say to what. With tags, successive requests ask for up to so many bytes more, so that a reply's
+        length says which request it answers, and late ones to an earlier call are not taken for it.
+        """
+        if self._owed and tags == 1:
             self._drain()
         found: dict[int, bytes] = {}
+        sizes: set[int] = set()
         for _ in range(1 + self.retries):
             missing = [servo for servo in servos if servo not in found]
             if missing:
+                self._tag = (self._tag + 1) % tags
+                sizes.add(size + self._tag)
+                words = bytes([parameters[0], size + self._tag]) if parameters else b""
                 several = instruction == SYNC_READ
                 self.stream.reset_input_buffer()
                 self.stream.write(
-                    packet(BROADCAST, instruction, parameters + bytes(missing)) if several
-                    else packet(missing[0], instruction, parameters)
+                    packet(BROADCAST, instruction, words + bytes(missing)) if several
+                    else packet(missing[0], instruction, words)
                 )  # fmt: skip
-                found |= self._replies(missing, size)
+                found |= self._replies(missing, size + self._tag, sizes)
                 self._owed |= not found.keys() >= set(missing)
-        return found
+        return {servo: data[:size] for servo, data in found.items()}
 
-    def _replies(self, servos: list[int], size: int) -> dict[int, bytes]:
+    def _replies(self, servos: list[int], expected: int, sizes: set[int]) -> dict[int, bytes]:
         """Whole replies of these servos, in any order, until all are there or nothing more comes."""
         found: dict[int, bytes] = {}
-        length, data = size + 6, b""
-        patience = CHATTER * length * len(servos)  # bytes
+        data, patience = b"", CHATTER * (expected + 6) * len(servos)  # bytes
         silent = time.monotonic() + self.timeout
         while len(found) < len(servos) and patience > 0:
-            more = self.stream.read(max(1, (len(servos) - len(found)) * length - len(data)))
+            more = self.stream.read(max(1, (len(servos) - len(found)) * (expected + 6) - len(data)))
             if more:
                 silent = time.monotonic() + self.timeout
             elif time.monotonic() >= silent:
                 break
             data, patience = data + more, patience - len(more)
-            while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + length:
-                reply = data[start : start + length]
-                if reply[3] != size + 2 or checksum(reply[2:-1]) != reply[-1]:
-                    self.refused += reply[2] in servos
+            while (start := data.find(b"\xff\xff")) >= 0 and len(data) >= start + 6:
+                body = data[start + 2 : start + 4 + data[start + 3]]
+                if not 2 <= data[start + 3] <= LONGEST:
+                    data = data[start + 1 :]
+                elif len(body) < 2 + body[1]:
+                    break
+                elif checksum(body[:-1]) != body[-1]:
+                    self.refused += body[0] in servos
                     data = data[start + 1 :]  # the next packet may begin within what looked like one
-                    continue
-                data = data[start + length :]
-                self.errors[reply[2]] = self.errors.get(reply[2], 0) | reply[4]
-                if reply[2] in servos:
-                    found[reply[2]] = reply[5:-1]
+                else:
+                    data = data[start + 2 + len(body) :]
+                    self.errors[body[0]] = self.errors.get(body[0], 0) | body[2]
+                    if body[0] in servos and body[1] - 2 in sizes:
+                        found[body[0]] = body[3:-1]
         return found
 
     def _drain(self) -> None:

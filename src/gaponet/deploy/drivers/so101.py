@@ -40,6 +40,7 @@ Array = np.ndarray
 STALL_CURRENT = 2.7 / 0.0065  # steps: 2.7 A at 12 V (Feetech's data sheet of the STS3215)
 BAUD = 1_000_000
 STIFFNESS = 17.8 / 32  # N·m/rad of an STS3215 for each unit of its P; robot.toml of the so101 says whence
+PATIENT = 0.1  # s of silence while connecting, when nothing hurries
 FULL = 1000  # of TORQUE_LIMIT, 0.1 %
 FACTS = {
     "p": reg.P, "i": reg.I, "d": reg.D, "max_torque": reg.MAX_TORQUE, "torque_limit": reg.TORQUE_LIMIT,
@@ -98,8 +99,9 @@ class SO101Driver:
         try:
             self._open()
             with self._bus_errors():
+                self._bus.timeout = max(self.timeout, PATIENT)
                 self._meet()
-            self._state = None
+            self._state, self._bus.timeout = None, self.timeout
             deadline = time.monotonic() + 1.0
             while self._state is None:
                 self._poll()
@@ -117,7 +119,7 @@ class SO101Driver:
         except ImportError:
             raise DriverError("pyserial is not installed; run: pip install 'gaponet[so101]'") from None
         try:
-            self._serial = serial.Serial(self.port, BAUD, timeout=0.002, write_timeout=0.1)
+            self._serial = serial.Serial(self.port, BAUD, timeout=0.002, write_timeout=max(1.0, self.timeout))
         except (serial.SerialException, ValueError, OSError) as error:
             raise DriverError(f"{self.port}: {error}; is the arm plugged in, and may you use the port?") from None
         self._bus = reg.ServoBus(self._serial, self.timeout)
