@@ -8,7 +8,8 @@ from logs import arm_sequence, late, wave
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
-from gaponet.eval.draw_dataset import PICTURES, draw_all, liveliest, spread, swing, who
+from gaponet.eval.draw_dataset import PICTURES, draw_all, liveliest, spread, swing
+from gaponet.eval.whose import who
 from gaponet.plot.style import save
 from gaponet.sim.model import model_hash
 

@@ -13,8 +13,7 @@ from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import writes
 from gaponet.cli.progress import bar
 from gaponet.errors import ModelError, UsageError
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.study.compare import Compare
+from gaponet.study.compare import Compare, identified
 from gaponet.study.options import Options
 from gaponet.study.study import Study
 from gaponet.train.config import TrainConfig
@@ -49,22 +48,9 @@ def compare(
         if not identify:
             study.variant(word)  # refused before anything takes time
     if identify:
-        study = replace(study, identified=_identified(study))
+        with bar("identifying") as update:
+            tell = lambda done, total, rms: update(done, total, f"{rms * 1e3:.2f} mrad")  # noqa: E731
+            study = replace(study, identified=identified(study, tell))
     failed = carry_out(question, study, options.json)
     if failed:
         raise ModelError(f"{failed} trainings failed; the table is of the others. Run it again to retry")
-
-
-def _identified(study: Study) -> RobotSpec:
-    """The simulator identified on the training motions; once."""
-    from gaponet.data.split import split_entries
-    from gaponet.robot_folder import save_robot
-    from gaponet.sim.identify import identify
-
-    folder = study.out / "identified"
-    if not (folder / "robot.toml").is_file():
-        with bar("identifying") as update:
-            train = study.data.sequences(split_entries(study.data, study.holdout_units)["train"])
-            tell = lambda done, total, rms: update(done, total, f"{rms * 1e3:.2f} mrad")  # noqa: E731
-            save_robot(identify(train, study.robot, progress=tell).robot, folder)
-    return load_robot(folder)

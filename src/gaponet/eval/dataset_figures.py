@@ -12,18 +12,13 @@ from matplotlib.ticker import MultipleLocator
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
 from gaponet.plot.methods import COLOURS
-from gaponet.plot.style import figure, styled
+from gaponet.plot.style import figure, joint_label, legend, styled
 
 Array = np.ndarray
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
 LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True))
 RAIN = 250  # points under each cloud
-
-
-def short(joint: str) -> str:
-    """left_shoulder_pitch_joint → left shoulder pitch."""
-    return joint.removesuffix("_joint").replace("_", " ")
 
 
 def payload_colours(payloads: list[float]) -> dict[float, Any]:
@@ -56,7 +51,7 @@ def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, flo
         ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=colour, mew=1)
         rain = rng.choice(values, min(RAIN, len(values)), replace=False)
         ax.plot(rain, y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)), ".", ms=1.6, mew=0, color=colour, alpha=0.5)
-    ax.set_yticks(-np.arange(len(positions)), [short(j) for j in positions])
+    ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="y", visible=False)
     ax.set_ylim(-len(positions) + 0.45, 0.55)
@@ -115,7 +110,7 @@ def composition(entries: list[Entry], title: str) -> Figure:
     axes[0].set_ylabel("recorded, h")
     axes[0].margins(y=0.09)
     fig.align_xlabels(axes)
-    _head(fig, f"{title}; numbers are sequences", axes[0], len(present))
+    legend(fig, f"{title}; numbers are sequences")
     return fig
 
 
@@ -149,13 +144,13 @@ def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: s
                 values = values - values[0] if channel == "temperature" else values
                 axes[row, column].plot(time, values, color=colours[payload], lw=0.9, label=f"{payload:g} kg")
     for column, joint in enumerate(joints):
-        axes[0, column].set_title(short(joint))
+        axes[0, column].set_title(joint_label(joint, wrapped=False))
         axes[-1, column].set_xlabel("time, s")
         axes[0, column].margins(x=0.01)
     for row, (_, label) in enumerate(rows):
         axes[row, 0].set_ylabel(label)
     fig.align_ylabels(axes[:, 0])
-    _head(fig, title, axes[0, 0], len(takes))
+    legend(fig, title)
     return fig
 
 
@@ -183,13 +178,13 @@ def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> 
         low.axhline(0, color="#111111", lw=0.6)
         low.fill_between(time, gap, 0, color=COLOURS["gaponet"], alpha=0.25, lw=0)
         low.plot(time, gap, color=COLOURS["gaponet"], lw=0.9)
-        top.set_title(short(joint))
+        top.set_title(joint_label(joint, wrapped=False))
         low.set_xlabel("time, s")
         top.margins(x=0.01)
     axes[0, 0].set_ylabel("position, rad")
     axes[1, 0].set_ylabel("gap, mrad")
     fig.align_ylabels(axes[:, 0])
-    _head(fig, title, axes[0, 0], 3)
+    legend(fig, title)
     return fig
 
 
@@ -214,19 +209,14 @@ def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) ->
         ax.bar(x, q3 - q1, width * 0.8, q1, color=colours[payload], label=f"{payload:g} kg")
         ax.hlines(middle, x - 0.4 * width, x + 0.4 * width, color="white", lw=1.2)
     ax.axvline(0.5, color="#999999", lw=0.6)
-    ax.set_xticks(np.arange(len(names)), [_wrapped(j) for j in names], fontsize=7.5)
+    ax.set_xticks(np.arange(len(names)), [joint_label(j) for j in names], fontsize=7.5)
     ax.set_xlim(-0.55, len(names) - 0.45)
     ax.set_ylim(bottom=0)
     ax.grid(axis="x", visible=False)
     ax.set_ylabel("mean |recorded − twin|, mrad")
     ax.set_xlabel("white: median over takes, box: quartiles, line: 5–95 %", fontsize=7.5)
-    _head(fig, title, ax, len(payloads))
+    legend(fig, title)
     return fig
-
-
-def _wrapped(joint: str) -> str:
-    """One word a line: tick labels stand side by side."""
-    return short(joint).replace(" ", "\n")
 
 
 def _same_scale(rows: Any) -> None:
@@ -235,11 +225,3 @@ def _same_scale(rows: Any) -> None:
         for ax in row[1:]:
             ax.sharey(row[0])
             ax.tick_params(labelleft=False)
-
-
-def _head(fig: Figure, title: str, ax: Any, columns: int) -> None:
-    """Title, and the legend under it: never over the data."""
-    fig.legend(
-        *ax.get_legend_handles_labels(), loc="outside upper left", ncols=columns, columnspacing=1.1, handlelength=1.4,
-        borderpad=0, title=title, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
-    )  # fmt: skip

@@ -14,6 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
+from gaponet.eval.whose import who
 from gaponet.files import writing
 from gaponet.plot.style import save
 from gaponet.robot import RobotSpec
@@ -202,10 +203,3 @@ def spread(items: list[Any], most: int) -> list[Any]:
     if len(items) <= most:
         return items
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]
-
-
-def who(entries: list[Entry]) -> str:
-    """ "VIRTUAL h1_2" where any of it was not recorded on hardware."""
-    virtual = sum(e.meta.virtual for e in entries)
-    kind = "" if not virtual else "VIRTUAL " if virtual == len(entries) else "partly VIRTUAL "
-    return kind + entries[0].meta.robot

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gaponet.plot.charts import Once, against, bars
+from gaponet.plot.charts import Once, against, bars, lines
 from gaponet.plot.methods import COLOURS, colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
 
@@ -31,25 +31,20 @@ def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[st
     return bars([label(k) for k in keys], values, "mrad", heading)
 
 
-@styled
 def by_horizon(methods: dict[str, Any]) -> Figure:
     """MPJAE against the time since the common start: does the error grow?"""
-    fig = figure(5.0, 3.0)
-    ax = fig.subplots()
-    for name, m in methods.items():
-        points = [(float(k), v["mpjae"] * 1e3) for k, v in m["by_horizon"].items() if k != "whole"]
-        x, y = zip(*points, strict=True)
-        end = x[-1] * 4
-        ax.plot([*x, end], [*y, m["by_horizon"]["whole"]["mpjae"] * 1e3], "o-", ms=3.5, color=colour(name),
-                label=title(name))  # fmt: skip
-    ax.set_xscale("log")
-    ax.set_xticks([*x, end], [*(f"{v:g} s" for v in x), "whole\nmotion"])
-    ax.minorticks_off()
-    ax.set_ylim(bottom=0)
-    ax.set_ylabel("mrad")
-    ax.set_title("MPJAE by horizon of the free run")
-    legend(fig)
-    return fig
+    keys = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
+    x = [float(k) for k in keys]
+    ticks = [*((v, f"{v:g} s") for v in x), (4 * x[-1], "whole\nmotion")]
+    drawn = {
+        title(n): (
+            colour(n),
+            [at for at, _ in ticks],
+            [Once(1e3 * m["by_horizon"][k]["mpjae"]) for k in (*keys, "whole")],
+        )
+        for n, m in methods.items()
+    }
+    return lines([("MPJAE by horizon of the free run", drawn)], ("", "mrad"), ticks, log=True)
 
 
 @styled

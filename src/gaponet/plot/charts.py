@@ -6,13 +6,15 @@ import math
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from gaponet.plot.methods import COLOURS
 from gaponet.plot.style import DASHED, figure, legend, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Spread(Protocol):

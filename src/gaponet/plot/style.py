@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Any, ParamSpec
-
-import matplotlib as mpl
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 from gaponet.files import whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 P = ParamSpec("P")
 
@@ -38,6 +38,8 @@ ENTRY = 1.9  # inches that a legend's entry takes
 
 def figure(width: float, height: float) -> Figure:
     """An empty figure, inches; never touches pyplot's global state."""
+    from matplotlib.figure import Figure  # here and below: imported when something is drawn
+
     return Figure(figsize=(width, height))
 
 
@@ -46,6 +48,8 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 
     @wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
+        import matplotlib as mpl
+
         with mpl.rc_context(STYLE):
             return draw(*args, **kwargs)
 
@@ -67,11 +71,14 @@ def legend(fig: Figure, title: str = "", below: bool = False) -> None:
 
 def joint_label(joint: str, wrapped: bool = True) -> str:
     """left_shoulder_pitch_joint → left shoulder pitch, wrapped: a word a line, since tick labels stand side by side."""
-    return joint.removesuffix("_joint").replace("_", "\n" if wrapped else " ")
+    words = joint.removesuffix("_joint").replace("_", " ")
+    return words.replace(" ", "\n") if wrapped else words
 
 
 def save(fig: Figure, path: Path) -> list[Path]:
     """SVG with letters as outlines, so that it looks the same everywhere, and PNG for screens and slides."""
+    import matplotlib as mpl
+
     files = [path.with_suffix(".svg"), path.with_suffix(".png")]
     how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
     with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):

@@ -5,14 +5,18 @@ Every number is that of the shipped artifact in free run. Units held out from tr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from gaponet.data.split import split_entries
 from gaponet.eval.evaluate import choose
 from gaponet.plot.charts import bars
 from gaponet.plot.methods import palette, title
 from gaponet.plot.style import joint_label
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import save_robot
+from gaponet.sim.identify import identify
 from gaponet.study.found import Found
 from gaponet.study.found import spread as over
 from gaponet.study.pool import Cell
@@ -50,10 +54,24 @@ class Compare:
             f"{seeds} seed{'s' if seeds > 1 else ''}."
         )
         columns = ("method", "seed", "units", "group", "key", *MEASURES)
-        tables = [Table("all", columns, tuple(_lines(runs)), shown=False), _totals(runs), _groups(runs)]
+        tables = [
+            Table("all", columns, tuple(_lines(runs)), shown=False),
+            _totals(runs),
+            _groups(runs),
+            _horizons(runs),
+        ]
         motions = sorted({e.meta.motion for e in entries})
         return found.result(study, "compare", "Comparison", tables, {"compare": _figure(runs, study.who)}, [heading],
                             motions=motions, unseen=unseen, sequences=len(entries))  # fmt: skip
+
+
+def identified(study: Study, tell: Callable[[int, int, float], None]) -> RobotSpec:
+    """The simulator identified on the training motions, in OUT/identified; once."""
+    folder = study.out / "identified"
+    if not (folder / "robot.toml").is_file():
+        train = study.data.sequences(split_entries(study.data, study.holdout_units)["train"])
+        save_robot(identify(train, study.robot, progress=tell).robot, folder)
+    return load_robot(folder)
 
 
 Runs = dict[str, list[dict[str, Any]]]  # method → what each seed gave; a baseline has none
@@ -102,6 +120,20 @@ def _groups(runs: Runs) -> Table:
         if len(found) > 1 or (units == "new" and found):
             rows += [(name.format(k), *(spread(runs, m, units, group, k, "mpjae") for m in runs)) for k in found]
     return Table("groups", ("MPJAE, mrad", *(title(m) for m in runs)), tuple(rows))
+
+
+def _horizons(runs: Runs) -> Table:
+    """A row per time since the common start."""
+    times = list(runs["nominal"][0]["known"].get("by_horizon", {}))
+    rows = [
+        (
+            f"{t} s" if t != "whole" else "whole motion",
+            *(spread(runs, m, "known", "by_horizon", t, "mpjae") for m in runs),
+        )
+        for t in times
+    ]
+    note = "MPJAE in mrad by time since the common start, of the last half of that time."
+    return Table("horizons", ("after", *(title(m) for m in runs)), tuple(rows), note)
 
 
 def _lines(runs: Runs) -> Iterator[tuple[Any, ...]]:

@@ -13,10 +13,11 @@ from typing import Any, Protocol
 from gaponet.data.json_file import write_json
 from gaponet.errors import ModelError
 from gaponet.eval.evaluate import read_split
+from gaponet.eval.whose import label
 from gaponet.sim.model import model_hash
 from gaponet.study.measure import Outcome, evaluate_baselines, train_and_evaluate
 from gaponet.study.pool import RESULT, Cell, Running, run_cells
-from gaponet.study.result import Result, facts, label
+from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
 from gaponet.study.table import Spread, Table
 

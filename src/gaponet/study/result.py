@@ -38,15 +38,6 @@ class Result:
     """What the numbers say, made from them."""
 
 
-def label(dataset: Dataset) -> str:
-    """Whose recordings these are."""
-    virtual = [e.meta.virtual for e in dataset.entries]
-    if not any(virtual):
-        return f"Recordings of a real {dataset.robot_name}."
-    some = "" if all(virtual) else "Partly "
-    return f"{some}VIRTUAL {dataset.robot_name}: these numbers say nothing about real hardware."
-
-
 def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str, Any]:
     """What it takes to repeat an experiment: command, date, versions, data, seeds, and what else is to be said."""
     entries = dataset.entries

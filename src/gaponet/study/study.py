@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.eval.draw_dataset import who
+from gaponet.eval.whose import who
 from gaponet.robot import RobotSpec
 from gaponet.study.options import (
     BUDGET,

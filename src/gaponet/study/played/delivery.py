@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
@@ -26,6 +25,9 @@ from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, o
 from gaponet.study.played.session import Playing, Session, Tell
 from gaponet.study.result import Result
 from gaponet.study.table import Spread, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 QUICK_PLANS = 5
 AXES = ("X", "Y", "Z")

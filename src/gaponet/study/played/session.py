@@ -12,10 +12,11 @@ from typing import Any
 
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
+from gaponet.eval.whose import label
 from gaponet.robot import RobotSpec
 from gaponet.study.options import Options
 from gaponet.study.played.trained import Trained, load_trained
-from gaponet.study.result import Result, facts, label
+from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
 from gaponet.study.table import Table
 from gaponet.virtual.fleet import load_fleet

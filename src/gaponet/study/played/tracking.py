@@ -13,10 +13,9 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from gaponet.eval.evaluate import choose
 from gaponet.plot.charts import Once, against, draw_bars
@@ -30,6 +29,9 @@ from gaponet.study.played.track import Example, Score, align, track
 from gaponet.study.played.unseen import Unseen, from_files, generated, require_unseen
 from gaponet.study.result import Result
 from gaponet.study.table import Spread, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Joints = tuple[str, list[int]]  # how they are called, columns
 
