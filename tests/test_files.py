@@ -102,3 +102,12 @@ def test_what_a_killed_writer_left_half_written_goes_with_the_next(tmp_path):
     (out / "sub" / f"{MARK}rc").touch()
     with writing(out, "run"):
         assert names(out / "sub") == [mine.name, f"{MARK}rc"]
+
+
+@pytest.mark.parametrize("place", ["cells/mlp-0", "rehearsal/cells/mlp-0", "without-b/cells/mlp-0"])
+def test_experiments_that_were_begun_before_there_was_a_mark_go_on(tmp_path, place):
+    (tmp_path / place).mkdir(parents=True)
+    (tmp_path / place / "setup.json").write_text("{}")
+    require_ours(tmp_path, "experiments")
+    with pytest.raises(FolderError, match="no dataset of gaponet"):
+        require_ours(tmp_path, "dataset")

@@ -19,8 +19,12 @@ from gaponet.errors import FolderError
 
 MARK = ".gaponet"
 # What tells folders that were written before there was a mark.
-EARLIER = {"dataset": "dataset.json", "run": "split.json", "experiments": "cells/*/setup.json",
-           "model": "card.json"}  # fmt: skip
+EARLIER = {
+    "dataset": ("dataset.json",),
+    "run": ("split.json",),
+    "experiments": tuple(f"{place}cells/*/setup.json" for place in ("", "rehearsal/", "without-*/")),
+    "model": ("card.json",),
+}
 
 _held: set[tuple[str, int]] = set()  # folders of this process's threads
 
@@ -74,7 +78,7 @@ def require_ours(folder: Path, kind: str) -> None:
     found = mark.read_text(encoding="utf-8", errors="replace").split()[:1] if mark.is_file() else []
     if found and found[0] != kind:
         raise FolderError(f"{folder}: holds gaponet's {found[0]}, not {kind}; choose another folder")
-    if found or any(folder.glob(EARLIER.get(kind, MARK))):
+    if found or any(any(folder.glob(sign)) for sign in EARLIER.get(kind, (MARK,))):
         return
     strangers = sorted(child.name for child in folder.iterdir() if not child.name.startswith(MARK))
     if strangers:
