@@ -85,6 +85,20 @@ def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(data
     words = ["import", str(tmp_path / "new.csv"), "--out", str(data.path), "--unit-id", "a", "--payload-mass", "0"]
     assert main([*words, "--robot", str(stranger.folder)]) == 2
     assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
+    words = [
+        "record",
+        "--motion",
+        "elbow-chirp-0",
+        "--out",
+        str(data.path),
+        "--driver",
+        "virtual",
+        "--payload-mass",
+        "0",
+    ]
+    assert main([*words, "--robot", str(stranger.folder)]) == 2
+    assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
+    assert not (data.path / "recordings").exists()
     assert kept_robot(data.path, "arm").kp.tolist() == [20.0, 20.0]
 
 

@@ -71,7 +71,7 @@ def import_logs(
     from gaponet.sim.model import model_hash
 
     spec = load_robot(robot)
-    if Dataset.peek(out, spec):
+    if Dataset.peek(out, spec) is not None:
         require_kept(out, spec, DatasetError, MOVE_KEPT)
     with bar("importing") as update:
         report = run(

@@ -9,10 +9,10 @@ from typing import Any, Literal
 import tyro
 
 from gaponet.cli.out import Out, writes
-from gaponet.cli.run import Reach, Request, perform, tracking
+from gaponet.cli.run import Reach, Request, asked_robot, perform, tracking
 from gaponet.deploy.controller import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
-from gaponet.errors import UsageError
+from gaponet.errors import DatasetError, UsageError
 
 
 @writes("dataset")
@@ -56,6 +56,8 @@ def record(
     from gaponet.data.importer import findings
     from gaponet.data.sequence import SequenceMeta, to_sequence
     from gaponet.data.store import Dataset
+    from gaponet.robot_folder import MOVE_KEPT
+    from gaponet.sim.kept import require_kept
 
     if driver != "virtual" and not unit_id:
         raise UsageError("say which unit is recorded: --unit-id NAME")
@@ -63,6 +65,9 @@ def record(
     if driver == "virtual":
         unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
     asked = Request("", driver, robot, None, payload_mass, payload_side, max_payload, reach, control, safety, yes)
+    spec = asked_robot(asked)
+    if Dataset.peek(out, spec) is not None:  # before anything moves
+        require_kept(out, spec, DatasetError, MOVE_KEPT)
     written: list[str] = []
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([m.strip() for m in motion.split(",") for _ in range(repetitions)], seed):

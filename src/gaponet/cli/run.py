@@ -127,9 +127,8 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     """Make everything, ask, run, and say how it went."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
     from gaponet.deploy.controller import Controller, play, require_commanded
-    from gaponet.robot import load_robot
 
-    spec = load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
+    spec = asked_robot(asked)
     fast = asked.reach.fast and asked.driver == "virtual"
     clock = SimulatedClock() if fast else MonotonicClock()
     motion = find_motion(asked, spec)
@@ -148,6 +147,13 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     recording = controller.run(play(motion, controller.dt), keys=not asked.yes)
     _report(screen, recording)
     return recording, motion, spec
+
+
+def asked_robot(asked: Request) -> RobotSpec:
+    """The robot named, or the driver's usual one."""
+    from gaponet.robot import load_robot
+
+    return load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
 
 
 def find_motion(asked: Request, robot: RobotSpec) -> Motion:
