@@ -256,3 +256,11 @@ def test_a_payload_that_is_no_mass_is_refused(so101, tmp_path, payload):
     with pytest.raises(LogError, match=r"wave: payload_mass is .*; give kg, 0 when empty"):
         import_logs(tmp_path / "logs", so101, "lab", payload, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_motion_with_a_name_of_many_letters_is_stored(arm, tmp_path):
+    file = tmp_path / ("a" * 240 + ".csv")
+    file.write_text(table_text(arm_columns()))
+    data = import_logs(file, arm, "b" * 300, 0.0, tmp_path / "out", position_unit="rad", time_unit="s").dataset
+    assert len(data.read(data.entries[0])) == 60
+    assert data.entries[0].meta.motion == "a" * 240

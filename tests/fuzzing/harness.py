@@ -93,6 +93,9 @@ def run(
         workers: Processes.
         keep: Folder for the files of failed mutants, in a folder each; default: they are not kept.
         progress: Called with done and failures.
+
+    Returns:
+        The counts; of what was done so far where Ctrl-C ends it.
     """
     chosen = list(targets)
     total = sum(t.share for t in chosen)
@@ -107,6 +110,8 @@ def run(
                 failures += member.look(counts)
             if progress:
                 progress(counts["done"], len(failures))
+    except KeyboardInterrupt:
+        pass  # the counts so far are true
     finally:
         for member in crew:
             member.close()

@@ -189,7 +189,7 @@ class Dataset:
         m = sequence.meta
         name = f"{m.motion}-{m.unit_id}-{m.payload_mass:g}kg-r{m.repetition}"
         entry = Entry(
-            id=re.sub(r"[^A-Za-z0-9_.-]", "_", name) + f"-{digest[:8]}",
+            id=re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:150] + f"-{digest[:8]}",
             hash=digest,
             dt=sequence.dt,
             rows=len(sequence),
