@@ -17,8 +17,9 @@ from dataclasses import replace
 import numpy as np
 import tyro
 
-from gaponet.deploy.controller import ControlConfig, Controller
+from gaponet.deploy.controller import Controller
 from gaponet.deploy.drivers.unitree import UnitreeDriver
+from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
 from gaponet.robot import load_robot
 

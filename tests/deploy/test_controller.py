@@ -15,9 +15,10 @@ from arm import commands
 from gaponet.data.importer import import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.deploy.clock import SimulatedClock
-from gaponet.deploy.controller import COMMANDING, NEXT, ControlConfig, Controller, Phase, play
+from gaponet.deploy.controller import Controller, play
 from gaponet.deploy.driver import DriverError
 from gaponet.deploy.drivers.virtual import VirtualDriver
+from gaponet.deploy.phases import COMMANDING, NEXT, ControlConfig, Phase
 from gaponet.deploy.publisher import sole_publisher
 from gaponet.deploy.recording import Recording
 from gaponet.deploy.safety import Limits, SafetyConfig

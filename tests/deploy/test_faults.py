@@ -16,9 +16,10 @@ pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
 from deploy.robot_process import RobotProcess
 
-from gaponet.deploy.controller import ControlConfig, Controller
+from gaponet.deploy.controller import Controller
 from gaponet.deploy.driver import DriverError
 from gaponet.deploy.drivers.unitree import UnitreeDriver
+from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.recording import Recording
 from gaponet.deploy.safety import Limits, SafetyConfig
 from gaponet.errors import UsageError

@@ -10,7 +10,7 @@ import tyro
 
 from gaponet.cli.out import Out, writes
 from gaponet.cli.run import Reach, Request, asked_robot, perform, tracking
-from gaponet.deploy.controller import ControlConfig
+from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
 from gaponet.errors import DatasetError, UsageError
 

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
-from gaponet.deploy.controller import ControlConfig
+from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
 from gaponet.errors import UsageError
 
@@ -144,7 +144,7 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     )  # fmt: skip
     if asked.driver != "virtual" and not asked.yes:
         _ask(screen, driver, motion)
-    recording = controller.run(play(motion, controller.dt), keys=not asked.yes)
+    recording = controller.run(play(motion, controller.dt), keys=True)
     _report(screen, recording)
     return recording, motion, spec
 

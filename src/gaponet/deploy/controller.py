@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +19,7 @@ import numpy as np
 from gaponet.deploy.clock import Clock, MonotonicClock, uncollected
 from gaponet.deploy.driver import Driver, DriverError, Fault, State
 from gaponet.deploy.guard import Guard
+from gaponet.deploy.phases import COMMANDING, NEXT, ControlConfig, Phase
 from gaponet.deploy.publisher import sole_publisher
 from gaponet.deploy.recording import Event, Recording, Row
 from gaponet.deploy.safety import Limits, SafetyConfig, Watch, limit_command, limit_delta
@@ -44,57 +43,10 @@ class Compensator(Protocol):
         """What to command so that the robot gets to `target`, (n) rad."""
 
 
-class Phase(StrEnum):
-    """Where a controller is."""
-
-    IDLE = "idle"
-    BLEND_IN = "blend_in"
-    RUN = "run"
-    BLEND_OUT = "blend_out"
-    RELEASE = "release"
-    DAMP = "damp"
-    STOPPED = "stopped"
-
-
-NEXT = {
-    Phase.IDLE: (Phase.BLEND_IN, Phase.STOPPED),
-    Phase.BLEND_IN: (Phase.RUN, Phase.DAMP, Phase.STOPPED),
-    Phase.RUN: (Phase.BLEND_OUT, Phase.RELEASE, Phase.DAMP, Phase.STOPPED),
-    Phase.BLEND_OUT: (Phase.RELEASE, Phase.DAMP, Phase.STOPPED),
-    Phase.RELEASE: (Phase.DAMP, Phase.STOPPED),
-    Phase.DAMP: (Phase.STOPPED,),
-    Phase.STOPPED: (),
-}
-COMMANDING = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT, Phase.RELEASE)
 HANG = 5.0  # control periods without a sign of life after which the guard process damps the robot
 FRESH = 5  # periods in a row without a fault before anything is commanded
 PATIENCE = 5.0  # s to wait for them
 PROMPT = 0.001  # s between the last look at the clock and a command's leaving that its limits allow for
-
-
-@dataclass(frozen=True)
-class ControlConfig:
-    """Timing of a controller."""
-
-    rate: float = 50.0
-    """Control periods per second."""
-    blend: float = 2.0
-    """Least duration of the moves to the first target and back, s."""
-    blend_speed: float = 0.5
-    """Fastest joint in those moves, rad/s."""
-    settle: float = 0.5
-    """Standing still at the first target before the run, s."""
-    blend_out: bool = True
-    """Go back to where the robot was found; a fault never waits for this."""
-    damp: float = 2.0
-    """Damping after a fault, or handing the arms back after a run, before the robot is let go, s."""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.rate <= 1000:
-            raise UsageError(f"rate is {self.rate} Hz; give 1 to 1000")
-        for name in ("blend", "blend_speed", "damp"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"{name} is {getattr(self, name)}; give a positive number")
 
 
 def play(motion: Motion, dt: float) -> Policy:

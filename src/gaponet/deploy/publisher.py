@@ -5,12 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import re
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from gaponet.errors import UsageError
+
+LOCKS = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR says
 
 
 @contextmanager
@@ -18,11 +19,14 @@ def sole_publisher(address: str) -> Iterator[int]:
     """Hold the lock of an address; gives its file descriptor, to be kept open by a guard process.
 
     Raises:
-        UsageError: Another process on this machine commands this robot.
+        UsageError: Another process on this machine commands this robot, or its lock cannot be used.
     """
     name = re.sub(r"[^A-Za-z0-9]+", "-", address).strip("-")
-    path = Path(tempfile.gettempdir()) / f"gaponet-{name}.lock"
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    path = LOCKS / f"gaponet-{name}.lock"
+    try:
+        descriptor = _opened(path)
+    except OSError as error:
+        raise UsageError(f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner") from None
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -31,3 +35,20 @@ def sole_publisher(address: str) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
+
+
+def _opened(path: Path) -> int:
+    """Its descriptor; the file is made where it is missing. Reading is enough for a lock, and is all that the next user
+    of the computer may do with this user's file."""
+    for _ in range(3):
+        try:
+            return os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            pass
+        try:
+            descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644)
+        except FileExistsError:  # another process was faster
+            continue
+        os.fchmod(descriptor, 0o644)  # whatever the umask says
+        return descriptor
+    raise FileNotFoundError(2, "it comes and goes")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -93,7 +94,7 @@ class VirtualDriver:
             physics: Hidden parameters (virtual.fleet).
             clock: The controller's.
             payload: kg per hand, and side.
-            name: Of the unit, for the lock: each is one robot.
+            name: Of the unit.
             start: Where it stands at first, (n) rad.
             seed: Of its noise.
             period: Between two states, s.
@@ -101,7 +102,7 @@ class VirtualDriver:
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
         self.kp, self.kd = robot.kp, robot.kd
         self.facts: dict[str, Any] = {}
-        self.address = f"virtual {robot.name} {name}"
+        self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
         self.clock, self._given = clock, (robot, physics, payload, start, seed, period)
         self.period = period
