@@ -1,4 +1,4 @@
-"""gaponet robot check, gaponet robot list."""
+"""gaponet robot check, gaponet robot list, gaponet robot link."""
 
 from __future__ import annotations
 
@@ -13,20 +13,33 @@ from gaponet.robot import RobotSpec, available, load_robot
 
 
 def robot(
-    action: tyro.conf.Positional[Literal["check", "list"]],
+    action: tyro.conf.Positional[Literal["check", "list", "link"]],
     path: tyro.conf.Positional[str] = "",
+    driver: Literal["unitree", "so101"] = "unitree",
+    domain: int = 0,
+    interface: str = "lo",
+    port: str = "/dev/ttyACM0",
+    seconds: float = 5.0,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """List the package's robots, or say what is wrong with a robot folder.
+    """List the package's robots, say what is wrong with a robot folder, or listen to a robot without moving it.
 
     Args:
-        action: check or list.
-        path: For check: robot name, or a folder with robot.toml and robot.xml.
+        action: check, list or link.
+        path: For check and link: robot name, or a folder with robot.toml and robot.xml.
+        driver: link: unitree (DDS) or so101 (serial).
+        domain: link, unitree: DDS domain.
+        interface: link, unitree: network interface to the robot.
+        port: link, so101: serial port.
+        seconds: link: how long to listen.
         json: One JSON object on stdout.
     """
     out = Out(json)
     if action == "list":
         list_robots(out)
+    elif action == "link":
+        options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
+        listen(out, driver, path or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
     elif not path:
         raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
     else:
@@ -42,6 +55,29 @@ def list_robots(out: Out) -> None:
     ])  # fmt: skip
     out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
     out.result({"robots": [{"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs]})
+
+
+def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: float) -> None:
+    """How a robot's states arrive, and who publishes what; nothing is sent."""
+    from gaponet.deploy.drivers.open import open_driver
+    from gaponet.deploy.link import measure
+
+    driver = open_driver(kind, name, **options)
+    try:
+        driver.connect()
+        found = measure(driver, seconds)
+        publishers = driver.publishers() if hasattr(driver, "publishers") else {}
+    finally:
+        driver.close(hold=True)
+    three = lambda what: ", ".join(f"{value:.2f}" for value in found[what])  # noqa: E731
+    out.table(f"{'VIRTUAL ' * driver.virtual}{name} at {driver.address}, {seconds:g} s", ["what", "value"], [
+        ["states, a second", f"{found['states']}, {found['rate_hz']:.1f}"],
+        ["age when it comes, ms: p50, p99, max", three("age_ms")],
+        ["between two, ms: p50, p99, max", three("interval_ms")],
+        ["lost, refused", f"{found['lost']}, {found['refused']}"],
+        *([f"publish {topic}", "; ".join(programs) or "nobody"] for topic, programs in publishers.items()),
+    ])  # fmt: skip
+    out.result(found | {"publishers": publishers, "virtual": driver.virtual} | driver.facts)
 
 
 def check_robot(out: Out, spec: RobotSpec) -> None:

@@ -18,6 +18,7 @@ from gaponet.deploy.safety import SafetyConfig
 from gaponet.errors import UsageError
 
 if TYPE_CHECKING:
+    from gaponet.deploy.controller import Controller
     from gaponet.deploy.driver import Driver
     from gaponet.deploy.recording import Event, Recording
     from gaponet.motion.motion import Motion
@@ -64,6 +65,7 @@ class Request:
     control: ControlConfig = field(default_factory=ControlConfig)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     yes: bool = False
+    dry_run: bool = False
     seed: int = 0  # of a virtual robot's noise
     compensation: CompensatorConfig = field(default_factory=CompensatorConfig)
     unit_id: str = ""
@@ -87,6 +89,7 @@ def run(
     unit_id: str = "",
     extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False,
     yes: tyro.conf.FlagCreatePairsOff[bool] = False,
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Play a motion on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
@@ -108,13 +111,16 @@ def run(
         unit_id: With a model: which unit this is; what gaponet calibrate found out about it is used.
         extrapolate: With a model: take payloads and servo gains that its training data do not hold.
         yes: Do not ask before a robot moves.
+        dry_run: Connect, read and compute, send nothing, and say what would be sent.
         json: One JSON object on stdout.
     """
     screen = Out(json)
     asked = Request(
         motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes,
-        compensation=compensation, unit_id=unit_id, extrapolate=extrapolate,
+        dry_run, compensation=compensation, unit_id=unit_id, extrapolate=extrapolate,
     )  # fmt: skip
+    if dry_run and out:
+        raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
     recording, played, _ = perform(screen, asked)
     if out:
         screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
@@ -127,6 +133,7 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     """Make everything, ask, run, and say how it went."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
     from gaponet.deploy.controller import Controller, play, require_commanded
+    from gaponet.deploy.dry import DryRun
 
     spec = asked_robot(asked)
     fast = asked.reach.fast and asked.driver == "virtual"
@@ -134,6 +141,8 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     motion = find_motion(asked, spec)
     driver, facts = make_driver(asked, spec, clock, motion)
     require_commanded(motion, spec, driver)
+    if asked.dry_run:
+        driver = DryRun(driver)
     compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
     controller = Controller(
         driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass,
@@ -142,10 +151,13 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
         on_connect=lambda met: compensator.require_gains(met.joint_names, met.kp, met.kd) if compensator else None,
         **facts,
     )  # fmt: skip
-    if asked.driver != "virtual" and not asked.yes:
+    if asked.driver != "virtual" and not asked.yes and not asked.dry_run:
         _ask(screen, driver, motion)
     recording = controller.run(play(motion, controller.dt), keys=True)
-    _report(screen, recording)
+    if asked.dry_run:
+        _report_dry(screen, recording, controller)
+    else:
+        _report(screen, recording)
     return recording, motion, spec
 
 
@@ -182,9 +194,9 @@ def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) ->
     reach = asked.reach
     if asked.driver == "unitree":
         options: dict[str, Any] = {n: getattr(reach, n) for n in ("topic", "joints", "domain", "interface")}
-        return open_driver("unitree", robot.folder, **options), {}
+        return open_driver("unitree", robot, silent=asked.dry_run, **options), {}
     if asked.driver == "so101":
-        return open_driver("so101", robot.folder, port=reach.port, calibration=reach.calibration), {}
+        return open_driver("so101", robot, port=reach.port, calibration=reach.calibration), {}
     from gaponet.deploy.drivers.virtual import VirtualDriver
     from gaponet.virtual.fleet import load_fleet
 
@@ -260,3 +272,14 @@ def _report(screen: Out, recording: Recording) -> None:
         ["age of state, ms: p50, p99, max", three("state_age_ms")],
         ["tracking error, mrad", "–" if error is None else f"{1e3 * error:.2f}"],
     ])  # fmt: skip
+
+
+def _report_dry(screen: Out, recording: Recording, controller: Controller) -> None:
+    from gaponet.deploy.dry import would_send
+
+    sent = would_send(recording, controller.limits)
+    screen.table("Dry run: nothing was sent. These commands would have been, to a robot that follows at once",
+                 ["joint", "from, rad", "to, rad", "fastest, rad/s", "torque asked, N·m"], [
+        [joint, *(f"{value:.3f}" for value in values.values())] for joint, values in sent.items()
+    ])  # fmt: skip
+    recording.meta["would_send"] = sent

@@ -10,6 +10,7 @@ issue 1554; tests/deploy/test_peers.py).
 """
 
 import time
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,15 +171,28 @@ class Bus:
             self._topics[name] = Topic(self._participant, name, raw(kind))
         return self._topics[name]
 
-    def publishers(self, topic: str, wait: float = 0.5) -> int:
-        """How many others publish a topic, after listening for `wait` s."""
-        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+    def publishers(self, wait: float = 0.5) -> defaultdict[str, list[str]]:
+        """Who else publishes what, after listening for `wait` s: topic → programs, as they call themselves."""
+        from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant, BuiltinTopicDcpsPublication
 
-        reader = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        programs = BuiltinDataReader(self._participant, BuiltinTopicDcpsParticipant)
+        publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         time.sleep(wait)
-        mine = self._participant.guid
-        found = reader.read(N=500)
-        return sum(e.topic_name == topic and e.participant_key != mine for e in found if hasattr(e, "topic_name"))
+        names = {e.key: _program(e.qos) for e in programs.read(N=500) if hasattr(e, "key")}
+        found: defaultdict[str, list[str]] = defaultdict(list)
+        for entry in publications.read(N=500):
+            if hasattr(entry, "topic_name") and entry.participant_key != self._participant.guid:
+                found[entry.topic_name].append(
+                    names.get(entry.participant_key, "a program that does not tell its name")
+                )
+        return found
+
+
+def _program(qos: Qos) -> str:
+    """Name, process and machine of a participant, where it tells them."""
+    told = {policy.key: policy.value for policy in qos if isinstance(policy, Policy.Property)}
+    name, pid, host = (told.get(f"__{key}", "?") for key in ("ProcessName", "Pid", "Hostname"))
+    return f"{name} (process {pid} on {host})"
 
 
 _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process

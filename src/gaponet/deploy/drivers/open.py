@@ -7,20 +7,20 @@ from typing import Any
 
 from gaponet.deploy.driver import Driver
 from gaponet.errors import UsageError
-from gaponet.robot import load_robot
+from gaponet.robot import RobotSpec, load_robot
 
 KINDS = ("virtual", "unitree", "so101")
 
 
-def open_driver(kind: str, robot: str | Path, **options: Any) -> Driver:
+def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Driver:
     """A driver, not yet connected.
 
     Args:
         kind: unitree or so101; virtual ones live in the caller's process and are made there (drivers.virtual).
-        robot: Name or folder.
+        robot: The robot, or its name or folder.
         options: Of the driver's class.
     """
-    spec = load_robot(robot)
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if kind == "unitree":
         from gaponet.deploy.drivers.unitree import UnitreeDriver
 

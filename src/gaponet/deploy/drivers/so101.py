@@ -253,7 +253,7 @@ class SO101Driver:
         """Opens the port only when this process is gone or hangs: a bus has one speaker."""
         calibration = str(self.calibration) if self.calibration else None
         return {
-            "kind": "so101", "robot": str(self.robot.folder), "early": True, "port": self.port,
+            "kind": "so101", "robot": str(self.robot.folder.resolve()), "early": True, "port": self.port,
             "calibration": calibration, "silent": True,
         }  # fmt: skip
 

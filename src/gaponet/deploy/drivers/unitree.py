@@ -64,6 +64,7 @@ class UnitreeDriver:
         domain: int = 0,
         interface: str = "lo",
         sole: bool = True,
+        silent: bool = False,
     ) -> None:
         """
         Args:
@@ -74,6 +75,7 @@ class UnitreeDriver:
             domain: DDS domain; 0 on a robot.
             interface: Network interface to the robot; lo for a virtual one on this machine.
             sole: Refuse to connect where somebody else publishes the topic.
+            silent: Only listen: nothing is published, and whoever publishes is left in peace.
         """
         if set(robot.joint_names) != set(MOTOR_NAMES):
             raise UsageError(f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others")
@@ -85,7 +87,7 @@ class UnitreeDriver:
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self.at_end: End = "hand_over" if topic == "arm_sdk" else "damp"
-        self.domain, self.interface, self.sole = domain, interface, sole
+        self.domain, self.interface, self.sole, self.silent = domain, interface, sole, silent
         self.address = f"unitree dds domain {domain}"
         self.virtual = False
         self.joint_names = robot.joint_names
@@ -93,7 +95,7 @@ class UnitreeDriver:
         self._motor = np.array([MOTOR_NAMES.index(name) for name in robot.joint_names])
         self._at = robot.index(self.commanded)
         self._command = hg.LowCmd.new()
-        self._refused = 0
+        self._refused = self.received = 0
         self._fault: Fault | None = None  # the first one that the robot told; it may be in one message only
         self._state: State | None = None
         self._bus: Bus | None = None
@@ -106,11 +108,12 @@ class UnitreeDriver:
         self._bus = dds.Bus(self.domain, self.interface)
         topic = f"rt/{self.topic}"
         self._reader = self._bus.reader("rt/lowstate", dds.LowState)
-        self._writer = self._bus.writer(topic, dds.LowCmd)
-        others = self._bus.publishers(topic) if self.sole else 0
+        if not self.silent:
+            self._writer = self._bus.writer(topic, dds.LowCmd)
+        others = self._bus.publishers()[topic] if self.sole and not self.silent else []
         if others:
             raise DriverError(
-                f"{others} other participant(s) publish {topic} on {self.interface}; stop them first (on the "
+                f"others publish {topic} on {self.interface}: {'; '.join(others)}; stop them first (on the "
                 "robot: leave debug programs, and for lowcmd release the motion mode)"
             )
         heard = self._listen()
@@ -172,6 +175,7 @@ class UnitreeDriver:
         for data in self._dds.receive(self._reader):
             if self._intact(data):
                 newest = data
+                self.received += 1
                 self._fault = self._fault or self._told(data)
         if newest is not None:
             self._state = self._decode(newest, now)
@@ -217,7 +221,7 @@ class UnitreeDriver:
         self._send(qpos, np.zeros_like(kd), kd, weight)
 
     def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:
-        if self._bus is None:
+        if self._bus is None or self.silent:
             return
         motors, data = self._motor[self._at], self._command
         for name, values in (("mode", np.ones(len(ctrl))), ("q", ctrl), ("kp", kp), ("kd", kd)):
@@ -238,10 +242,16 @@ class UnitreeDriver:
                 self.damp(0.0)
         self._bus = self._reader = self._writer = None  # type: ignore[assignment]
 
+    def publishers(self) -> dict[str, list[str]]:
+        """Who else publishes on the bus: topic → programs; those of the robot's topics are always named."""
+        assert self._bus is not None
+        found = self._bus.publishers()
+        return {topic: found[topic] for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(found))}
+
     def guard(self) -> dict[str, object] | None:
         """A second participant that is connected from the start and silent while the controller lives."""
         return {
-            "kind": "unitree", "robot": str(self.robot.folder), "early": True, "topic": self.topic,
+            "kind": "unitree", "robot": str(self.robot.folder.resolve()), "early": True, "topic": self.topic,
             "joints": self.joints, "domain": self.domain, "interface": self.interface, "sole": False,
         }  # fmt: skip
 
