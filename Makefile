@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers fuzz kills check clean
+.PHONY: setup demo test faults peers adversary fuzz kills check clean
 
 setup: $(VENV)/.done
 
@@ -35,6 +35,10 @@ faults: setup
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup
 	$(BIN)/python -m pytest -m peers -s
+
+# A million random and adversarial states through controller and limits, in simulated time: minutes; counts as JSON.
+adversary: setup
+	OMP_NUM_THREADS=1 $(BIN)/python tests/deploy/adversary.py --states 1000000
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
