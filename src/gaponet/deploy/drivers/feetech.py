@@ -109,12 +109,11 @@ class ServoBus:
         self.stream, self.timeout, self.retries = stream, timeout, retries
         self.refused = 0  # replies with a wrong checksum
         self.errors: dict[int, int] = {}  # servo → error bits of all its replies so far
-        self._owed = False  # replies were asked for that have not come; they may come late
         self._tag = 0
 
     def ping(self, servo: int) -> bool:
         """Whether it answers."""
-        return bool(self._ask(PING, [servo], b"", 0))
+        return bool(self._ask(PING, [servo]))
 
     def read(self, servo: int, register: Register) -> int:
         """One register.
@@ -122,14 +121,14 @@ class ServoBus:
         Raises:
             DriverError: No answer, or damaged ones only.
         """
-        found = self._ask(READ, [servo], bytes([register.address]), register.size)
+        found = self._ask(READ, [servo], register.address, register.size)
         if not found:
             raise DriverError(f"servo {servo} does not answer; is it powered and is its number {servo}?")
         return register.decode(found[servo])
 
     def sync_read(self, servos: Iterable[int], block: Register) -> dict[int, bytes]:
         """The same block of several servos in one exchange; those that never answered well are missing."""
-        return self._ask(SYNC_READ, list(servos), bytes([block.address]), block.size, TAGS)
+        return self._ask(SYNC_READ, list(servos), block.address, block.size)
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
         """One register of several servos; nobody acknowledges."""
@@ -140,32 +139,28 @@ class ServoBus:
         """One register of every servo there is, whatever its number; nobody acknowledges."""
         self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
 
-    def _ask(
-        self, instruction: int, servos: list[int], parameters: bytes, size: int, tags: int = 1
-    ) -> dict[int, bytes]:
+    def _ask(self, instruction: int, servos: list[int], address: int = 0, size: int = 0) -> dict[int, bytes]:
         """Replies by servo; those that are missing after a silence are asked for again.
 
-        A reply does not say to what. With tags, successive requests ask for up to so many bytes more, so that a reply's
-        length says which request it answers, and late ones to an earlier call are not taken for it.
+        A reply does not say to what. So successive requests ask for 0 to 7 bytes more than are wanted: a reply's length
+        says which request it answers, and a late one to an earlier call is not taken for it.
         """
-        if self._owed and tags == 1:
-            self._drain()
         found: dict[int, bytes] = {}
         sizes: set[int] = set()
         for _ in range(1 + self.retries):
             missing = [servo for servo in servos if servo not in found]
             if missing:
-                self._tag = (self._tag + 1) % tags
-                sizes.add(size + self._tag)
-                words = bytes([parameters[0], size + self._tag]) if parameters else b""
+                self._tag = (self._tag + 1) % TAGS
+                asked = size + self._tag if size else 0
+                sizes.add(asked)
+                words = bytes([address, asked]) if size else b""
                 several = instruction == SYNC_READ
                 self.stream.reset_input_buffer()
                 self.stream.write(
                     packet(BROADCAST, instruction, words + bytes(missing)) if several
                     else packet(missing[0], instruction, words)
                 )  # fmt: skip
-                found |= self._replies(missing, size + self._tag, sizes)
-                self._owed |= not found.keys() >= set(missing)
+                found |= self._replies(missing, asked, sizes)
         return {servo: data[:size] for servo, data in found.items()}
 
     def _replies(self, servos: list[int], expected: int, sizes: set[int]) -> dict[int, bytes]:
@@ -195,14 +190,3 @@ class ServoBus:
                     if body[0] in servos and body[1] - 2 in sizes:
                         found[body[0]] = body[3:-1]
         return found
-
-    def _drain(self) -> None:
-        """Wait until late replies have come, so that they are not taken for those to what is asked next."""
-        patience, silent = 8192, time.monotonic() + self.timeout
-        while patience > 0:
-            more = self.stream.read(256)
-            if more:
-                silent, patience = time.monotonic() + self.timeout, patience - len(more)
-            elif time.monotonic() >= silent:
-                break
-        self._owed = False
