@@ -1,6 +1,7 @@
 """A run that was stopped and resumed is the run that was not."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.data.store import Dataset
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.train.budget import Budget
 from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
@@ -68,7 +69,9 @@ def stop(stage, at):
 @pytest.mark.parametrize(("stage", "at"), [("warm start", 5), ("warm start", 15), ("ppo", 1), ("ppo", 6)])
 def test_a_run_resumed_equals_one_that_was_never_stopped(world, tmp_path, stage, at):
     data, robot, whole = world
-    Trainer(data, robot, tmp_path / "run", TINY, STEPS, show=stop(stage, at)).run()
+    begun = not (stage == "warm start" and at < 10)
+    with nullcontext() if begun else pytest.raises(ModelError, match="before the first step of training"):
+        Trainer(data, robot, tmp_path / "run", TINY, STEPS, show=stop(stage, at)).run()
     assert memory(tmp_path / "run")["steps"] < whole["steps"]
     Trainer(data, robot, tmp_path / "run", TINY, STEPS, resume=True).run()
     again = memory(tmp_path / "run")

@@ -11,8 +11,9 @@ import gaponet.sim.batch
 from gaponet.data.pair import require_disjoint
 from gaponet.data.split import split_entries, write_split
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
+from gaponet.model.artifact import how_trained
 from gaponet.model.config import ModelConfig
 from gaponet.plot.methods import COLOURS, NAMES
 from gaponet.train.budget import Budget
@@ -53,6 +54,15 @@ def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(traine
     assert result["unseen"]
     assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
     assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot, tmp_path):
+    data, _, _ = trained
+    with pytest.raises(ModelError, match=r"the budget ended .* before the first step of training: nothing was learned"):
+        Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
+    assert not (tmp_path / "run/model").exists()
+    card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    assert how_trained(card) == "1 of 3 rounds of the supervised start, no PPO"
 
 
 def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):

@@ -41,10 +41,6 @@ COMMANDS = {
 }
 
 
-# torch's threads and the simulator's take turns on the same cores: one that waits must not spin (a factor of five).
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-
 def load(command: str) -> Callable[..., Any]:
     """The function behind a command."""
     module, function = COMMANDS[command].split(":")

@@ -59,16 +59,22 @@ def train(
     config = replace(config, model=replace(config.model, kind=model))
     config = fast_preset(config) if fast else config
     trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
+    from gaponet.model.artifact import how_trained
+
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, nominal {mrad(val['nominal'])} "
         f"({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in {card['seconds']:.0f} s"
+        + f": {how_trained(card)}"
         + (" (interrupted)" if card["interrupted"] else "")
     )
     screen.say(f"model in {trained.path}; next: gaponet eval {out} {dataset}; gaponet report {out}")
     screen.result(
-        {k: card[k] for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "interrupted", "parity_rad", "seed")}
+        {
+            k: card[k]
+            for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
+        }
     )
 
 

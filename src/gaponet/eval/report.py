@@ -14,7 +14,7 @@ from gaponet.errors import DatasetError, ModelError
 from gaponet.eval.page import element, facts_table, figure, page, table, tag
 from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
 from gaponet.files import write_text
-from gaponet.model.artifact import GapModel
+from gaponet.model.artifact import GapModel, how_trained
 from gaponet.plot.methods import title
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
@@ -167,6 +167,11 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
             f"{span * 1e3:.0f} ms: "
             "raise --model.history or --model.stride."
         )
+    done, planned = card.get("stages", {}).get("warm_start_rounds", (0, 0))
+    if done < planned:
+        out.append(
+            f"Undertrained: the budget ended after {done} of {planned} rounds of the supervised start; train longer."
+        )
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
     worse = [j for j, m in methods[kind]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
@@ -214,6 +219,7 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
     r2, shape, ppo, motions = card.get("sensor_r2"), card["model"], config["ppo"], card["motions"]
     rows = [
         ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
+        ["trained", how_trained(card)],
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
         ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],

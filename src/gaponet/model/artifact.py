@@ -69,6 +69,17 @@ def recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, lis
     return found
 
 
+def how_trained(card: dict[str, Any]) -> str:
+    """In words: what the budget bought; a model that saw no update of PPO is a supervised start and is called so."""
+    if "stages" not in card:
+        return "by an older gaponet, which did not keep what training got to"
+    (done, planned), updates = card["stages"]["warm_start_rounds"], card["stages"]["ppo_updates"]
+    warm = (
+        f"{done} of {planned} rounds of the supervised start" if done < planned else f"supervised start ({done} rounds)"
+    )
+    return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
+
+
 def write_card(path: Path, card: dict[str, Any]) -> None:
     """JSON at full precision, written whole or not at all."""
     from gaponet.files import write_text
@@ -81,6 +92,13 @@ class SensorR2(TypedDict):
 
     mean: Number
     by_joint: dict[str, Number]
+
+
+class Stages(TypedDict):
+    """What training got to: rounds of the warm start, done and planned; updates of PPO."""
+
+    warm_start_rounds: tuple[int, int]
+    ppo_updates: int
 
 
 class Card(TypedDict):
@@ -103,6 +121,7 @@ class Card(TypedDict):
     virtual: NotRequired[bool]
     simulator_only: NotRequired[bool]
     interrupted: NotRequired[bool]
+    stages: NotRequired[Stages]
     dataset_hash: NotRequired[str]
     seed: NotRequired[int]
     hours: NotRequired[float]

@@ -176,6 +176,12 @@ class Trainer:
             self._shrink()
         except KeyboardInterrupt:
             self.interrupted = True
+        if not self.kept.steps:
+            why = "interrupted" if self.interrupted else "the budget ended"
+            raise ModelError(
+                f"{self.out}: {why} after {self.seconds():.0f} s, before the first step of training: nothing was "
+                "learned, no model written. Give --budget more than that; gaponet train … --resume goes on here"
+            )
         return self.finish()
 
     # ---- stages
@@ -392,6 +398,10 @@ class Trainer:
             steps=self.kept.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
+            stages={
+                "warm_start_rounds": [self.kept.rounds_done, recipe(self.config).rounds],
+                "ppo_updates": self.kept.updates,
+            },
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch", "rsl-rl-lib")}
             | {"python": platform.python_version()},
         )
