@@ -179,7 +179,8 @@ class Trial:
         self.expect("whole", wait(start(case.argv(whole), self.log)), 0)
         self.duration = time.monotonic() - began
         self.content = case.content(whole)
-        self.size = sum(f.stat().st_size for f in whole.rglob("*") if f.is_file())
+        self.before = size(case.begin) if case.begin else 0.0
+        self.needed = size(whole) - self.before
 
     def fresh(self, out: Path) -> Path:
         """OUT as the command finds it the first time."""
@@ -231,7 +232,7 @@ class Trial:
     def full(self) -> None:
         """A disk that fills up at a third, and again at two thirds, of what is needed; then there is room."""
         for share in (0.02, 0.35, 0.7):
-            place = mounted(self.work / f"full-{share:g}", self.size * (share + (self.case.begin is not None)))
+            place = mounted(self.work / f"full-{share:g}", self.before + self.needed * share)
             try:
                 out = self.fresh(place / "out")
                 code = wait(start(self.case.argv(out), self.log))
@@ -281,6 +282,11 @@ class Trial:
         self.expect("foreign", wait(start(self.case.argv(out), self.log)), 2)
         if names(out) != [".git/HEAD"] or len(list(out.iterdir())) != 1:
             self.wrong.append(f"foreign: {out} was changed")
+
+
+def size(folder: Path) -> float:
+    """What a folder takes on a disk, bytes."""
+    return sum(4096 * (1 + f.stat().st_size // 4096) for f in folder.rglob("*"))
 
 
 def mounted(place: Path, size: float) -> Path:
