@@ -22,12 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from gaponet.data.holds import Holds, StaticError, find_holds, join, static_error
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
 from gaponet.robot import RobotSpec
+from gaponet.structure import Json, read_json
 
 Array = np.ndarray
 Condition = tuple[float, str]  # payload_mass kg, payload_side
@@ -75,6 +77,13 @@ class UnitOffsets:
 
     joints: dict[str, JointOffset]
     stiffness: float | None
+
+
+class OffsetsFile(TypedDict):
+    """offsets.json: unit → what UnitOffsets holds, and the hash of the simulator whose gravity was used."""
+
+    applied: bool
+    units: dict[str, dict[str, Json]]
 
 
 @dataclass(frozen=True)
@@ -138,12 +147,8 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     file = dataset.path / FILE
     if not file.is_file():
         return {"applied": False, "unit": "rad", "units": {}}
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        content["units"].items()
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(f"{file}: damaged ({error}); delete it, the next import writes it again") from None
-    return content
+    hint = "delete it, the next import writes it again"
+    return {**read_json(OffsetsFile, file, DatasetError, hint, more=True)}
 
 
 def _nominal_sag(qpos: Array, condition: Condition, robot: RobotSpec, gravity: Gravity) -> Array:

@@ -14,10 +14,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import TypedDict
+
 from gaponet.data.pair import hash_order, split_by_motion
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text
+from gaponet.structure import read_json
 
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 Parts = dict[str, list[Entry]]
@@ -30,6 +33,20 @@ BY: dict[str, Callable[[Entry], str]] = {
     "payload": lambda e: f"{e.meta.payload_mass:g}",
 }
 TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
+
+
+class RunSplit(TypedDict):
+    """{sequence id: content hash} of each part."""
+
+    train: dict[str, str]
+    val: dict[str, str]
+    test: dict[str, str]
+
+
+class SplitFile(TypedDict):
+    """A split file, and whatever else stands there."""
+
+    parts: RunSplit
 
 
 def split_entries(
@@ -185,15 +202,11 @@ def read_split(path: str | Path, dataset: Dataset) -> Parts:
     Raises:
         DatasetError: Not a split file, a sequence of it is not in the dataset, or parts share one.
     """
-    try:
-        record = json.loads(Path(path).read_text(encoding="utf-8"))
-        hashes: dict[str, dict[str, str]] = {part: record["parts"][part] for part in PARTS}
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise DatasetError(f"{path}: not a split file ({error}); make one with gaponet data split") from None
+    hashes = read_json(SplitFile, Path(path), DatasetError, "make one with gaponet data split", more=True)["parts"]
     parts: Parts = {part: [] for part in PARTS}
     taken: dict[str, str] = {}
-    for part, listed in hashes.items():
-        for name, digest in listed.items():
+    for part in PARTS:
+        for name, digest in hashes[part].items():  # type: ignore[literal-required]
             entry = dataset.find(digest)
             if entry is None:
                 raise DatasetError(f"{path}: '{name}' is not in {dataset.path}; split that dataset anew")

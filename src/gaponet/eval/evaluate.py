@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from typing_extensions import TypedDict
 
 from gaponet.data.json_file import write_json
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
+from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.files import whole, writing
@@ -33,14 +33,6 @@ Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
 LEARNED = ("inverse", "mlp", "transformer", "fno", "gaponet")  # kinds of model
 ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
-
-
-class RunSplit(TypedDict):
-    """split.json of a run: {sequence id: content hash} of each part."""
-
-    train: dict[str, str]
-    val: dict[str, str]
-    test: dict[str, str]
 
 
 @dataclass(frozen=True)
