@@ -124,3 +124,12 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
 def better_each_time():
     error = iter(1.0 / k for k in range(1, 1000))
     return lambda self, net: next(error)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"\x80\x05cos\nsystem\n(S'true'\ntR."])
+def test_a_checkpoint_that_is_none_is_refused_in_one_line(world, tmp_path, content):
+    dataset, robot = world[:2]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
+    with pytest.raises(ModelError, match=r"checkpoint\.pt: does not fit this model or is damaged"):
+        Trainer(dataset, robot, tmp_path / "run", TINY, STEPS, resume=True)

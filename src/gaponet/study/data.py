@@ -6,9 +6,9 @@ stay the same, and so does the training budget.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 
+from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
 from gaponet.plot.charts import lines
 from gaponet.plot.methods import palette, title
@@ -83,7 +83,7 @@ def _recorded(asked: Data, found: Found) -> tuple[dict[float, int], dict[float, 
     for share in sorted(set(asked.shares)):
         if word := _word(asked, found, share):
             card = found.cells[word, ""][0].folder / "model" / "card.json"
-            told = json.loads(card.read_text(encoding="utf-8"))
+            told = read_kept(card)
             motions[share], minutes[share] = len(told["motions"]["train"]), told["hours"] * 60
     return motions, minutes
 

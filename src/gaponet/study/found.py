@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Protocol
 
-from gaponet.data.json_file import write_json
+from gaponet.data.json_file import read_kept, write_json
 from gaponet.errors import ModelError
 from gaponet.eval.evaluate import read_split
 from gaponet.eval.whose import label
@@ -61,7 +60,7 @@ class Found:
             if cell.done:
                 left_out = cell.holdout_units[0] if cell.holdout_units != study.holdout_units else ""
                 done.setdefault((cell.variant.name, left_out), []).append(cell)
-        runs = {k: [json.loads((c.folder / RESULT).read_text(encoding="utf-8")) for c in v] for k, v in done.items()}
+        runs = {k: [read_kept(c.folder / RESULT) for c in v] for k, v in done.items()}
         return cls(runs, cache(lambda key: baselines(done[key][0], study)), done)
 
     def of_word(self, word: str, left_out: str = "") -> ListOf[Outcome]:
@@ -133,7 +132,7 @@ def baselines(cell: Cell, study: Study) -> Outcome:
         found = evaluate_baselines(cell.folder, study.data, nominal, identified, cell.holdout_units)
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, found)
-    return json.loads(file.read_text(encoding="utf-8"))
+    return read_kept(file)
 
 
 def spread(found: ListOf[Outcome], *path: str, scale: float = 1e3) -> Spread:

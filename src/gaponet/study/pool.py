@@ -22,6 +22,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NoReturn
 
+from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError
 from gaponet.files import write_text, writing
@@ -105,7 +106,7 @@ def plan(
         file, wanted = cell.folder / SETUP, cell.setup(dataset)
         if not file.is_file():
             raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
-        kept = json.loads(file.read_text(encoding="utf-8"))
+        kept = read_kept(file)
         if kept.get("simulator") == text_hash(cell.robot):  # set up before November 2026
             kept["simulator"] = wanted["simulator"]
         kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig()))))
@@ -167,7 +168,7 @@ def _fitted_beside(folder: Path) -> DelayOffset | None:
 
     def same(other: Path) -> bool:
         split = [(f / "split.json").read_text(encoding="utf-8") for f in (folder, other)]
-        setup = [json.loads((f / SETUP).read_text(encoding="utf-8"))["simulator"] for f in (folder, other)]
+        setup = [read_kept(f / SETUP)["simulator"] for f in (folder, other)]
         return split[0] == split[1] and setup[0] == setup[1]
 
     for other in sorted(folder.parent.glob("*/delay_offset.json")):
@@ -178,7 +179,7 @@ def _fitted_beside(folder: Path) -> DelayOffset | None:
 
 def _card(folder: Path) -> dict[str, Any]:
     file = folder / "model" / "card.json"
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return read_kept(file) if file.is_file() else {}
 
 
 def run_cells(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.eval.whose import who
@@ -127,7 +127,7 @@ def rates_of(data: Dataset) -> tuple[float, ...]:
 def expected_s(cells: ListOf[Cell], study: Study) -> float:
     """Wall time of what is not there yet, s: from cells of this experiment that are done, else from the H1-2's."""
     done = [c for c in cells if c.done]
-    taken = [json.loads((c.folder / RESULT).read_text(encoding="utf-8"))["seconds"] for c in done]
+    taken = [read_kept(c.folder / RESULT)["seconds"] for c in done]
     factor = sum(taken) / sum(_cost(c) for c in done) if done else REHEARSAL if study.rehearsal else 1.0
     todo = [_cost(c) * factor for c in cells if not c.done]
     return max(sum(todo) / study.processes, max(todo, default=0.0))

@@ -41,7 +41,7 @@ from gaponet.robot import RobotSpec
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
-from gaponet.structure import validated
+from gaponet.structure import parse_json, validated
 from gaponet.train.budget import Budget
 from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state, write_state
 from gaponet.train.config import TrainConfig
@@ -349,14 +349,15 @@ class Trainer:
             self.net.load_state_dict(state.pop("net"))
             self.rng = state.pop("rng")
             self.kept = Kept(**state)
-        except (RuntimeError, KeyError, EOFError, ValueError, TypeError) as error:
-            reason = str(error).splitlines()[0]
+        except Exception as error:  # torch and its unpickler raise of every kind
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
         self.kept.sensor_r2 = report_of(self.kept.sensor_r2)
         torch.set_rng_state(self.rng)
         if not self.kept.progress:  # of a run from before checkpoints had it
-            text = (self.out / "progress.jsonl").read_text(encoding="utf-8")
-            self.kept.progress = [json.loads(line) for line in text.splitlines()]
+            file = self.out / "progress.jsonl"
+            lines = file.read_bytes().splitlines()
+            self.kept.progress = [parse_json(dict[str, Any], line, file, ModelError) for line in lines]
         if self.kept.dataset not in ("", dataset_hash(self.dataset.entries)):
             raise UsageError(f"{self.out}: was trained on other recordings than {self.dataset.path} holds; train anew")
 

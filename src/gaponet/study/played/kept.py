@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gaponet import __version__
-from gaponet.data.json_file import finite, write_json
+from gaponet.data.json_file import finite, read_kept, write_json
 
 T = TypeVar("T")
 
@@ -44,7 +44,7 @@ class Kept:
             found = plain(make())
             self.folder.mkdir(parents=True, exist_ok=True)
             write_json(file, found)
-        return json.loads(file.read_text(encoding="utf-8"))
+        return read_kept(file)
 
     @cached_property
     def _common(self) -> str:

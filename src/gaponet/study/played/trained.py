@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
 
+from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
 from gaponet.eval.evaluate import corrected_robot
 from gaponet.model.artifact import GapModel
@@ -72,4 +72,4 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
 def _changed(run: Path) -> bool:
     """Whether a cell is of a model with changed fields."""
     file = run / "cell.json"
-    return file.is_file() and bool(set(json.loads(file.read_text(encoding="utf-8"))["changes"]) - set(SAME))
+    return file.is_file() and bool(set(read_kept(file)["changes"]) - set(SAME))
