@@ -130,6 +130,7 @@ def better_each_time():
 def test_a_checkpoint_that_is_none_is_refused_in_one_line(world, tmp_path, content):
     dataset, robot = world[:2]
     (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "split.json").write_text("{}")
     (tmp_path / "run" / "checkpoint.pt").write_bytes(content)
     with pytest.raises(ModelError, match=r"checkpoint\.pt: does not fit this model or is damaged"):
         Trainer(dataset, robot, tmp_path / "run", TINY, STEPS, resume=True)
