@@ -10,86 +10,91 @@ Trains on virtual-1 to virtual-3 and measures on virtual-4, motions that no trai
 3. GAPONet trained without 2 kg, with and without payload input, asked at 2 kg; trained without 3 kg, asked at 3 kg;
 4. the same models on the `shifted` fleet, whose physics none of them was trained on.
 
-Calls the commands that a user would call. Writes docs/results/virtual_h1_2.{json,md,svg,png}. What is found in WORK is
-kept. Every number is from VIRTUAL robots.
+Writes docs/results/virtual_h1_2.{md,json,csv,svg,png}. What is found in WORK is kept. Every number is from VIRTUAL
+robots.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterable
-from datetime import date
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
-import numpy as np
+from publish import WIDE, publish, say
 
+from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
 from gaponet.gap import metrics, runs
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
-from gaponet.plot.methods import COLOURS, NAMES
-from gaponet.plot.style import STYLE, figure
+from gaponet.plot.charts import bars
+from gaponet.plot.methods import palette, title
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
+from gaponet.study.compare import Compare, identified
+from gaponet.study.found import Found, answer
+from gaponet.study.pool import Cell
+from gaponet.study.result import Result
+from gaponet.study.study import Study
+from gaponet.study.table import Spread, Table, compared
+from gaponet.train.config import TrainConfig, WarmStartConfig
 
-DOCS = Path(__file__).parents[1] / "docs" / "results"
 RECIPE = Path(__file__).with_suffix(".toml")
-ENVIRONMENT = os.environ | {"OMP_WAIT_POLICY": "PASSIVE"}
 UNIT, UNITS = "virtual-4", ("virtual-1", "virtual-2", "virtual-3", "virtual-4")
-
-# Small rounds of the warm start: validation has stopped falling after five or six of them. Networks twice as wide as
-# today's default.
-TRAINING = ("--warm-start.num-envs", 128, "--warm-start.steps", 300, "--warm-start.gradient-steps", 200,
-            "--warm-start.rounds", 6, "--model.branch-hidden", 128, 128, "--model.trunk-hidden", 64, 64,
-            "--model.sensor-hidden", 256, 256)  # fmt: skip
-MODELS = {  # name here → word of gaponet compare
-    "mlp": "mlp:mlp_match=on",
-    "gaponet": "gaponet",
-    "identified_gaponet": "identified+gaponet",
-    "without_2": "gaponet:holdout_payloads=2",
-    "without_2_blind": "gaponet:holdout_payloads=2:payload_input=off",
-    "without_3": "gaponet:holdout_payloads=3",
-}
-TITLES = NAMES | {
-    "identified": "identification",
-    "identified_gaponet": "identification + GAPONet",
-    "calibrated": "GAPONet, calibrated",
-    "identified_calibrated": "identification + GAPONet, calibrated",
-    "without_2": "GAPONet trained without 2 kg",
-    "without_2_blind": "the same without payload input",
-    "without_3": "GAPONet trained without 3 kg",
-}
-FILL = COLOURS | {
-    "identified_gaponet": "#7d0a1d", "calibrated": "#e58a97", "identified_calibrated": "#b9606c",
-}  # fmt: skip
-SHOWN = ("nominal", "delay_offset", "identified", "mlp", "gaponet", "calibrated", "identified_gaponet",
-         "identified_calibrated")  # fmt: skip
+# Small rounds of the warm start: validation has stopped falling after five or six of them.
+TRAINING = TrainConfig(WIDE, warm_start=WarmStartConfig(rounds=6, num_envs=128, steps=300, gradient_steps=200))
+MLP, OURS, FURTHER = "mlp:mlp_match=on", "gaponet", "identified+gaponet"
+WITHOUT_2, WITHOUT_3 = "gaponet:holdout_payloads=2", "gaponet:holdout_payloads=3"
+BLIND = f"{WITHOUT_2}:payload_input=off"
+CALIBRATED = ", calibrated"  # behind a word
 
 By = dict[str, float]  # payload, or "all" → MPJAE, rad
+Errors = Mapping[str, ListOf[By]]  # method → seed by seed
 
 
-def gaponet(*words: object) -> dict[str, Any]:
-    """Run a command with --json and return its object."""
-    print("gaponet", *words, flush=True)
-    command = [sys.executable, "-m", "gaponet.cli.main", *map(str, words), "--json"]
-    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT).stdout)
+@dataclass(frozen=True)
+class VirtualH12(Compare):
+    """The comparison on the unit held out, after calibration, and on another fleet."""
+
+    models: tuple[str, ...] = (MLP, OURS, FURTHER, WITHOUT_2, BLIND, WITHOUT_3)
+    holdout_units: tuple[str, ...] = (UNIT,)
+
+    def result(self, study: Study, found: Found) -> Result:
+        """Its tables after the one that counts: the unit never trained on, by payload."""
+        made = super().result(study, found)
+        unit: dict[str, ListOf[By]] = {
+            name: [_new(found.baselines((OURS, ""))[name])] for name in ("nominal", "delay_offset", "identified")
+        }
+        for word in self.models:
+            unit[word] = [_new(run) for run in found.of_word(word)]
+            if word in (OURS, FURTHER):
+                unit[word + CALIBRATED] = [_after_calibration(c, study) for c in found.cells[word, ""]]
+        shifted = _on_shifted(study, found, made.facts["motions"])
+        told = f"MPJAE in mrad on {UNIT}, never trained on; calibrated: with 30 s of it playing other motions."
+        fleet = "The fleet `shifted`: other effects and larger spread, all four units, zero-shot."
+        tables = (made.tables[0], _by_payload("unit", unit, told), _by_payload("shifted", shifted, fleet))
+        figures = {"unit": _figure(unit, f"VIRTUAL {UNIT}, never trained on"),
+                   "shifted": _figure(shifted, "VIRTUAL fleet `shifted`, zero-shot")}  # fmt: skip
+        said = made.sentences
+        if unit.get(BLIND) and unit.get(WITHOUT_2):
+            blind, seen = (Spread.of([by["2"] for by in unit[w]], 1e3) for w in (BLIND, WITHOUT_2))
+            said += (
+                f"At 2 kg, on which it was not trained, {compared('mass not told', blind, seen, 'told', ' mrad')}.",
+            )
+        return replace(made, name="virtual_h1_2", tables=(*tables, *made.tables[1:]), figures=figures, sentences=said)
 
 
-def collected(work: Path, name: str, recipe: Path, fleet: str) -> Dataset:
-    """A dataset of the fleet, unless it is there."""
-    gaponet("collect", "--fleet", fleet, "--recipe", recipe, "--out", work / name)
-    return Dataset(work / name)
+def _new(run: Mapping[str, dict]) -> By:
+    """Errors on the unit held out, by payload."""
+    return {p: v["mpjae"] for p, v in run["new"]["by_payload"].items()} | {"all": run["new"]["mpjae"]}
 
 
-def mpjae(
+def _mpjae(
     sequences: list[Sequence], nominal: RobotSpec, simulator: RobotSpec, corrector: Corrector | None = None
 ) -> By:
     """Free runs in a simulator, by payload and of all."""
@@ -100,188 +105,75 @@ def mpjae(
     return by | {"all": metrics(done)["mpjae"]}
 
 
-def cells(work: Path, word: str) -> list[Path]:
-    """Run folders of a model, seed by seed."""
-    found = {}
-    for file in (work / "compare" / "cells").glob("*/cell.json"):
-        cell = json.loads(file.read_text(encoding="utf-8"))
-        start = "identified+" if cell["start"] == "identified" else ""
-        if word == start + ":".join([cell["kind"], *cell["changes"]]):
-            found[cell["seed"]] = file.parent
-    return [found[seed] for seed in sorted(found)]
+def _after_calibration(cell: Cell, study: Study) -> By:
+    """With 30 s of the unit, on the same test sequences."""
+    run = cell.folder
+    model, simulator = GapModel.load(run), corrected_robot(run, study.robot)
+    if UNIT not in calibration.load(run, model.weights_hash()):
+        _run("calibrate", run, study.data.path, "--unit", UNIT)
+    own = calibration.load(run, model.weights_hash())[UNIT]
+    entries = [e for e in choose([run], study.data)[0] if e.meta.unit_id == UNIT]
+    return _mpjae(study.data.sequences(entries), study.robot, own.robot(simulator), model.corrector(simulator))
 
 
-def unseen_unit(compared: dict[str, Any], models: dict[str, str]) -> dict[str, list[By]]:
-    """Method → seed by seed, of the unit held out."""
-    words = {name: name for name in ("nominal", "delay_offset", "identified")} | models
-    return {
-        name: [
-            {p: v["mpjae"] for p, v in run["new"]["by_payload"].items()} | {"all": run["new"]["mpjae"]}
-            for run in compared["methods"][word]["runs"]
-        ]
-        for name, word in words.items()
-    }
-
-
-def after_calibration(work: Path, word: str, data: Dataset, nominal: RobotSpec) -> list[By]:
-    """Each seed with 30 s of the unit, on the same test sequences."""
-    out = []
-    for run in cells(work, word):
-        model, simulator = GapModel.load(run), corrected_robot(run, nominal)
-        if UNIT not in calibration.load(run, model.weights_hash()):
-            gaponet("calibrate", run, work / "default", "--unit", UNIT)
-        own = calibration.load(run, model.weights_hash())[UNIT]
-        entries = [e for e in choose([run], data)[0] if e.meta.unit_id == UNIT]
-        out.append(mpjae(data.sequences(entries), nominal, own.robot(simulator), model.corrector(simulator)))
-    return out
-
-
-def on_shifted(work: Path, motions: list[str], nominal: RobotSpec) -> dict[str, list[By]]:
+def _on_shifted(study: Study, found: Found, motions: list[str]) -> Errors:
     """The same models and simulators on the other fleet, all its units."""
-    recipe = work / "shifted.toml"
-    payloads = [0.0, 1.0, 2.0, 3.0]
+    recipe, nominal = study.out / "shifted.toml", study.robot
     recipe.write_text(
-        f"motions = {json.dumps(motions)}\npayloads = {payloads}\nunits = {json.dumps(UNITS)}\nvariants = 2\n"
+        f"motions = {json.dumps(motions)}\npayloads = [0.0, 1.0, 2.0, 3.0]\nunits = {json.dumps(UNITS)}\nvariants = 2\n"
     )
-    sequences = collected(work, "shifted", recipe, "shifted").sequences()
-    found = {"nominal": [mpjae(sequences, nominal, nominal)]}
-    found["identified"] = [mpjae(sequences, nominal, load_robot(work / "compare" / "identified"))]
-    for name in ("mlp", "gaponet", "identified_gaponet"):
-        models = [(GapModel.load(run), corrected_robot(run, nominal)) for run in cells(work, MODELS[name])]
-        found[name] = [mpjae(sequences, nominal, robot, model.corrector(robot)) for model, robot in models]
-    return found
-
-
-def measure(work: Path, seeds: int, budget: str, models: dict[str, str]) -> dict[str, Any]:
-    """Everything on the page."""
-    nominal = load_robot("h1_2")
-    data = collected(work, "default", RECIPE, "default")
-    compared = gaponet(
-        "compare", work / "default", "--out", work / "compare", "--models", *models.values(), "--seeds", seeds,
-        "--budget", budget, "--identify", "--holdout-units", UNIT, *TRAINING,
-    )  # fmt: skip
-    unit = unseen_unit(compared, models)
-    for name, calibrated in (("gaponet", "calibrated"), ("identified_gaponet", "identified_calibrated")):
-        unit[calibrated] = after_calibration(work, MODELS[name], data, nominal)
-    methods = compared["methods"]
-    return {
-        "virtual": True,
-        **{k: compared[k] for k in ("motions", "budget", "simulator_hash")},
-        "seeds": seeds,
-        "minutes": {name: methods[word]["seconds"] / 60 for name, word in models.items()},
-        "weights": {name: methods[word]["parameters"] for name, word in models.items()},
-        "hours": sum(e.rows * e.dt for e in data.entries) / 3600,
-        "sequences": len(data.entries),
-        "unit": unit,
-        "shifted": on_shifted(work, compared["motions"], nominal),
+    sequences = collected(study.out / "shifted", recipe, "shifted").sequences()
+    assert study.identified is not None
+    out = {
+        "nominal": [_mpjae(sequences, nominal, nominal)],
+        "identified": [_mpjae(sequences, nominal, study.identified)],
     }
+    for word in (MLP, OURS, FURTHER):
+        models = [
+            (GapModel.load(c.folder), corrected_robot(c.folder, nominal)) for c in found.cells.get((word, ""), [])
+        ]
+        out[word] = [_mpjae(sequences, nominal, robot, model.corrector(robot)) for model, robot in models]
+    return {word: errors for word, errors in out.items() if errors}
 
 
-def spread(found: list[By], payload: str) -> tuple[float, float]:
-    """Mean and standard deviation over seeds."""
-    values = [by[payload] for by in found]
-    return float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+def _name(word: str) -> str:
+    return title(word.removesuffix(CALIBRATED)) + (CALIBRATED if word.endswith(CALIBRATED) else "")
 
 
-def table(found: dict[str, list[By]], names: Iterable[str]) -> str:
-    """Markdown: MPJAE in mrad by payload, and of nominal."""
-    payloads = list(found["nominal"][0])
-    heads = [f"{p} kg" if p != "all" else "mean" for p in payloads]
-    rows = ["| method | " + " | ".join(heads) + " | of nominal | worst |", "| --- |" + " ---: |" * (len(heads) + 2)]
-    for name in names:
-        cells_of = []
-        for p in payloads:
-            mean, std = spread(found[name], p)
-            cells_of.append(f"{mean * 1e3:.2f} ± {std * 1e3:.2f}" if std else f"{mean * 1e3:.2f}")
-        ratio = {p: spread(found[name], p)[0] / spread(found["nominal"], p)[0] for p in payloads}
-        worst = max((p for p in payloads if p != "all"), key=lambda p: ratio[p])
-        rows.append(
-            f"| {TITLES[name]} | {' | '.join(cells_of)} | {ratio['all']:.2f} | {ratio[worst]:.2f} ({worst} kg) |"
-        )
-    return "\n".join(rows)
+def _by_payload(name: str, errors: Errors, caption: str) -> Table:
+    """A row per method: mrad by payload, of nominal, and where it is worst."""
+    payloads, nominal, rows = list(errors["nominal"][0]), errors["nominal"][0], []
+    for word, found in errors.items():
+        if found:
+            values = {p: Spread.of([by[p] for by in found], 1e3) for p in payloads}
+            left = {p: values[p].mean / nominal[p] / 1e3 for p in payloads}
+            worst = max((p for p in payloads if p != "all"), key=lambda p: left[p])
+            rows.append((_name(word), *values.values(), left["all"], f"{left[worst]:.2f} ({worst} kg)"))
+    heads = (f"{p} kg" if p != "all" else "mean" for p in payloads)
+    return Table(name, ("method", *heads, "of nominal", "worst"), tuple(rows), caption)
 
 
-def payloads_left_out(unit: dict[str, list[By]]) -> str:
-    """The section on interpolation and extrapolation, where that was measured."""
-    if "without_2" not in unit:
-        return ""
-    at = lambda name, p: "{:.2f} ± {:.2f}".format(*(1e3 * x for x in spread(unit[name], p)))  # noqa: E731
-    return f"""## Payloads left out of training, the same unit, mrad
-
-| trained on | asked at | with payload input | without |
-| --- | --- | ---: | ---: |
-| 0, 1, 3 kg | 2 kg | {at("without_2", "2")} | {at("without_2_blind", "2")} |
-| 0, 1, 2, 3 kg | 2 kg | {at("gaponet", "2")} | |
-| 0, 1, 2 kg | 3 kg | {at("without_3", "3")} | |
-| 0, 1, 2, 3 kg | 3 kg | {at("gaponet", "3")} | |
-
-{verdict(unit)}
-
-"""
+def _figure(errors: Errors, heading: str):
+    """Error by payload with spread over seeds; models that were trained on all payloads."""
+    shown = {w: found for w, found in errors.items() if found and "holdout" not in w}
+    payloads = [p for p in shown["nominal"][0] if p != "all"]
+    colours = palette(w.replace(CALIBRATED, ":calibrated") for w in shown)
+    methods = {
+        _name(w): (colour, [Spread.of([by[p] for by in found], 1e3) for p in payloads])
+        for (w, found), colour in zip(shown.items(), colours.values(), strict=True)
+    }
+    return bars([f"{p} kg" for p in payloads], methods, "MPJAE, mrad", heading)
 
 
-def verdict(unit: dict[str, list[By]]) -> str:
-    """Whether being told the payload helps at a payload between those trained on: by more than two standard errors."""
-    (told, told_std), (blind, blind_std) = (spread(unit[name], "2") for name in ("without_2", "without_2_blind"))
-    noise = 2 * np.hypot(told_std / len(unit["without_2"]) ** 0.5, blind_std / len(unit["without_2_blind"]) ** 0.5)
-    if abs(told - blind) <= noise:
-        return "The model that is told the payload does no better at 2 kg than the one that is not, and no worse."
-    return f"The model that is told the payload does {'better' if told < blind else 'worse'} at 2 kg than the other."
+def collected(folder: Path, recipe: Path, fleet: str) -> Dataset:
+    """A dataset of the fleet, unless it is there."""
+    _run("collect", "--fleet", fleet, "--recipe", recipe, "--out", folder)
+    return Dataset(folder)
 
 
-def page(r: dict[str, Any]) -> str:
-    """The results as Markdown."""
-    unit = r["unit"]
-    times = ", ".join(f"{TITLES[n]} {r['minutes'][n]:.0f}" for n in ("mlp", "gaponet", "identified_gaponet"))
-    return f"""# GAPONet on virtual H1-2 robots
-
-**Every number on this page is from VIRTUAL robots.** {date.today()}, 2 cores, no GPU, {r["seeds"]} seeds, mean ± std.
-Regenerate: `python benchmarks/virtual_h1_2.py WORK`.
-
-Dataset: {r["sequences"]} sequences, {r["hours"]:.1f} h, 50 Hz, 0 to 3 kg in each hand, fleet `default`.
-Trained on virtual-1 to virtual-3; measured on **virtual-4** and {len(r["motions"])} motions of which none was in
-training, whole-motion free run of the shipped ONNX. Budget {r["budget"]} control steps each; minutes of training on one
-core: {times}. Weights: GAPONet {r["weights"]["gaponet"]:,}, MLP {r["weights"]["mlp"]:,}. Simulator
-{r["simulator_hash"]}.
-
-## The unit never trained on, MPJAE in mrad
-
-{table(unit, SHOWN)}
-
-"Calibrated": after `gaponet calibrate` with 30 s of virtual-4 playing other motions.
-
-{payloads_left_out(unit)}## Another fleet: `shifted`, other effects and larger spread, all four units, zero-shot, mrad
-
-{table(r["shifted"], r["shifted"])}
-
-![](virtual_h1_2.svg)
-"""
-
-
-def draw(r: dict[str, Any]) -> None:
-    """Error by payload with spread over seeds: the unseen unit, and the shifted fleet."""
-    with mpl.rc_context(STYLE | {"font.size": 10}):  # type: ignore[arg-type]
-        fig = figure(10.5, 3.8)
-        axes = fig.subplots(1, 2, width_ratios=[1.5, 1])
-        titles = ("VIRTUAL unit 4, never trained on", "VIRTUAL fleet `shifted`, zero-shot")
-        for ax, title, found in zip(axes, titles, (r["unit"], r["shifted"]), strict=True):
-            names = [n for n in SHOWN if n in found]
-            payloads = [p for p in found["nominal"][0] if p != "all"]
-            width = 0.84 / len(names)
-            for i, name in enumerate(names):
-                values = 1e3 * np.array([spread(found[name], p) for p in payloads])
-                x = np.arange(len(payloads)) + (i - (len(names) - 1) / 2) * width
-                error = values[:, 1] if values[:, 1].any() else None
-                ax.bar(x, values[:, 0], width * 0.92, yerr=error, color=FILL[name], error_kw={"lw": 0.8},
-                       label=TITLES[name])  # fmt: skip
-            ax.set_xticks(np.arange(len(payloads)), [f"{p} kg" for p in payloads])
-            ax.grid(axis="x", visible=False)
-            ax.set_title(title)
-            ax.set_ylabel("MPJAE, mrad")
-        handles, labels = axes[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper center", ncols=4)
-        for suffix in ("svg", "png"):
-            fig.savefig(DOCS / f"virtual_h1_2.{suffix}", dpi=160)
+def _run(*words: object) -> None:
+    if gaponet([*map(str, words)]):
+        raise SystemExit(2)
 
 
 def main() -> None:
@@ -291,14 +183,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget", default="230400", help="of each run, as in gaponet train")
     parser.add_argument("--all-payloads-only", action="store_true", help="leave 3. out: half of the trainings")
+    parser.add_argument("--recipe", type=Path, default=RECIPE)
     args = parser.parse_args()
-    models = {n: w for n, w in MODELS.items() if not (args.all_payloads_only and n.startswith("without"))}
-    result = measure(args.work, args.seeds, args.budget, models)
-    DOCS.mkdir(parents=True, exist_ok=True)
-    (DOCS / "virtual_h1_2.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    (DOCS / "virtual_h1_2.md").write_text(page(result), encoding="utf-8")
-    draw(result)
-    print(page(result))
+    question = VirtualH12((MLP, OURS, FURTHER)) if args.all_payloads_only else VirtualH12()
+    data = collected(args.work / "default", args.recipe, "default")
+    out = args.work / "compare"
+    study = Study(data, load_robot("h1_2"), out, TRAINING, args.budget, args.seeds, question.holdout_units)
+    study = replace(study, identified=identified(study, lambda done, total, rms: None))
+    publish(answer(question, study, say), args.work / "results")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.eval.budget import encoder_step, floor
+from gaponet.eval.budget_figure import waterfall
+from gaponet.eval.evaluate import LEARNED
 
 
 def test_the_encoder_step_is_read_off_the_recordings():
@@ -26,3 +28,16 @@ def test_the_floor_is_what_two_repetitions_differ_by(tmp_path):
         assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
         assert joint["both"] == joint["repeatability"]
     assert all(f["repeatability"] is None for f in floor(same[:1], robot).values())
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_every_kind_of_model_has_its_bar(kind):
+    steps = {"nominal": 0.01, "delay": 0.008, "offset": 0.007, "identified": 0.004, kind: 0.002}
+    floor = {"encoder": 0.0005, "repeatability": None, "both": 0.0005}
+    found = {"left": steps, "floor": floor, "by_joint": {"elbow_joint": {"left": steps, "floor": floor}},
+             "virtual": True, "robot": "arm", "sequences": 3, "unseen": True}  # fmt: skip
+    ax = waterfall(found).axes[0]
+    ticks = [t.get_text() for t in waterfall(found).axes[1].get_xticklabels()]
+    assert ticks[0] == "nominal"
+    assert ticks[-1] == "left"
+    assert ax.patches[4].get_height() == pytest.approx(2.0)  # what the model removes, mrad
