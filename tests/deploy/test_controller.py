@@ -16,7 +16,7 @@ from gaponet.data.importer import import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.deploy.clock import SimulatedClock
 from gaponet.deploy.controller import Controller, play
-from gaponet.deploy.driver import DriverError
+from gaponet.deploy.driver import DriverError, Fault
 from gaponet.deploy.drivers.virtual import VirtualDriver
 from gaponet.deploy.phases import COMMANDING, NEXT, ControlConfig, Phase
 from gaponet.deploy.publisher import sole_publisher
@@ -54,6 +54,9 @@ class Tampered(VirtualDriver):
             "jumps": lambda: dataclasses.replace(honest, qpos=honest.qpos + 0.8 * wrong),
             "hot": lambda: dataclasses.replace(honest, temperature=honest.temperature + 70 * wrong),
             "bus": self._fail,
+            "encoder": lambda: dataclasses.replace(honest, qpos=np.where(wrong, self.last.qpos, honest.qpos)),
+            "leans": lambda: dataclasses.replace(honest, tilt=0.8),
+            "told": lambda: dataclasses.replace(honest, fault=Fault("robot", "a motor reports an error")),
         }[self.kind]()
 
     def _fail(self):
@@ -128,6 +131,7 @@ def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
     [
         ("stops", "stale", 3), ("late", "stale", 1), ("freezes", "frozen", 2), ("nan", "nan", 1), ("jumps", "jump", 1),
         ("hot", "temperature", 1), ("bus", "driver", 1),
+        ("encoder", "frozen", 25), ("leans", "tilt", 1), ("told", "robot", 1),
     ],
 )  # fmt: skip
 def test_every_fault_ends_in_damp_with_its_reason(arm, kind, reason, periods):
