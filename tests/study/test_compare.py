@@ -52,8 +52,10 @@ def test_payloads_are_in_order_of_mass_and_new_units_are_named(result):
 
 def test_everything_is_written_and_no_line_is_lost(result, tmp_path):
     files = [f.name for f in write(result, tmp_path / "out")]
-    assert files == ["compare.csv", "compare-totals.csv", "compare-groups.csv", "compare-horizons.csv", "compare.svg", "compare.png",
-                     "compare.md", "compare.json", "report.html"]  # fmt: skip
+    assert files == [
+        "compare.csv", "compare-totals.csv", "compare-groups.csv", "compare-horizons.csv", "compare.svg", "compare.png",
+        "compare.md", "compare.json", "report.html",
+    ]  # fmt: skip
     lines = list(csv.DictReader((tmp_path / "out" / "compare.csv").open()))
     assert len(lines) == 4 * 2 * (1 + 3 + 1 + 1)  # runs × groups of units × (all, payloads, unit, joint)
     assert sum(float(line["mpjae"]) == 0.03 for line in lines if line["seed"] == "3") == 1 + 6
