@@ -133,7 +133,7 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     """Make everything, ask, run, and say how it went."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
     from gaponet.deploy.controller import Controller, play, require_commanded
-    from gaponet.deploy.dry import DryRun
+    from gaponet.deploy.drivers.dry import DryRun
 
     spec = asked_robot(asked)
     fast = asked.reach.fast and asked.driver == "virtual"
@@ -275,7 +275,7 @@ def _report(screen: Out, recording: Recording) -> None:
 
 
 def _report_dry(screen: Out, recording: Recording, controller: Controller) -> None:
-    from gaponet.deploy.dry import would_send
+    from gaponet.deploy.drivers.dry import would_send
 
     sent = would_send(recording, controller.limits)
     screen.table("Dry run: nothing was sent. These commands would have been, to a robot that follows at once",
