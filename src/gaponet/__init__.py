@@ -1,22 +1,44 @@
 """gaponet: close the gap between simulated and real motors from joint logs.
 
-`import gaponet` loads numpy alone; simulator, torch and file formats are imported by the functions that use them.
+    import gaponet as gp
+
+    gp.import_logs("LOGS", "so101", "data", unit_id="lab", payload_mass=0.0)
+    gp.train("data", "run", budget="10m")
+    gp.evaluate("run", "data").result["methods"]
+
+The names below are what is public. `import gaponet` loads numpy alone; simulator, torch and file formats are imported
+by the functions that use them.
 """
 
-from typing import TYPE_CHECKING, Any
+from importlib import import_module
+from typing import Any
 
 from gaponet.errors import GAPONetError
 
-if TYPE_CHECKING:
-    from gaponet.robot import RobotSpec, load_robot
-
 __version__ = "0.1.0"
-__all__ = ["GAPONetError", "RobotSpec", "__version__", "load_robot"]
+
+_HOMES = {  # name → module
+    **dict.fromkeys(
+        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "calibrate"), "gaponet.api"
+    ),
+    "Dataset": "gaponet.data.store",
+    "load_robot": "gaponet.robot",
+    "RobotSpec": "gaponet.robot",
+    "GapModel": "gaponet.model.artifact",
+    "AlignedSim": "gaponet.deploy.aligned_sim",
+    "MujocoAligner": "gaponet.deploy.mujoco_loop",
+    "Compensator": "gaponet.deploy.compensator",
+    "Controller": "gaponet.deploy.controller",
+}
+__all__ = ["GAPONetError", "__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in ("RobotSpec", "load_robot"):
-        raise AttributeError(f"module 'gaponet' has no attribute '{name}'")
-    from gaponet import robot
+    """A public name, imported when it is first asked for (PEP 562)."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_HOMES)}")
+    return getattr(import_module(_HOMES[name]), name)
 
-    return getattr(robot, name)
+
+def __dir__() -> list[str]:
+    return __all__

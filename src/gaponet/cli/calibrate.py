@@ -9,11 +9,11 @@ from typing import Literal
 
 import tyro
 
+from gaponet import api
 from gaponet.cli.gap import mrad
 from gaponet.cli.identify import COLUMNS
-from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
 
 
 def calibrate(
@@ -43,32 +43,11 @@ def calibrate(
         mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
-    from gaponet.data.sequence import require_same_gains
-    from gaponet.errors import UsageError
-    from gaponet.eval.evaluate import corrected_robot
     from gaponet.model import calibration
-    from gaponet.model.artifact import GapModel
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot, run)
-    data.require_robot(spec)
-    model = GapModel.load(run)
-    simulator = corrected_robot(run, spec)
-    units = sorted({e.meta.unit_id for e in data.entries})
-    if unit not in units and (unit or len(units) != 1):
-        raise UsageError(f"--unit {unit or '(none)'}: {dataset} holds units {', '.join(units)}; name one")
-    entries = [e for e in data.select(names(motions)) if e.meta.unit_id == (unit or units[0])]
-    if not motions:
-        trained = set(model.card["motions"]["train"])
-        entries = [e for e in entries if e.meta.motion in trained] or entries
-    if not mixed_gains:
-        require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    with bar("calibrating") as update:
-        found = calibration.calibrate(
-            model, simulator, data.sequences(entries), seconds, payload_mass == "unknown",
-            lambda done, total, rms: update(done, total, f"window RMS {mrad(rms)} mrad"),
-        )  # fmt: skip
-    path = calibration.save(found, run)
+    unknown = payload_mass == "unknown"
+    found = api.calibrate(run, dataset, unit, names(motions), seconds, unknown, robot, mixed_gains)
     out.table(f"Unit {found.unit_id}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
         [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
     ])  # fmt: skip
@@ -76,6 +55,6 @@ def calibrate(
         known = found.payload_std is not None and isfinite(found.payload_std)  # it takes two windows to tell
         spread = f" ± {found.payload_std:.2f}" if known else ""
         out.say(f"payload {found.payload_mass:.2f}{spread} kg in each hand that carries")
-    out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; {path}")
+    out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; kept in {run}")
     out.say(f"next: gaponet eval {run} {dataset}")
     out.result(asdict(found))

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
+from gaponet.progress import bar
 
 
 def collect(

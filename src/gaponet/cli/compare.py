@@ -8,11 +8,11 @@ from typing import Annotated
 
 import tyro
 
+from gaponet.api import open_dataset
 from gaponet.cli.experiment import Shared, carry_out
-from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import writes
-from gaponet.cli.progress import bar
 from gaponet.errors import ModelError, UsageError
+from gaponet.progress import bar
 from gaponet.study.compare import Compare, identified
 from gaponet.study.options import Options
 from gaponet.study.study import Study

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
-from gaponet.cli.inputs import open_dataset
+from gaponet import api
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
 from gaponet.data.signals import FAST
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import MOVE_KEPT
 
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
@@ -65,20 +62,11 @@ def import_logs(
         kd: The same of the damping gain, N·m·s/rad.
         json: One JSON object on stdout.
     """
-    from gaponet.data.importer import import_logs as run
-    from gaponet.data.store import Dataset
-    from gaponet.sim.kept import require_kept
-    from gaponet.sim.model import model_hash
-
     spec = load_robot(robot)
-    if Dataset.peek(out, spec) is not None:
-        require_kept(out, spec, DatasetError, MOVE_KEPT)
-    with bar("importing") as update:
-        report = run(
-            src, spec, unit_id, payload_mass, out, payload_side, level, format,
-            gravity=gravity_of(spec), simulator=model_hash(spec), progress=update, joint_map=joint_map(map),
-            columns=columns, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
-        )  # fmt: skip
+    report = api.import_logs(
+        src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
+        joint_map=joint_map(map), columns=columns, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
+    )  # fmt: skip
     show_import(Out(json), report, spec)
 
 
@@ -92,12 +80,11 @@ def doctor(
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
-    from gaponet.data.doctor import diagnose, inventory
+    from gaponet.data.doctor import inventory
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
-    with bar("examining") as update:
-        diagnosis = diagnose(data, spec, update, gravity_of(spec))
+    data, spec = api.open_dataset(dataset, robot)
+    diagnosis = api.doctor(data, spec)
     out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
@@ -109,22 +96,6 @@ def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
         if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):
             raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
     return {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)} or None
-
-
-def gravity_of(robot: RobotSpec) -> Callable[[np.ndarray, float, str], np.ndarray]:
-    """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
-    from gaponet.sim.dynamics import static_torque
-    from gaponet.sim.model import build_model
-
-    models: dict[tuple[float, str], Any] = {}
-
-    def gravity(qpos: np.ndarray, payload_mass: float, payload_side: str) -> np.ndarray:
-        key = (payload_mass, payload_side)
-        if key not in models:
-            models[key] = build_model(robot, *key)
-        return static_torque(models[key], qpos)
-
-    return gravity
 
 
 def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:

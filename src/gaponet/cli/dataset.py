@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.cli.inputs import open_dataset
+from gaponet.api import open_dataset
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
 from gaponet.data.store import Dataset
+from gaponet.progress import bar
 
 
 def card(

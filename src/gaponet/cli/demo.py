@@ -11,10 +11,10 @@ import tyro
 
 from gaponet.cli.gap import gap
 from gaponet.cli.out import Out, writes
-from gaponet.cli.progress import bar
-from gaponet.cli.train import evaluate, run_training
+from gaponet.cli.train import evaluate
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
+from gaponet.progress import bar
 from gaponet.robot import load_robot
 from gaponet.train.config import TrainConfig, WarmStartConfig
 
@@ -50,7 +50,8 @@ def demo(
         gap(out / "dataset", robot)
     for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
         run, resume = out / model.kind, (out / model.kind / "checkpoint.pt").is_file()
-        run_training(dataset, load_robot(robot), run, TrainConfig(model, warm_start=QUICK), limit, resume, holdout)
+        config = TrainConfig(model, warm_start=QUICK)
+        api.train(dataset, run, limit, config, robot=robot, holdout_units=holdout, resume=resume)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))

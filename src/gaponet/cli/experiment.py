@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from gaponet.cli.inputs import open_dataset
+from gaponet.api import open_dataset
 from gaponet.cli.out import Out, show_result, writes
-from gaponet.cli.progress import bar, bars
 from gaponet.errors import UsageError
+from gaponet.progress import bar, bars
 from gaponet.study.ablation import Ablation
 from gaponet.study.data import Data
 from gaponet.study.found import Question, answer, train_all

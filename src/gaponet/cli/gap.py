@@ -7,9 +7,9 @@ from typing import Any
 
 import tyro
 
-from gaponet.cli.inputs import names, open_dataset
+from gaponet import api
+from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
 from gaponet.robot import RobotSpec
 
 
@@ -24,12 +24,10 @@ def pair(
         json: One JSON object on stdout.
     """
     from gaponet.sim.model import model_hash
-    from gaponet.sim.pairing import pair_dataset
 
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
-    with bar("replaying") as update:
-        made = pair_dataset(data, spec, lambda done, total: update(done, total, "control steps"))
+    data, spec = api.open_dataset(dataset, robot)
+    made = api.pair(data, spec)
     out.say(f"{made} twins made, {len(data) - made} were there; simulator {model_hash(spec)} in {dataset}")
     out.result({"made": made, "sequences": len(data), "simulator_hash": model_hash(spec)})
 
@@ -48,26 +46,9 @@ def gap(
         motions: Only these, separated by commas.
         json: One JSON object on stdout.
     """
-    from gaponet.gap import runs, summary
-    from gaponet.sim.model import model_hash
-    from gaponet.sim.pairing import pair_dataset
-
     out = Out(json)
-    data, spec = open_dataset(dataset, robot)
-    data.require_robot(spec)
-    entries = data.select(names(motions))
-    with bar("replaying") as update:
-        pair_dataset(data, spec, lambda done, total: update(done, total, "control steps"))
-    pairs = [data.pair(e, model_hash(spec)) for e in entries]
-    result = {
-        "methods": {"nominal": summary(runs([p.real for p in pairs], [p.sim.qpos for p in pairs], spec), spec)},
-        "dataset": data.path.name,
-        "sequences": len(pairs),
-        "hours": sum(e.rows * e.dt for e in entries) / 3600,
-        "virtual": any(e.meta.virtual for e in entries),
-        "robot": spec.name,
-        "simulator_hash": model_hash(spec),
-    }
+    data, spec = api.open_dataset(dataset, robot)
+    result = api.gap(data, spec, names(motions))
     show_methods(out, result, spec)
     out.result(result)
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tyro
 
+from gaponet import api
 from gaponet.cli.gap import mrad
-from gaponet.cli.inputs import open_dataset
 from gaponet.cli.out import Out, writes
-from gaponet.cli.progress import bar
 
 COLUMNS = {  # field → heading, factor from SI
     "kp": ("kp\nN·m/rad", 1.0),
@@ -48,39 +46,11 @@ def identify(
         mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
-    from gaponet.data.sequence import require_same_gains
-    from gaponet.data.split import split_entries
-    from gaponet.errors import UsageError
-    from gaponet.robot_folder import save_robot
     from gaponet.sim.free_runs import BOUNDS
-    from gaponet.sim.identify import identify as fit
-    from gaponet.sim.replay import replay
 
     screen = Out(json)
-    data, spec = open_dataset(dataset, robot)
-    data.require_robot(spec)
-    others = {e.meta.unit_id for e in data.entries} - set(units) if units else set()
-    strangers = set(units) - {e.meta.unit_id for e in data.entries}
-    if strangers:
-        raise UsageError(f"--units {min(strangers)}: not in {dataset}")
-    parts = split_entries(data, tuple(sorted(others | set(holdout_units))))
-    if not mixed_gains:
-        require_same_gains((e.meta for e in parts["train"]), data.joint_names, spec.operated)
-    with bar("identifying") as update:
-        found = fit(
-            data.sequences(parts["train"]), spec, windows,
-            progress=lambda done, total, rms: update(done, total, f"window RMS {mrad(rms)} mrad"),
-        )  # fmt: skip
-    save_robot(found.robot, out)
-    held, op = data.sequences(parts["val"]), spec.operated_index
-    nominal = spec.nominal or spec
-    error = {
-        name: float(np.mean([
-            np.abs(t.qpos - s.qpos)[1:, op].mean()
-            for s, t in zip(held, replay(held, simulator, lock_idle=True), strict=True)
-        ]))
-        for name, simulator in (("nominal", nominal), ("identified", found.robot))
-    }  # fmt: skip
+    made = api.identify(dataset, out, windows, robot, units, holdout_units, mixed_gains)
+    found, error, spec = made.found, made.val_mpjae, made.found.robot
     values: dict[str, Any] = {
         j: {f: float(getattr(found.robot, f)[spec.joint_names.index(j)]) for f in BOUNDS} for j in spec.operated
     }

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from gaponet import api
 from gaponet.cli.gap import mrad, show_methods
-from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.inputs import names
 from gaponet.cli.out import Out, writes
-from gaponet.cli.progress import bar
-from gaponet.files import writing
 from gaponet.model.config import Kind
-from gaponet.robot import RobotSpec
+from gaponet.progress import bar
 from gaponet.train.config import TrainConfig
 from gaponet.train.config import fast as fast_preset
 
 if TYPE_CHECKING:
-    from gaponet.data.store import Dataset
-    from gaponet.model.artifact import GapModel
+    pass
 
 
 @writes("run")
@@ -54,13 +51,11 @@ def train(
         config: Everything else.
         json: One JSON object on stdout.
     """
-    screen = Out(json)
-    data, spec = open_dataset(dataset, robot)
-    config = replace(config, model=replace(config.model, kind=model))
-    config = fast_preset(config) if fast else config
-    trained = run_training(data, spec, out, config, budget, resume, holdout_units, log)
     from gaponet.model.artifact import how_trained
 
+    screen = Out(json)
+    config = fast_preset(config) if fast else config
+    trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
@@ -70,38 +65,8 @@ def train(
         + (" (interrupted)" if card["interrupted"] else "")
     )
     screen.say(f"model in {trained.path}; next: gaponet eval {out} {dataset}; gaponet report {out}")
-    screen.result(
-        {
-            k: card[k]
-            for k in ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
-        }
-    )
-
-
-def run_training(
-    data: Dataset,
-    spec: RobotSpec,
-    out: Path,
-    config: TrainConfig,
-    budget: str,
-    resume: bool,
-    holdout: tuple[str, ...],
-    log: tuple[str, ...] = (),
-) -> GapModel:
-    """Train with a progress bar: reward, held-out MPJAE, throughput."""
-    from gaponet.train.budget import Budget
-    from gaponet.train.run import Status, Trainer
-
-    with bar(f"training {config.model.kind}") as update:
-
-        def show(s: Status) -> None:
-            reward = "" if s.reward != s.reward else f"reward {s.reward:.4f}, "
-            held = "" if s.val_mpjae != s.val_mpjae else f"held-out {s.val_mpjae * 1e3:.2f} mrad"
-            best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
-            update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
-
-        with writing(out, "run"):
-            return Trainer(data, spec, out, config, Budget.parse(budget), resume, holdout, show, log).run()
+    shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
+    screen.result({k: card[k] for k in shown})
 
 
 def evaluate(
@@ -122,17 +87,9 @@ def evaluate(
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
-    from gaponet.eval.evaluate import evaluate as run_evaluation
-    from gaponet.eval.evaluate import save
-
     out = Out(json)
-    data, spec = open_dataset(dataset, robot, run)
-    with bar("evaluating") as update:
-        evaluation = run_evaluation(
-            [run, *also], data, spec, names(motions),
-            lambda method, done, total: update(done, total, method),
-        )  # fmt: skip
-    save(evaluation, run)
+    data, spec = api.open_dataset(dataset, robot, run)
+    evaluation = api.evaluate(run, data, also, names(motions), spec)
     if not evaluation.result["unseen"]:
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from gaponet.api import open_dataset
 from gaponet.cli.gap import mrad
-from gaponet.cli.inputs import names, open_dataset
+from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
-from gaponet.cli.progress import bar
+from gaponet.progress import bar
 
 if TYPE_CHECKING:
     from gaponet.view.film import Clip

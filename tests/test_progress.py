@@ -2,7 +2,7 @@
 
 import time
 
-from gaponet.cli import progress
+from gaponet import progress
 
 
 def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(capfd, monkeypatch):

@@ -1,0 +1,363 @@
+"""What the commands do, as functions: `import gaponet as gp` offers them, and the commands only parse, call and print.
+
+Datasets, runs and robots are given as paths or as what these functions return. Each shows how far it is on stderr.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.errors import DatasetError, UsageError
+from gaponet.progress import bar
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import MOVE_KEPT, keeps_robot, kept_robot
+
+if TYPE_CHECKING:
+    from gaponet.data.doctor import Diagnosis
+    from gaponet.data.importer import ImportReport
+    from gaponet.data.store import Dataset
+    from gaponet.eval.evaluate import Evaluation
+    from gaponet.model.artifact import GapModel
+    from gaponet.model.calibration import Calibration
+    from gaponet.sim.identify import Identified
+    from gaponet.train.config import TrainConfig
+
+Place = str | Path
+
+
+def open_dataset(
+    dataset: Dataset | Place, robot: RobotSpec | Place | None = None, run: Place | None = None
+) -> tuple[Dataset, RobotSpec]:
+    """A dataset and its robot: the one asked for, else the one that the dataset keeps.
+
+    A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
+    is said.
+    """
+    from gaponet.data.store import Dataset
+
+    data = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    if robot is not None:
+        return data, _robot(robot)
+    if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
+        return data, kept_robot(Path(run), data.robot_name)
+    spec = kept_robot(data.path, data.robot_name)
+    if not keeps_robot(data.path):
+        note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
+        print(note, file=sys.stderr)
+    return data, spec
+
+
+def import_logs(
+    src: Place,
+    robot: RobotSpec | Place,
+    out: Place,
+    unit_id: str | None = None,
+    payload_mass: float | None = None,
+    **options: Any,
+) -> ImportReport:
+    """Read logs into a dataset, with delays and static offsets of the unit; a bad log refuses them all.
+
+    The same call again adds what is missing.
+
+    Args:
+        src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
+        robot: The robot that was recorded.
+        out: Dataset folder; appended to where it exists.
+        unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
+        payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
+        options: Of data.importer.import_logs: payload_side, level, fmt, kp, kd, joint_map, columns, position_unit,
+            time_unit.
+
+    Raises:
+        LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
+    """
+    from gaponet.data.importer import import_logs as run
+    from gaponet.data.store import Dataset
+    from gaponet.sim.kept import require_kept
+    from gaponet.sim.model import model_hash
+
+    spec = _robot(robot)
+    if Dataset.peek(out, spec) is not None:
+        require_kept(Path(out), spec, DatasetError, MOVE_KEPT)
+    with bar("importing") as update:
+        return run(
+            src, spec, unit_id, payload_mass, out,
+            gravity=_gravity(spec), simulator=model_hash(spec), progress=update, **options,
+        )  # fmt: skip
+
+
+def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> Diagnosis:
+    """Look through a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque."""
+    from gaponet.data.doctor import diagnose
+
+    data, spec = open_dataset(dataset, robot)
+    with bar("examining") as update:
+        return diagnose(data, spec, update, _gravity(spec))
+
+
+def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:
+    """Replay every sequence in the nominal simulator and keep the twin beside it; returns how many were made."""
+    from gaponet.sim.pairing import pair_dataset
+
+    data, spec = open_dataset(dataset, robot)
+    data.require_robot(spec)
+    with bar("replaying") as update:
+        return pair_dataset(data, spec, lambda done, total: update(done, total, "control steps"))
+
+
+def gap(
+    dataset: Dataset | Place, robot: RobotSpec | Place | None = None, motions: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """How far the nominal simulator is from the robot, in whole-motion free run.
+
+    Args:
+        dataset: Sequences without a twin are replayed first.
+        robot: If not the one that the dataset keeps.
+        motions: Only these.
+
+    Returns:
+        methods → nominal → metrics (gap.metrics: mpjae rad, …) and the same by_joint, by_payload, by_unit, by_motion and
+        by_horizon; dataset, sequences, hours, virtual, robot, simulator_hash.
+    """
+    from gaponet.gap import runs, summary
+    from gaponet.sim.model import model_hash
+
+    data, spec = open_dataset(dataset, robot)
+    pair(data, spec)
+    entries, simulator = data.select(motions), model_hash(spec)
+    pairs = [data.pair(e, simulator) for e in entries]
+    return {
+        "methods": {"nominal": summary(runs([p.real for p in pairs], [p.sim.qpos for p in pairs], spec), spec)},
+        "dataset": data.path.name,
+        "sequences": len(pairs),
+        "hours": sum(e.rows * e.dt for e in entries) / 3600,
+        "virtual": any(e.meta.virtual for e in entries),
+        "robot": spec.name,
+        "simulator_hash": simulator,
+    }
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What identification found, and what it is worth.
+
+    Attributes:
+        found: Robot with identified servos, window RMS before and after [rad], warnings.
+        val_mpjae: Whole validation motions, rad: nominal, identified.
+    """
+
+    found: Identified
+    val_mpjae: dict[str, float]
+
+
+def identify(
+    dataset: Dataset | Place,
+    out: Place,
+    windows: int = 40,
+    robot: RobotSpec | Place | None = None,
+    units: tuple[str, ...] = (),
+    holdout_units: tuple[str, ...] = (),
+    mixed_gains: bool = False,
+) -> Identification:
+    """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
+
+    Args:
+        dataset: Recordings.
+        out: Robot folder to write; train(…, robot=out) starts from it.
+        windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
+        robot: Where to start, if not from the one that the dataset keeps.
+        units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
+        holdout_units: Units to leave out, as in training.
+        mixed_gains: Take recordings made with different kp or kd together.
+    """
+    from gaponet.data.sequence import require_same_gains
+    from gaponet.data.split import split_entries
+    from gaponet.files import writing
+    from gaponet.robot_folder import save_robot
+    from gaponet.sim.identify import identify as fit
+    from gaponet.sim.replay import replay
+
+    data, spec = open_dataset(dataset, robot)
+    data.require_robot(spec)
+    held = {e.meta.unit_id for e in data.entries}
+    if set(units) - held:
+        raise UsageError(f"--units {min(set(units) - held)}: not in {data.path}")
+    parts = split_entries(data, tuple(sorted((held - set(units) if units else set()) | set(holdout_units))))
+    if not mixed_gains:
+        require_same_gains((e.meta for e in parts["train"]), data.joint_names, spec.operated)
+    with writing(Path(out), "robot"), bar("identifying") as update:
+        found = fit(
+            data.sequences(parts["train"]), spec, windows,
+            progress=lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
+        )  # fmt: skip
+        save_robot(found.robot, Path(out))
+    val, op = data.sequences(parts["val"]), spec.operated_index
+    error = (
+        lambda twins: float(  # noqa: E731
+            np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)])
+        )
+    )
+    simulators = {"nominal": spec.nominal or spec, "identified": found.robot}
+    return Identification(found, {name: error(replay(val, s, lock_idle=True)) for name, s in simulators.items()})
+
+
+def train(
+    dataset: Dataset | Place,
+    out: Place,
+    budget: str = "10m",
+    config: TrainConfig | None = None,
+    model: str | None = None,
+    robot: RobotSpec | Place | None = None,
+    holdout_units: tuple[str, ...] = (),
+    resume: bool = False,
+    log: tuple[str, ...] = (),
+) -> GapModel:
+    """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
+
+    Ctrl-C ends training and leaves a usable run.
+
+    Args:
+        dataset: Recordings.
+        out: Run folder.
+        budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
+        config: Everything else (train.config); default TrainConfig().
+        model: gaponet, or a baseline: mlp, transformer, fno, inverse; default that of the config.
+        robot: If not the one that the dataset keeps, e.g. the folder that identify wrote.
+        holdout_units: Units never trained on; their test motions stay in the test part.
+        resume: Go on with the run in out.
+        log: tensorboard, wandb.
+
+    Raises:
+        ModelError: The budget bought no training step.
+    """
+    from gaponet.files import writing
+    from gaponet.train.budget import Budget
+    from gaponet.train.config import TrainConfig
+    from gaponet.train.run import Status, Trainer
+
+    data, spec = open_dataset(dataset, robot)
+    config = config or TrainConfig()
+    config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
+    with bar(f"training {config.model.kind}") as update, writing(Path(out), "run"):
+
+        def show(s: Status) -> None:
+            reward = "" if s.reward != s.reward else f"reward {s.reward:.4f}, "
+            held = "" if s.val_mpjae != s.val_mpjae else f"held-out {s.val_mpjae * 1e3:.2f} mrad"
+            best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
+            update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
+
+        return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
+
+
+def evaluate(
+    run: GapModel | Place,
+    dataset: Dataset | Place,
+    also: tuple[Place, ...] = (),
+    motions: tuple[str, ...] = (),
+    robot: RobotSpec | Place | None = None,
+) -> Evaluation:
+    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it.
+
+    Args:
+        run: Run folder, or what train returned; the result is kept in it.
+        dataset: The dataset trained on (its test motions are used) or another.
+        also: Further runs to compare, e.g. the MLP's.
+        motions: Only these.
+        robot: If not the one that the dataset keeps.
+    """
+    from gaponet.eval.evaluate import evaluate as step
+    from gaponet.eval.evaluate import save
+
+    folder = _run(run)
+    data, spec = open_dataset(dataset, robot, folder)
+    with bar("evaluating") as update:
+        found = step(
+            [folder, *map(Path, also)], data, spec, motions, lambda method, done, total: update(done, total, method)
+        )
+    save(found, folder)
+    return found
+
+
+def calibrate(
+    run: GapModel | Place,
+    dataset: Dataset | Place,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    seconds: float = 30.0,
+    unknown_payload: bool = False,
+    robot: RobotSpec | Place | None = None,
+    mixed_gains: bool = False,
+) -> Calibration:
+    """Fit what is particular to one unit from a short log: gain, damping, friction, zero offset, delay of each joint.
+
+    The trained model stays as it is; the run keeps the calibration beside it, and evaluate shows the unit with it too.
+
+    Args:
+        run: Run folder, or what train returned.
+        dataset: Recordings of the unit, perhaps among others.
+        unit: Which one, where the dataset holds several.
+        motions: Only these; default: those that the run was trained on, so that its test motions stay unseen, or all,
+            where the unit played none of them.
+        seconds: How much of the recordings to use, in windows of 8 s.
+        unknown_payload: Do not believe the recordings' payload, estimate it too; all must carry the same.
+        robot: If not the one that the dataset keeps.
+        mixed_gains: Take recordings made with different kp or kd together.
+    """
+    from gaponet.data.sequence import require_same_gains
+    from gaponet.eval.evaluate import corrected_robot
+    from gaponet.model import calibration
+    from gaponet.model.artifact import GapModel
+
+    folder = _run(run)
+    data, spec = open_dataset(dataset, robot, folder)
+    data.require_robot(spec)
+    model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
+    units = sorted({e.meta.unit_id for e in data.entries})
+    if unit not in units and (unit or len(units) != 1):
+        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
+    entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
+    if not motions:
+        trained = set(model.card["motions"]["train"])
+        entries = [e for e in entries if e.meta.motion in trained] or entries
+    if not mixed_gains:
+        require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
+    with bar("calibrating") as update:
+        found = calibration.calibrate(
+            model, simulator, data.sequences(entries), seconds, unknown_payload,
+            lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
+        )  # fmt: skip
+    calibration.save(found, folder)
+    return found
+
+
+def _robot(robot: RobotSpec | Place) -> RobotSpec:
+    return robot if isinstance(robot, RobotSpec) else load_robot(robot)
+
+
+def _run(run: GapModel | Place) -> Path:
+    """The folder of a run; a model of training lies in it."""
+    if isinstance(run, (str, Path)):
+        return Path(run)
+    return run.path.parent if run.path.name == "model" else run.path
+
+
+def _gravity(robot: RobotSpec) -> Callable[[np.ndarray, float, str], np.ndarray]:
+    """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
+    from gaponet.sim.dynamics import static_torque
+    from gaponet.sim.model import build_model
+
+    models: dict[tuple[float, str], Any] = {}
+
+    def gravity(qpos: np.ndarray, payload_mass: float, payload_side: str) -> np.ndarray:
+        key = (payload_mass, payload_side)
+        if key not in models:
+            models[key] = build_model(robot, *key)
+        return static_torque(models[key], qpos)
+
+    return gravity
