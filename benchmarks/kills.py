@@ -35,7 +35,7 @@ import numpy as np
 
 import gaponet.model.export  # what a child needs is there before it is forked
 import gaponet.study.study
-import gaponet.train.run  # noqa: F401
+import gaponet.training.run  # noqa: F401
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
 from gaponet.files import MARK

@@ -26,7 +26,7 @@ from gaponet.study.found import Found, answer
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.train.config import TrainConfig, WarmStartConfig
+from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.view.side_by_side import pick, side_by_side
 
 SHOWN, JOINT, SECONDS = "dual_joint_elbow_wrist", "elbow_flex", 25.0

@@ -35,8 +35,8 @@ from gaponet.model.observation import frames_before
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
-from gaponet.train.config import TrainConfig
-from gaponet.train.env import DeltaEnv
+from gaponet.training.config import TrainConfig
+from gaponet.training.env import DeltaEnv
 
 Array = np.ndarray
 

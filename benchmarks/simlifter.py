@@ -33,7 +33,7 @@ from gaponet.collect import collect, load_recipe
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval import dataset_figures
-from gaponet.gap import metrics, runs
+from gaponet.metrics import metrics, runs
 from gaponet.motion.library import Library
 from gaponet.motion.recipe import takes
 from gaponet.plot.style import save

@@ -29,7 +29,7 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
-from gaponet.gap import metrics, runs
+from gaponet.metrics import metrics, runs
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.plot.charts import bars
@@ -42,7 +42,7 @@ from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
 from gaponet.study.table import Spread, Table, compared
-from gaponet.train.config import TrainConfig, WarmStartConfig
+from gaponet.training.config import TrainConfig, WarmStartConfig
 
 RECIPE = Path(__file__).with_suffix(".toml")
 UNIT, UNITS = "virtual-4", ("virtual-1", "virtual-2", "virtual-3", "virtual-4")

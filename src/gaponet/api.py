@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from gaponet.model.artifact import GapModel
     from gaponet.model.calibration import Calibration
     from gaponet.sim.identify import Identified
-    from gaponet.train.config import TrainConfig
+    from gaponet.training.config import TrainConfig
 
 Place = str | Path
 
@@ -122,10 +122,10 @@ def gap(
         motions: Only these.
 
     Returns:
-        methods → nominal → metrics (gap.metrics: mpjae rad, …) and the same by_joint, by_payload, by_unit, by_motion and
-        by_horizon; dataset, sequences, hours, virtual, robot, simulator_hash.
+        methods → nominal → metrics (mpjae rad, …), and by_joint, by_payload, by_unit, by_motion, by_horizon the same;
+        dataset, sequences, hours, virtual, robot, simulator_hash.
     """
-    from gaponet.gap import runs, summary
+    from gaponet.metrics import runs, summary
     from gaponet.sim.model import model_hash
 
     data, spec = open_dataset(dataset, robot)
@@ -198,13 +198,12 @@ def identify(
         )  # fmt: skip
         save_robot(found.robot, Path(out))
     val, op = data.sequences(parts["val"]), spec.operated_index
-    error = (
-        lambda twins: float(  # noqa: E731
-            np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)])
-        )
-    )
-    simulators = {"nominal": spec.nominal or spec, "identified": found.robot}
-    return Identification(found, {name: error(replay(val, s, lock_idle=True)) for name, s in simulators.items()})
+
+    def error(simulator: RobotSpec) -> float:
+        twins = replay(val, simulator, lock_idle=True)
+        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)]))
+
+    return Identification(found, {"nominal": error(spec.nominal or spec), "identified": error(found.robot)})
 
 
 def train(
@@ -237,9 +236,9 @@ def train(
         ModelError: The budget bought no training step.
     """
     from gaponet.files import writing
-    from gaponet.train.budget import Budget
-    from gaponet.train.config import TrainConfig
-    from gaponet.train.run import Status, Trainer
+    from gaponet.training.budget import Budget
+    from gaponet.training.config import TrainConfig
+    from gaponet.training.run import Status, Trainer
 
     data, spec = open_dataset(dataset, robot)
     config = config or TrainConfig()

@@ -10,7 +10,7 @@ from arm import write_arm
 from gaponet.bench import training as bench
 from gaponet.model.config import ModelConfig
 from gaponet.sim.replay import replay
-from gaponet.train.config import PPOConfig, TrainConfig
+from gaponet.training.config import PPOConfig, TrainConfig
 
 SMALL = TrainConfig(
     ModelConfig(history=1, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,), mlp_hidden=(8,)),

@@ -13,8 +13,8 @@ from gaponet.model.loop import DeltaLoop
 from gaponet.model.observation import Layout
 from gaponet.model.sensor import ProbeOracle
 from gaponet.sim.replay import replay
-from gaponet.train.config import RewardConfig
-from gaponet.train.env import DeltaEnv
+from gaponet.training.config import RewardConfig
+from gaponet.training.env import DeltaEnv
 
 LIMITS = np.array([[-10.0, 10.0]] * 2)
 

@@ -13,7 +13,7 @@ from gaponet.errors import UsageError
 from gaponet.model.baselines import delay_offset
 from gaponet.study.pool import SETUP, plan, run_cells, train_cell
 from gaponet.study.variant import parse_variant
-from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 
 SMALL = TrainConfig(
     warm_start=WarmStartConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),

@@ -4,7 +4,7 @@ import pytest
 
 from gaponet.errors import UsageError
 from gaponet.study.variant import KINDS, _read, parse_variant
-from gaponet.train.config import TrainConfig, WarmStartConfig
+from gaponet.training.config import TrainConfig, WarmStartConfig
 
 BASE = TrainConfig(warm_start=WarmStartConfig(rounds=7))
 

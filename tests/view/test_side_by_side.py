@@ -7,7 +7,7 @@ from runs import untrained
 
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
-from gaponet.gap import metrics, runs
+from gaponet.metrics import metrics, runs
 from gaponet.sim.replay import replay
 from gaponet.view.side_by_side import pick, side_by_side
 

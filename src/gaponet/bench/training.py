@@ -24,8 +24,8 @@ from gaponet.model.layers import size
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs, replay
-from gaponet.train.config import RewardConfig, TrainConfig, fast
-from gaponet.train.env import DeltaEnv
+from gaponet.training.config import RewardConfig, TrainConfig, fast
+from gaponet.training.env import DeltaEnv
 
 Array = np.ndarray
 Turn = Callable[[], object]
@@ -77,7 +77,7 @@ def bench_train(
         speeds by name, expected (control steps/s) and share of it, times_others (PPO's speed over that of each of the
         others), parameters, peak_memory_bytes.
     """
-    from gaponet.train.ppo import make_runner, update
+    from gaponet.training.ppo import make_runner, update
 
     torch.set_num_threads(config.learner_threads)
     config = _for_envs(config, num_envs)

@@ -58,7 +58,7 @@ def _sim(robot: str, out: Out, num_envs: int, rounds: int) -> None:
 def _train(robot: str, model: Literal["gaponet", "mlp"], out: Out, num_envs: int, rounds: int) -> None:
     from gaponet.bench.training import bench_train
     from gaponet.model.config import ModelConfig
-    from gaponet.train.config import TrainConfig
+    from gaponet.training.config import TrainConfig
 
     result = bench_train(load_robot(robot), TrainConfig(ModelConfig(model)), num_envs, rounds)
     _print_speeds(out, f"{robot}, {model}, {num_envs} simulations", result["speeds"])

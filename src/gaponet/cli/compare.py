@@ -16,7 +16,7 @@ from gaponet.progress import bar
 from gaponet.study.compare import Compare, identified
 from gaponet.study.options import Options
 from gaponet.study.study import Study
-from gaponet.train.config import TrainConfig
+from gaponet.training.config import TrainConfig
 
 
 @writes("experiments")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import tyro
 
+from gaponet import api
 from gaponet.cli.gap import gap
 from gaponet.cli.out import Out, writes
 from gaponet.cli.train import evaluate
@@ -16,7 +17,7 @@ from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.progress import bar
 from gaponet.robot import load_robot
-from gaponet.train.config import TrainConfig, WarmStartConfig
+from gaponet.training.config import TrainConfig, WarmStartConfig
 
 QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
 

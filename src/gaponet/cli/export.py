@@ -59,7 +59,7 @@ def _inverse(screen: Out, run: Path, model: GapModel) -> None:
     from gaponet.deploy.compensator import INVERSE
     from gaponet.motion.library import Library
     from gaponet.robot_folder import kept_robot
-    from gaponet.train.learned_inverse import learn_inverse
+    from gaponet.training.learned_inverse import learn_inverse
 
     robot = kept_robot(run, model.card["robot"])
     library = Library(robot, INVERSE_SEED, model.config.payload_max)

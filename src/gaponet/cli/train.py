@@ -13,8 +13,8 @@ from gaponet.cli.inputs import names
 from gaponet.cli.out import Out, writes
 from gaponet.model.config import Kind
 from gaponet.progress import bar
-from gaponet.train.config import TrainConfig
-from gaponet.train.config import fast as fast_preset
+from gaponet.training.config import TrainConfig
+from gaponet.training.config import fast as fast_preset
 
 if TYPE_CHECKING:
     pass

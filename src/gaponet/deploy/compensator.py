@@ -34,7 +34,7 @@ from gaponet.sim.model import idle_joints
 
 Array = np.ndarray
 
-INVERSE = "inverse"  # folder of the learned inverse beside the model (train/learned_inverse.py)
+INVERSE = "inverse"  # folder of the learned inverse beside the model (training/learned_inverse.py)
 SETTLE = 100  # control periods in which the shadow comes to rest at a start
 
 

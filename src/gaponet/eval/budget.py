@@ -15,7 +15,7 @@ from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
-from gaponet.gap import metrics, runs
+from gaponet.metrics import metrics, runs
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec

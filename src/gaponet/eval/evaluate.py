@@ -19,7 +19,7 @@ from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.files import whole, writing
-from gaponet.gap import Run, runs, summary
+from gaponet.metrics import Run, runs, summary
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset

@@ -96,7 +96,7 @@ class Features(nn.Module):
 class Bounded(nn.Module):
     """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
 
-    The gain is 1 while training; train/gain.py lowers it where less of a correction does better.
+    The gain is 1 while training; training/gain.py lowers it where less of a correction does better.
     """
 
     gain: Tensor
@@ -117,7 +117,7 @@ class DeltaNet(nn.Module):
     """
 
     predictor: Any
-    """A network that answers in the simulator's place: fitted before all else (train/sensor_fit.py), then frozen."""
+    """A network that answers in the simulator's place: fitted before all else (training/sensor_fit.py), then frozen."""
     sample_sensors: bool
     """True while supervised fitting asks it."""
 

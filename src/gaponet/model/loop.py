@@ -168,7 +168,7 @@ class DeltaLoop:
         return wanted + offset
 
     def answer(self, qpos: Array, qvel: Array, wanted: Array, payload_mass: Array) -> Array:
-        """What `solve` gives, where this network was fitted to it (train/learned_inverse.py): wanted + its answer."""
+        """What `solve` gives, by a network that was fitted to it (training/learned_inverse.py): wanted + its answer."""
         self.observe(qpos, qvel, wanted, payload_mass)
         self.bound.run()
         self.push(qpos, qvel, wanted)

@@ -16,7 +16,7 @@ from gaponet.study.result import Result
 from gaponet.study.study import Study, rates_of
 from gaponet.study.table import Spread, Table, compared_by_seed
 from gaponet.study.variant import parse_variant
-from gaponet.train.config import TrainConfig
+from gaponet.training.config import TrainConfig
 
 DEFAULT = "gaponet"
 COLD = "warm_start.rounds=0:ppo.critic_warmup=0:ppo.learning_rate=1e-4:ppo.init_std=0.05"  # PPO's values of the paper

@@ -14,7 +14,7 @@ from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose
-from gaponet.gap import Run, runs, summary
+from gaponet.metrics import Run, runs, summary
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 
 # Small rounds: on the virtual H1-2, validation stops falling after two of them, or falls by a few per cent more.
 TRAINING = TrainConfig(warm_start=WarmStartConfig(rounds=2, num_envs=128, steps=300, gradient_steps=200))

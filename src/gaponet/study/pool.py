@@ -30,8 +30,8 @@ from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash, text_hash
 from gaponet.study.variant import Variant
-from gaponet.train.budget import Budget
-from gaponet.train.config import TrainConfig
+from gaponet.training.budget import Budget
+from gaponet.training.config import TrainConfig
 
 Tell = Callable[[float, str], None]  # share done, what is going on
 Running = dict[str, tuple[float, str]]  # the same of each running cell, by name
@@ -132,7 +132,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
 
     from gaponet.model.artifact import GapModel
     from gaponet.model.deeponet import build_network
-    from gaponet.train.run import Status, Trainer
+    from gaponet.training.run import Status, Trainer
 
     torch.set_num_threads(cell.threads)
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)

@@ -26,8 +26,8 @@ from gaponet.study.options import (
 from gaponet.study.pool import RESULT, Cell, plan
 from gaponet.study.rehearsal import rehearsal, take
 from gaponet.study.variant import IDENTIFIED, Variant, parse_variant
-from gaponet.train.budget import Budget
-from gaponet.train.config import TrainConfig
+from gaponet.training.budget import Budget
+from gaponet.training.config import TrainConfig
 
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.train.config import TrainConfig
+from gaponet.training.config import TrainConfig
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
 IDENTIFIED = "identified+"

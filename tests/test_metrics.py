@@ -5,7 +5,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.gap import metrics, runs, summary
+from gaponet.metrics import metrics, runs, summary
 
 
 def sequence(robot, qpos, motion="m", payload=0.0):

@@ -13,7 +13,7 @@ from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import drawn_states, export
-from gaponet.train.learned_inverse import learn_inverse, visit
+from gaponet.training.learned_inverse import learn_inverse, visit
 
 CONFIG = ModelConfig(
     history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,), payload_max=0.4

@@ -15,8 +15,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from gaponet.model.layers import DeltaNet
-from gaponet.train.config import PPOConfig
-from gaponet.train.env import DeltaEnv
+from gaponet.training.config import PPOConfig
+from gaponet.training.env import DeltaEnv
 
 STD_RANGE = (0.001, math.exp(-1))  # rad
 

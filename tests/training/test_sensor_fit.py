@@ -7,10 +7,10 @@ from arm import recordings, write_arm
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.train.config import RewardConfig
-from gaponet.train.env import DeltaEnv
-from gaponet.train.sensor_fit import shift_positions
-from gaponet.train.warm_start import fit_inputs
+from gaponet.training.config import RewardConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.sensor_fit import shift_positions
+from gaponet.training.warm_start import fit_inputs
 
 
 def test_moving_a_posture_changes_no_relative_feature():

@@ -42,16 +42,24 @@ from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.structure import parse_json, validated
-from gaponet.train.budget import Budget
-from gaponet.train.checkpoint import State, env_state, restore_env, restore_warm, round_state, warm_state, write_state
-from gaponet.train.config import TrainConfig
-from gaponet.train.env import DeltaEnv
-from gaponet.train.gain import choose_gain
-from gaponet.train.inverse import inverse_labels
-from gaponet.train.loggers import Loggers
-from gaponet.train.ppo import make_runner, trained_by, update
-from gaponet.train.sensor_fit import Report, points_of, report_of
-from gaponet.train.warm_start import WarmStart, fit_inputs, recipe
+from gaponet.training.budget import Budget
+from gaponet.training.checkpoint import (
+    State,
+    env_state,
+    restore_env,
+    restore_warm,
+    round_state,
+    warm_state,
+    write_state,
+)
+from gaponet.training.config import TrainConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.gain import choose_gain
+from gaponet.training.inverse import inverse_labels
+from gaponet.training.loggers import Loggers
+from gaponet.training.ppo import make_runner, trained_by, update
+from gaponet.training.sensor_fit import Report, points_of, report_of
+from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
 Array = np.ndarray
 

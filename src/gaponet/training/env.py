@@ -18,7 +18,7 @@ from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
-from gaponet.train.config import RewardConfig
+from gaponet.training.config import RewardConfig
 
 Array = np.ndarray
 

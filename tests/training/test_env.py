@@ -8,8 +8,8 @@ from arm import recordings, write_arm
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.sim.replay import replay
-from gaponet.train.config import RewardConfig
-from gaponet.train.env import DeltaEnv
+from gaponet.training.config import RewardConfig
+from gaponet.training.env import DeltaEnv
 
 
 @pytest.fixture

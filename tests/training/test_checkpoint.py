@@ -11,9 +11,9 @@ from arm import recordings, write_arm
 from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.train.budget import Budget
-from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.train.run import Trainer
+from gaponet.training.budget import Budget
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.run import Trainer
 
 TINY = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
@@ -104,8 +104,8 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
         net.bounded.gain.fill_(0.5)
         return 0.5
 
-    monkeypatch.setattr("gaponet.train.run.choose_gain", halve)
-    monkeypatch.setattr("gaponet.train.run.Trainer.validate", better_each_time())
+    monkeypatch.setattr("gaponet.training.run.choose_gain", halve)
+    monkeypatch.setattr("gaponet.training.run.Trainer.validate", better_each_time())
     warm = replace(TINY, warm_start=replace(TINY.warm_start, rounds=4))
     card = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
     assert card["gain"] == 0.5

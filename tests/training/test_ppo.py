@@ -5,9 +5,9 @@ from arm import recordings, write_arm
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.train.config import PPOConfig, RewardConfig
-from gaponet.train.env import DeltaEnv
-from gaponet.train.ppo import Correct, PreparedEnv, make_runner, trained_by, update
+from gaponet.training.config import PPOConfig, RewardConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.ppo import Correct, PreparedEnv, make_runner, trained_by, update
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
 PPO = PPOConfig(num_envs=16, num_steps=8, epochs=1, mini_batches=2, critic_warmup=0, learning_rate=1e-3)

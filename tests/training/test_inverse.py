@@ -6,7 +6,7 @@ import numpy as np
 from arm import recordings, write_arm
 
 from gaponet.sim.replay import replay
-from gaponet.train.inverse import inverse_labels
+from gaponet.training.inverse import inverse_labels
 
 
 class Lead:

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from gaponet.files import whole
-from gaponet.train.env import DeltaEnv
-from gaponet.train.warm_start import WarmStart
+from gaponet.training.env import DeltaEnv
+from gaponet.training.warm_start import WarmStart
 
 State = dict[str, Any]
 ROWS = ("row", "first", "last", "previous", "now")  # of each environment

@@ -16,9 +16,9 @@ from gaponet.eval.evaluate import LEARNED, ORDER, evaluate
 from gaponet.model.artifact import how_trained
 from gaponet.model.config import ModelConfig
 from gaponet.plot.methods import COLOURS, NAMES
-from gaponet.train.budget import Budget
-from gaponet.train.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.train.run import Trainer
+from gaponet.training.budget import Budget
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.run import Trainer
 
 SMALL = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),

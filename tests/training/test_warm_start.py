@@ -7,9 +7,9 @@ from arm import recordings, write_arm
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.train.config import RewardConfig, TrainConfig, WarmStartConfig
-from gaponet.train.env import DeltaEnv
-from gaponet.train.warm_start import WarmStart, held_labels, recipe
+from gaponet.training.config import RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.warm_start import WarmStart, held_labels, recipe
 
 
 def test_a_held_correction_has_the_mean_label_of_its_rows():

@@ -1,7 +1,7 @@
 """Supervised start: regress the inverse labels on states that the policy visits itself (DAgger, Ross et al. 2011).
 
 Fitted on recorded states alone, a policy meets other states as soon as it errs and errs more. So each round rolls the
-present policy out, labels every visited state with u* − a of its row (train/inverse.py: right wherever the state is,
+present policy out, labels every visited state with u* − a of its row (training/inverse.py: right wherever the state is,
 the plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven
 by the labels themselves and only seeds the second; the inverse-label baseline stops after it.
 """
@@ -16,9 +16,9 @@ import torch
 
 from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
-from gaponet.train.config import TrainConfig, WarmStartConfig
-from gaponet.train.env import DeltaEnv
-from gaponet.train.sensor_fit import Asked, Report, explained, fit_predictor, points_of, sensor_labels
+from gaponet.training.config import TrainConfig, WarmStartConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.sensor_fit import Asked, Report, explained, fit_predictor, points_of, sensor_labels
 
 Array = np.ndarray
 

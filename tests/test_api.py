@@ -1,0 +1,51 @@
+"""The front door: public names, and logs to an evaluated model by calls alone."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from arm import recordings, write_arm
+
+import gaponet as gp
+from gaponet.data.store import Dataset
+from gaponet.model.config import ModelConfig
+from gaponet.training.config import TrainConfig, WarmStartConfig
+
+
+def test_public_names_are_there_and_what_is_not_says_what_is():
+    assert {"import_logs", "train", "evaluate", "GapModel", "Controller"} <= set(dir(gp))
+    for name in gp.__all__:
+        assert getattr(gp, name) is not None
+    with pytest.raises(AttributeError, match=r"no attribute 'fit'; it offers import_logs, doctor, pair, gap"):
+        gp.fit  # noqa: B018
+
+
+def test_no_public_name_hides_behind_a_module_of_the_same_name():
+    code = (
+        "import gaponet as gp, pkgutil, importlib\n"
+        "mods = [m.name for m in pkgutil.iter_modules(gp.__path__)]\n"
+        "print(sorted(set(mods) & set(gp.__all__)))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
+
+
+def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
+    robot = write_arm(tmp_path)
+    data = Dataset.create(tmp_path / "data", robot)
+    for sequence in recordings(robot, 8, kp=0.5, delay=2):
+        data.append(sequence)
+    assert gp.pair(data, robot) == 8
+    nominal = gp.gap(data, robot)["methods"]["nominal"]["mpjae"]
+    assert gp.doctor(data, robot).verdict
+    small = TrainConfig(
+        ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+        warm_start=WarmStartConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
+    )
+    model = gp.train(data, tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot)
+    found = gp.evaluate(model, data, robot=robot).result
+    assert found["unseen"]
+    assert found["methods"]["gaponet"]["mpjae"] < 0.8 * nominal
+    loop = model.loop()
+    assert np.isfinite(loop.delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
