@@ -30,7 +30,7 @@ def waterfall(budget: dict[str, Any]) -> Figure:
         if i % columns == 0:
             ax.set_ylabel("MPJAE, mrad")
         bottom = i + columns >= len(panels)
-        ax.set_xticks(range(len(steps) + 1), [*(_tick(s) for s in steps), "left"] if bottom else [], fontsize=6.5)
+        ax.set_xticks(range(len(steps) + 1), [*(_tick(s) for s in steps), "left"] if bottom else [], fontsize=5.8)
     who = "VIRTUAL " if budget["virtual"] else "real "
     fig.suptitle(
         f"{who}{budget['robot']}, {budget['sequences']} {'held-out ' if budget['unseen'] else ''}recordings: "
