@@ -57,14 +57,14 @@ def change(name: str, content: bytes, rng: random.Random) -> bytes:
 def _of_folder(files: Files, name: str, names: list[str], rng: random.Random) -> None:
     kind = rng.randrange(4)
     if kind == 0:
-        del files[name]
+        files.pop(name, None)
         names.remove(name) if len(names) > 1 else None
     elif kind == 1:
         files[name] = None
     elif kind == 2:
         files[name] = b""
     else:
-        files[name] = files[rng.choice(names)]
+        files[name] = files.get(rng.choice(names))  # None where an earlier change took the only file
 
 
 def _bytes(content: bytes, rng: random.Random) -> bytes:
