@@ -2,43 +2,63 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
-from gaponet.errors import GAPONetError, missing_extra
+from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.text import plain
 
-# command → module:function. A module is imported when its command is run (or when help lists them all).
-COMMANDS = {
-    "robot": "gaponet.cli.robot:robot",
-    "import": "gaponet.cli.data:import_logs",
-    "doctor": "gaponet.cli.data:doctor",
-    "pair": "gaponet.cli.gap:pair",
-    "gap": "gaponet.cli.gap:gap",
-    "data": "gaponet.cli.dataset:data",
-    "collect": "gaponet.cli.collect:collect",
-    "identify": "gaponet.cli.identify:identify",
-    "train": "gaponet.cli.train:train",
-    "calibrate": "gaponet.cli.calibrate:calibrate",
-    "export": "gaponet.cli.export:export",
-    "eval": "gaponet.cli.train:evaluate",
-    "report": "gaponet.cli.train:report",
-    "compare": "gaponet.cli.compare:compare",
-    "experiment": "gaponet.cli.experiment:experiment",
-    "run": "gaponet.cli.run:run",
-    "record": "gaponet.cli.record:record",
-    "virtual": "gaponet.cli.virtual:virtual",
-    "budget": "gaponet.cli.budget:budget",
-    "runs": "gaponet.cli.runs:runs",
-    "view": "gaponet.cli.view:view",
-    "demo": "gaponet.cli.demo:demo",
-    "bench": "gaponet.cli.bench:bench",
+# Task → command → module:function. A module is imported when its command is run; help reads what it says of itself.
+TASKS = {
+    "Logs": {
+        "import": "gaponet.cli.data:import_logs",
+        "doctor": "gaponet.cli.data:doctor",
+        "data": "gaponet.cli.dataset:data",
+        "collect": "gaponet.cli.collect:collect",
+        "robot": "gaponet.cli.robot:robot",
+    },
+    "The gap": {
+        "pair": "gaponet.cli.gap:pair",
+        "gap": "gaponet.cli.gap:gap",
+        "budget": "gaponet.cli.budget:budget",
+        "view": "gaponet.cli.view:view",
+    },
+    "Closing it": {
+        "identify": "gaponet.cli.identify:identify",
+        "train": "gaponet.cli.train:train",
+        "calibrate": "gaponet.cli.calibrate:calibrate",
+        "export": "gaponet.cli.export:export",
+    },
+    "Is it closed?": {
+        "eval": "gaponet.cli.train:evaluate",
+        "report": "gaponet.cli.train:report",
+        "runs": "gaponet.cli.runs:runs",
+        "compare": "gaponet.cli.compare:compare",
+        "experiment": "gaponet.cli.experiment:experiment",
+    },
+    "On a robot, real or virtual": {
+        "run": "gaponet.cli.run:run",
+        "record": "gaponet.cli.record:record",
+        "virtual": "gaponet.cli.virtual:virtual",
+    },
+    "Try it, time it": {
+        "demo": "gaponet.cli.demo:demo",
+        "bench": "gaponet.cli.bench:bench",
+    },
 }
+ABOUT = "Close the gap between simulated and real motors from joint logs."
+WIDTH = 100  # letters of a command's purpose
+COMMANDS = {name: where for commands in TASKS.values() for name, where in commands.items()}
 
 
 def load(command: str) -> Callable[..., Any]:
@@ -81,16 +101,43 @@ def _run(argv: list[str]) -> None:
 
         print(f"gaponet {__version__}")
         return
+    if not argv or argv[0] in ("-h", "--help"):
+        print(overview())
+        return
+    name, completing = argv[0], argv[0].startswith("--tyro-")
+    if name not in COMMANDS and not completing:
+        close = get_close_matches(name, COMMANDS, 1)
+        guess = f"do you mean {close[0]}? " if close else ""
+        raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
 
-    names = argv[:1] if argv[:1] and argv[0] in COMMANDS else list(COMMANDS)
     tyro.extras.subcommand_cli_from_dict(
-        {name: load(name) for name in names},
+        {name: load(name) for name in (COMMANDS if completing else (name,))},
         prog="gaponet",
-        description="Close the gap between simulated and real motors from joint logs.",
+        description=ABOUT,
         args=argv,
         sort_subcommands=False,
     )
+
+
+def overview() -> str:
+    """All commands by task, a line each, on one screen; nothing is imported for it."""
+    lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", "", ABOUT]
+    for task, commands in TASKS.items():
+        lines += ["", task]
+        lines += [f"  {name:<11}{_purpose(*where.split(':'))}" for name, where in commands.items()]
+    return "\n".join(lines)
+
+
+def _purpose(module: str, function: str) -> str:
+    """The first sentence of a command's docstring."""
+    spec = find_spec(module)
+    assert spec
+    assert spec.origin
+    tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
+    found = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
+    first = " ".join((ast.get_docstring(found) or "").split("\n\n")[0].split())
+    return shorten(first, WIDTH, placeholder=" …")
 
 
 def _say(text: str) -> int:

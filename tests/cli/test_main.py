@@ -1,0 +1,30 @@
+"""The command line as a whole."""
+
+import subprocess
+import sys
+
+from gaponet.cli.main import COMMANDS, main, overview
+
+
+def test_help_is_one_screen_with_a_sentence_for_every_command(capsys):
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= 120
+    for name in COMMANDS:
+        (line,) = [line for line in lines if line.startswith(f"  {name} ")]
+        assert len(line.split(maxsplit=1)[1]) > 20
+
+
+def test_help_imports_no_command():
+    code = (
+        "import sys; from gaponet.cli.main import overview; overview()\n"
+        "print({'tyro', 'torch', 'mujoco', 'gaponet.cli.train'} & {*sys.modules})"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "set()"
+    assert "gaponet COMMAND --help" in overview()
+
+
+def test_a_mistyped_command_is_told_its_neighbour(capsys):
+    assert main(["trian"]) == 2
+    assert capsys.readouterr().err == "Usage: no command 'trian'; do you mean train? gaponet --help lists them all\n"
