@@ -136,7 +136,7 @@ def doubts(spec: RobotSpec, load: np.ndarray) -> list[str]:
 
 
 def as_dict(spec: RobotSpec) -> dict[str, Any]:
-    """For JSON."""
+    """The check as a dictionary that JSON can hold."""
     return {
         "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,
         "joints": [

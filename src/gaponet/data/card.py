@@ -132,7 +132,7 @@ class Range:
 
 
 def _identity(dataset: Dataset) -> dict[str, Any]:
-    """What it is and where it comes from."""
+    """What the dataset is and where it comes from."""
     made = dataset.path / "collect.json"
     recorded = sorted({e.meta.recorded_at for e in dataset.entries} - {""})
     return {

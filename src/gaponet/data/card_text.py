@@ -13,7 +13,7 @@ ASK = "set with `gaponet data card DIR --{0} …`"
 
 
 def card_text(card: dict[str, Any]) -> str:
-    """All of it; the first line says whether robots were virtual."""
+    """The card as Markdown; the first line says whether robots were virtual."""
     return "\n".join(
         [f"# {markdown(headline(card))}", "", *_facts(card), *_shares(card), *_repeatability(card), *_signals(card)]
     )

@@ -34,7 +34,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
+        """The verdict in one sentence."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"Do not train on this yet: {errors} error(s) and {warnings} warning(s)."
@@ -43,7 +43,7 @@ class Diagnosis:
         return "Good: nothing found that training should not see."
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The diagnosis as a dictionary that JSON can hold."""
         return {
             "verdict": self.verdict,
             "findings": [asdict(f) for f in self.findings],

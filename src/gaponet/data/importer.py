@@ -255,7 +255,7 @@ def _relative(source: str, src: Path) -> str:
 
 
 def _sha256(files: tuple[str, ...]) -> str:
-    """Of a recording's files one after the other, in the order of their names (cat control.csv state_motor.csv)."""
+    """SHA-256 of a recording's files one after the other, by name (cat control.csv state_motor.csv)."""
     digest = hashlib.sha256()
     for file in files:
         digest.update(Path(file).read_bytes())

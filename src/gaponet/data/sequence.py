@@ -229,7 +229,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
 
 
 def _median_period(log: Log) -> float:
-    """Of the state, s; a clock that cannot be right is refused before anything is put on a grid."""
+    """Median period of the state, s; a clock that cannot be right is refused before anything is put on a grid."""
     time = log.channels["qpos"].time
     period = np.diff(time)
     median, longest = float(np.median(period)), int(period.argmax())

@@ -32,7 +32,7 @@ SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share
 
 @dataclass(frozen=True)
 class Torque:
-    """Of one sequence: per joint (n) least and greatest value, N·m, rows above the limit, rows that are spikes."""
+    """Torques of one sequence, per joint (n): least and greatest, N·m; rows above the limit; rows that are spikes."""
 
     low: Array
     high: Array
@@ -154,7 +154,7 @@ def _follows(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
 
 
 def _slope(ctrl: Array, qpos: Array, lag: Array, speed: Array) -> Array:
-    """Of the state over the command of `lag` rows ago; where a fast joint's lag is unknown, nothing is said."""
+    """Slope of the state over the command of `lag` rows ago; where a fast joint's lag is unknown, nothing is said."""
     slope = np.full(len(lag), np.nan)
     for j in np.flatnonzero((np.ptp(ctrl, axis=0) > SLOPE_RANGE) & ((lag > 0) | (speed < FAST))):
         steps = round(float(lag[j]))

@@ -40,7 +40,7 @@ SETTLE = 100  # control periods in which the shadow comes to rest at a start
 
 @dataclass(frozen=True)
 class CompensatorConfig:
-    """How the robot is made to follow."""
+    """Settings of the compensator."""
 
     aim: Literal["target", "simulator"] = "target"
     """target: the commanded positions. simulator: what the nominal simulator makes of them."""
@@ -55,9 +55,9 @@ class CompensatorConfig:
     gain: float = 0.5
     """γ of an iteration; 0.5 converges wherever a change of u changes u + G(u) by a factor between 0 and 4."""
     iterations: int = 2
-    """Per control period, from the last period's answer; 0 leaves the model out."""
+    """Iterations per control period, which begin at the last period's answer; 0 leaves the model out."""
     feedback: float = 0.5
-    """Integration of what is still missing, 1/s; 0 for none."""
+    """Rate at which the remaining error is integrated, 1/s; 0 for none."""
     feedback_time: float = 0.5
     """Time constant of the low-pass before the integrator, s."""
     feedback_limit: float = 0.1
@@ -65,7 +65,7 @@ class CompensatorConfig:
     limit: float = 0.5
     """Largest |u − a|, rad."""
     blend: float = 1.0
-    """From uncompensated to compensated after a start, s."""
+    """Time in which compensation is blended in after a start, s."""
     lead: int = 0
     """How many control periods early targets are given, where the motion is known ahead. Zero is causal."""
 

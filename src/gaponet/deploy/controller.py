@@ -66,7 +66,7 @@ def require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
 
 
 class Controller:
-    """One run on one robot."""
+    """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end."""
 
     def __init__(
         self,

@@ -59,11 +59,11 @@ class Guard:
             raise DriverError("the guard process could not reach the robot; see its message above")
 
     def alive(self) -> bool:
-        """Whether it runs and has not taken this process for dead or hanging."""
+        """Whether the guard runs and has not taken this process for dead or hanging."""
         return self._process.poll() is None and not self.fired()
 
     def fired(self) -> bool:
-        """Whether it damps the robot, or has: nothing more may be sent."""
+        """Whether the guard damps the robot or has damped it: nothing more may be sent."""
         if not self._fired and select.select([self._out], [], [], 0)[0]:
             self._fired = self._out.readline() == FIRED
         return self._fired

@@ -38,11 +38,11 @@ class SafetyConfig:
     """Limits and watchdogs."""
 
     margin: float = 0.02
-    """rad kept from each end of a joint's range."""
+    """Distance kept from each end of a joint's range, rad."""
     speed: float = 5.0
     """Fastest change of a command, rad/s."""
     torque_share: float = 0.95
-    """Of a joint's effort limit that a command may ask for."""
+    """Share of a joint's effort limit that a command may ask for."""
     acceleration: float = 50.0
     """Fastest acceleration of a joint, rad/s²: how wrong an old state may be."""
     delta: float = 0.5
@@ -54,13 +54,13 @@ class SafetyConfig:
     frozen: int = 2
     """Control periods with new messages but equal readings until a state counts as frozen; 0: never."""
     frozen_travel: float = 0.3
-    """Where readings may repeat (coarse encoders): rad that a command moves while nothing moves, until that counts."""
+    """How far a command may move while nothing moves, rad, on coarse encoders whose readings may repeat."""
     frozen_joint: float = 0.1
-    """Where they do not: rad by which one joint's command or its velocity moves on while its position stands still."""
+    """How far one joint's command or velocity may move on while its position stands still, rad, on fine encoders."""
     joint_speed: float = 12.0
     """A joint that moves faster between two states has jumped, rad/s."""
     jump: float = 0.05
-    """rad allowed beyond that."""
+    """Distance allowed beyond that before it counts as a jump, rad."""
     temperature: float = 85.0
     """Hottest motor, °C."""
     tilt: float = 0.7

@@ -167,7 +167,7 @@ def by_take(entries: list[Entry]) -> dict[tuple[Any, ...], list[Entry]]:
 
 
 def liveliest(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
-    """Of the takes with the most payloads, the one in which the torques of the operated joints change most."""
+    """The take whose torques at the operated joints change most, among those with the most payloads."""
     groups = [g for g in by_take(dataset.entries).values() if all("tau" in e.channels for e in g)]
     if not groups:
         raise _Nothing("no torque was recorded")

@@ -138,7 +138,7 @@ class Seen:
 
     @classmethod
     def by(cls, run: Path) -> Seen:
-        """By this run."""
+        """What this run has seen."""
         model, split = GapModel.load(run), read_split(run)
         used = ("train", "val")
         hashes = {h for part in used for h in split[part].values()}

@@ -21,7 +21,7 @@ GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
 
 class Error(TypedDict):
-    """Of a joint, a payload, a horizon or a motion, rad."""
+    """The error of a joint, a payload, a horizon or a motion, rad."""
 
     mpjae: Number
 
@@ -77,7 +77,7 @@ class Metrics(TypedDict):
 
 
 class PPO(TypedDict):
-    """What a report says of it."""
+    """What a report says of PPO."""
 
     num_envs: int
     epochs: int
@@ -85,7 +85,7 @@ class PPO(TypedDict):
 
 
 class Model(TypedDict):
-    """What a list of runs says of it."""
+    """What a list of runs says of the model."""
 
     kind: Method
 
@@ -171,7 +171,7 @@ Step = Literal["nominal", "delay", "offset", "identified", "inverse", "mlp", "tr
 
 
 class Floor(TypedDict):
-    """Of encoder and repeatability together, rad."""
+    """The error that encoder and repeatability hide together, rad."""
 
     both: Number
 

@@ -111,7 +111,7 @@ class Card(TypedDict):
     kd: tuple[float, ...]
     simulator: NotRequired[str]
     simulator_hash: NotRequired[str]
-    """Of the MJCF's text, in cards written before November 2026."""
+    """Hash of the MJCF's text, in cards written before November 2026."""
     model: dict[str, Json]
     qpos_range: NotRequired[tuple[tuple[float | None, float | None], ...]]
     dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
@@ -307,5 +307,5 @@ class GapModel:
 
 
 def sha256(file: Path) -> str:
-    """Of a file's content, 64 hex digits."""
+    """SHA-256 of a file's content, 64 hex digits."""
     return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -70,7 +70,7 @@ class Take:
     repetition: int
 
     def seed(self, base: int) -> int:
-        """Of everything random in this take."""
+        """Seed of everything random in this take."""
         return int(hashlib.sha256(repr((base, self)).encode()).hexdigest()[:16], 16)
 
 

@@ -73,7 +73,7 @@ def descend(
 
 
 def weights(errors: Array) -> Array:
-    """Of soft_l1."""
+    """Weights of the errors that give the soft_l1 loss."""
     return np.asarray(1 / np.sqrt(1 + (errors / SOFT) ** 2))
 
 

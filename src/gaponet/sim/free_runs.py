@@ -136,7 +136,7 @@ class FreeRuns:
         )
 
     def rms(self, errors: Array) -> float:
-        """Of the simulated errors, rad."""
+        """Root mean square of the simulated errors, rad."""
         return float(np.sqrt((errors[: self.rows] ** 2).mean()))
 
     def errors(self, xs: Array) -> Array:

@@ -54,7 +54,7 @@ class Row:
     factor: str
     setting: str
     word: str
-    """Of study.variant; DEFAULT where the setting is the default's."""
+    """The word that study.variant reads; DEFAULT where the setting is the default's."""
     paper: tuple[float, float] | None = None
 
 

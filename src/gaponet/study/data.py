@@ -28,7 +28,7 @@ class Data:
     """Error against hours of training data: how much must be recorded?"""
 
     models: tuple[str, ...] = MODELS
-    """As of gaponet compare."""
+    """Models, written as for gaponet compare."""
     shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
     """Parts of the training motions."""
     holdout_units: tuple[str, ...] = ()

@@ -35,7 +35,7 @@ class Question(Protocol):
         """The trainings that are needed, each word and seed once."""
 
     def result(self, study: Study, found: Found) -> Result:
-        """What they say."""
+        """The result that the finished cells give."""
 
 
 @dataclass(frozen=True)

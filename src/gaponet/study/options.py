@@ -24,12 +24,12 @@ QUICK_BUDGET, QUICK_SEEDS = "2560", 1
 
 @dataclass(frozen=True)
 class Options:
-    """Of all experiments that train."""
+    """Options of all experiments that train."""
 
     seeds: int | None = None
-    """How many, counted from --seed; 3, with --quick 1."""
+    """How many seeds, counted from --seed; 3, with --quick 1."""
     budget: str | None = None
-    """Of each training: time such as 90s or 10m, or control steps; 76800, with --quick 2560."""
+    """How long each training takes: time such as 90s or 10m, or control steps; 76800, with --quick 2560."""
     workers: int = 0
     """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -37,6 +37,6 @@ class Options:
     robot: str | None = None
     """Robot name or folder, if not the one that the dataset keeps; all models correct it."""
     json: tyro.conf.FlagCreatePairsOff[bool] = False
-    """One JSON object on stdout."""
+    """Print one JSON object on stdout."""
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TRAINING
-    """Of all models; rows of a table change one thing in it."""
+    """Settings of all models; rows of a table change one thing in them."""

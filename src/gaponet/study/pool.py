@@ -58,12 +58,12 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the cell for people: model and seed."""
         return f"{self.variant.name} seed {self.seed}"
 
     @property
     def done(self) -> bool:
-        """Whether it is trained and evaluated."""
+        """Whether the cell is trained and evaluated."""
         return (self.folder / RESULT).is_file()
 
     def setup(self, data: Dataset) -> dict[str, Any]:

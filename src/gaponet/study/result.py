@@ -22,18 +22,18 @@ VERSIONS = ("gaponet", "mujoco", "numpy", "torch")
 
 @dataclass(frozen=True)
 class Result:
-    """Of one experiment."""
+    """Everything that one experiment found."""
 
     name: str
-    """Of its files."""
+    """Stem of the names of its files."""
     title: str
     virtual: str
     """Whose numbers these are, as a sentence (label())."""
     facts: Mapping[str, Any]
-    """What it takes to repeat it (facts())."""
+    """Facts that a reader needs to repeat it (facts())."""
     tables: tuple[Table, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    """By name."""
+    """Figures by name."""
     sentences: tuple[str, ...] = ()
     """What the numbers say, made from them."""
 

@@ -46,7 +46,7 @@ class Study:
     config: TrainConfig = TRAINING
     budget: str = BUDGET
     seeds: int = SEEDS
-    """How many, counted from config.seed."""
+    """How many seeds, counted from config.seed."""
     holdout_units: tuple[str, ...] = ()
     workers: int = 0
     """Processes at once; 0 for as many as there are cores."""

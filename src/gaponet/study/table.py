@@ -20,12 +20,12 @@ class Spread:
 
     mean: float
     std: float
-    """Of the sample (n − 1); NaN for a single value."""
+    """Standard deviation of the sample (n − 1); NaN for a single value."""
     count: int
 
     @classmethod
     def of(cls, values: Iterable[float], scale: float = 1.0) -> Spread:
-        """Of seeds, units or motions; scale 1e3 makes mrad of rad. No values at all give a blank cell."""
+        """The spread over seeds, units or motions; scale 1e3 makes mrad of rad. No values at all give a blank cell."""
         found = np.array([v for v in values if math.isfinite(v)]) * scale
         std = float(found.std(ddof=1)) if len(found) > 1 else math.nan
         return cls(float(found.mean()) if len(found) else math.nan, std, len(found))
@@ -46,7 +46,7 @@ class Table:
 
     name: str
     columns: tuple[str, ...]
-    """With units: "MPJAE, mrad"."""
+    """Heading with its unit: "MPJAE, mrad"."""
     rows: tuple[tuple[Any, ...], ...]
     """Text, whole numbers, numbers, Spread; None is blank."""
     caption: str = ""

@@ -25,11 +25,11 @@ class Unit:
     """Leave one unit out, each in turn: how well is a unit served that training never saw?"""
 
     models: tuple[str, ...] = MODELS
-    """As of gaponet compare."""
+    """Models, written as for gaponet compare."""
     holdout_units: ClassVar[tuple[str, ...]] = ()
 
     def cells(self, study: Study) -> list[Cell]:
-        """Of each fold, in OUT/without-UNIT/cells."""
+        """The trainings of each fold, kept in OUT/without-UNIT/cells."""
         folds = (
             replace(study, holdout_units=(u,)).cells(self.models, into=f"without-{u}") for u in units_of(study.data)
         )

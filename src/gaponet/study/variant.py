@@ -24,19 +24,19 @@ class Variant:
     """One method of a comparison."""
 
     name: str
-    """As it was written."""
+    """The word as the user wrote it."""
     config: TrainConfig
     identified: bool = False
     """Whether it corrects the identified simulator instead of the one given."""
 
     @property
     def kind(self) -> str:
-        """Of the model."""
+        """The kind of the model: gaponet, mlp, …"""
         return self.config.model.kind
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """What was said beyond the kind, as FIELD=VALUE."""
+        """The fields that the word changes, as FIELD=VALUE."""
         return tuple(self.name.split(":")[1:])
 
 

@@ -93,7 +93,7 @@ class Kept:
     trained_state: State
     best: float = float("inf")
     trained: float = float("inf")
-    """Of the best that was fitted, with gain 1."""
+    """Validation error of the best network that was fitted, with gain 1."""
     val: float = float("nan")
     steps: int = 0
     seconds: float = 0.0
@@ -103,7 +103,7 @@ class Kept:
     sensor_r2: Report | None = None
     runner: State | None = None
     env: State | None = None
-    """Of PPO's environments."""
+    """State of PPO's environments."""
     warm: State | None = None
     progress: list[dict[str, Any]] = field(default_factory=list)
     """Lines of progress.jsonl."""

@@ -21,7 +21,7 @@ KINDS = (".gif", ".mp4", ".png")
 
 @dataclass(frozen=True)
 class Clip:
-    """Which times of the recording are shown, and how fast."""
+    """The times of the recording that are shown, and how fast."""
 
     start: float
     """s into the recording."""

@@ -36,7 +36,7 @@ class Layout:
 
     @property
     def height(self) -> int:
-        """All of it."""
+        """Height of the whole picture, pixels."""
         return self.head + self.robots + self.labels + self.course
 
     @classmethod

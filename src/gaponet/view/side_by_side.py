@@ -39,7 +39,7 @@ class Motion:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name of the copy for people."""
         return title(self.method)
 
     @property

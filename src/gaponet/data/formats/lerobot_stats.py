@@ -9,7 +9,7 @@ EpisodeStats = dict[str, dict[str, Array]]  # {feature: {min, max, mean, std (n)
 
 
 def episode_stats(columns: dict[str, Array]) -> EpisodeStats:
-    """Of one episode's columns, (T, n) or (T)."""
+    """Statistics of one episode's columns, (T, n) or (T)."""
     stats = {}
     for name, values in columns.items():
         x = values.reshape(len(values), -1).astype(float)
@@ -21,7 +21,7 @@ def episode_stats(columns: dict[str, Array]) -> EpisodeStats:
 
 
 def pool(episodes: list[EpisodeStats]) -> EpisodeStats:
-    """Of all frames together, from those of the episodes."""
+    """Statistics of all frames together, from those of the episodes."""
     pooled = {}
     for name in episodes[0]:
         parts = {k: np.stack([e[name][k] for e in episodes]) for k in episodes[0][name]}

@@ -86,7 +86,7 @@ class Stream(Protocol):
 
 
 def checksum(body: bytes) -> int:
-    """Of everything between FF FF and itself."""
+    """Inverted sum of all bytes between FF FF and the checksum."""
     return ~sum(body) & 0xFF
 
 
@@ -112,7 +112,7 @@ class ServoBus:
         self._tag = 0
 
     def ping(self, servo: int) -> bool:
-        """Whether it answers."""
+        """Whether the servo answers."""
         return bool(self._ask(PING, [servo]))
 
     def read(self, servo: int, register: Register) -> int:
@@ -131,12 +131,12 @@ class ServoBus:
         return self._ask(SYNC_READ, list(servos), block.address, block.size)
 
     def sync_write(self, register: Register, values: dict[int, int]) -> None:
-        """One register of several servos; nobody acknowledges."""
+        """Write one register of several servos; nobody acknowledges."""
         parameters = b"".join(bytes([servo]) + register.encode(value) for servo, value in values.items())
         self.stream.write(packet(BROADCAST, SYNC_WRITE, bytes([register.address, register.size]) + parameters))
 
     def broadcast(self, register: Register, value: int) -> None:
-        """One register of every servo there is, whatever its number; nobody acknowledges."""
+        """Write one register of every servo there is, whatever its number; nobody acknowledges."""
         self.stream.write(packet(BROADCAST, WRITE, bytes([register.address]) + register.encode(value)))
 
     def _ask(self, instruction: int, servos: list[int], address: int = 0, size: int = 0) -> dict[int, bytes]:

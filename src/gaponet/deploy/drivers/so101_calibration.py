@@ -91,7 +91,7 @@ def read_calibration(path: str | Path, robot: RobotSpec) -> Calibration:
 
 
 def numbered(robot: RobotSpec) -> Calibration:
-    """Of an arm of which only the servos' numbers are known, 1 to 6."""
+    """Calibration of an arm of which only the servos' numbers are known, 1 to 6."""
     whole = {joint: Row(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS - 1)
              for i, joint in enumerate(SPEAK)}  # fmt: skip
     return Calibration(whole, robot)

@@ -47,7 +47,7 @@ class Heard:
     qvel: list[Array] = field(default_factory=list)
 
     def save(self, path: Path) -> None:
-        """As npz."""
+        """Write what was heard as npz."""
         np.savez_compressed(path, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
 
 

@@ -58,7 +58,7 @@ class Placed:
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one trajectory: motor torque over the holds, RMS of the operated joints, N·m; mean rise of windings, K."""
+    """Cost of one trajectory: motor torque over the holds, RMS over operated joints, N·m; mean rise of windings, K."""
 
     method: str
     seed: int | None

@@ -49,7 +49,7 @@ class Delivery(Playing):
     front: float = 0.1
     """Goals lie at least so far in front of the robot's base, m."""
     goal_seed: int = 0
-    """Of the goals."""
+    """Seed of the goals."""
 
     def require(self, data: Dataset) -> None:
         """Refuse short holds, and recordings of real robots, of which no unit can be played."""

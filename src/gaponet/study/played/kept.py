@@ -48,7 +48,7 @@ class Kept:
 
     @cached_property
     def _common(self) -> str:
-        """Of what all parts depend on, which may be long: every motion, say."""
+        """Digest of what all parts depend on, which may be long: every motion, say."""
         return _digest([__version__, self.facts])
 
 

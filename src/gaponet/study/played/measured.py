@@ -35,17 +35,17 @@ M = TypeVar("M", bound=Measured)
 
 
 def methods(found: Iterable[Measured]) -> list[str]:
-    """In the order in which they were measured."""
+    """Methods in the order in which they were measured."""
     return list(dict.fromkeys(m.method for m in found))
 
 
 def payloads(found: Iterable[Measured]) -> list[float]:
-    """From light to heavy, kg."""
+    """Payloads from light to heavy, kg."""
     return sorted({m.payload for m in found})
 
 
 def of(found: Iterable[M], method: str | None = None, payload: float | None = None) -> list[M]:
-    """Those of a method, of a payload, or of both."""
+    """Measurements of a method, of a payload, or of both."""
     return [m for m in found if method in (None, m.method) and payload in (None, m.payload)]
 
 

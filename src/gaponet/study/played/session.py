@@ -34,7 +34,7 @@ class Playing:
     """Run folders, or folders of them such as gaponet compare's cells; without any, GAPONet and the MLP are trained
     here, in OUT/cells."""
     unit: str = ""
-    """Of the fleet; default one that no model was trained on."""
+    """Unit of the fleet that plays; by default one that no model was trained on."""
     fleet: str = "default"
     """Virtual units: default, shifted, or a .toml file."""
     payloads: tuple[float, ...] = ()
@@ -83,7 +83,7 @@ class Session:
         cls, asked: Playing, data: Dataset, whole: Dataset, robot: RobotSpec, runs: tuple[Path, ...], out: Path,
         quick: bool,
     ) -> Session:  # fmt: skip
-        """With the models of these runs; of one seed in a rehearsal."""
+        """A session with the models of these runs; a rehearsal takes one seed."""
         trained = load_trained(runs, robot)
         if quick:
             trained = [t for t in trained if t.seed == trained[0].seed]

@@ -59,7 +59,7 @@ class Tracking(Playing):
     """How many motions are made for the experiment."""
 
     def play(self, session: Session, tell: Tell) -> Result:
-        """On the unit; with recordings of a real robot, alignment alone."""
+        """Play the motions on the unit; recordings of a real robot allow alignment alone."""
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
             entries, unseen = choose([t.run for t in trained], session.data)
@@ -207,7 +207,7 @@ def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
 
 
 def over_motions(scores: ListOf[Score]) -> list[Once]:
-    """Of each joint the mean over motions, seeds averaged, and its standard error."""
+    """Mean over motions and its standard error for each joint, seeds averaged first."""
     by_motion: dict[str, list[Any]] = {}
     for s in scores:
         by_motion.setdefault(s.motion, []).append(s.q_dis)
