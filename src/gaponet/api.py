@@ -236,9 +236,9 @@ def train(
         ModelError: The budget bought no training step.
     """
     from gaponet.files import writing
-    from gaponet.training.budget import Budget
+    from gaponet.training.budget import Budget, Status
     from gaponet.training.config import TrainConfig
-    from gaponet.training.run import Status, Trainer
+    from gaponet.training.run import Trainer
 
     data, spec = open_dataset(dataset, robot)
     config = config or TrainConfig()

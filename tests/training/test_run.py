@@ -101,7 +101,7 @@ def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tm
         assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
     result = evaluate([run, tmp_path / "run"], data, robot).result
     assert [m for m in result["methods"] if m in LEARNED] == [kind, "gaponet"]
-    assert set(ORDER) | {"target", "recorded"} == set(NAMES) == set(COLOURS)
+    assert set(ORDER) | {"target", "recorded"} <= set(NAMES) == set(COLOURS)
 
 
 @pytest.mark.parametrize(

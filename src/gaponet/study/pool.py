@@ -132,7 +132,8 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
 
     from gaponet.model.artifact import GapModel
     from gaponet.model.deeponet import build_network
-    from gaponet.training.run import Status, Trainer
+    from gaponet.training.budget import Status
+    from gaponet.training.run import Trainer
 
     torch.set_num_threads(cell.threads)
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)

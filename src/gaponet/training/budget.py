@@ -1,4 +1,4 @@
-"""How long to train: wall-clock time or control steps."""
+"""How long to train, wall-clock time or control steps, and where training stands."""
 
 from __future__ import annotations
 
@@ -34,3 +34,22 @@ class Budget:
     def spent(self, seconds: float, steps: int) -> float:
         """Share of the budget used, 1 when it is out."""
         return seconds / self.seconds if self.seconds is not None else steps / (self.steps or 1)
+
+
+@dataclass(frozen=True)
+class Status:
+    """What a progress bar shows."""
+
+    stage: str
+    fraction: float
+    steps: int
+    seconds: float
+    reward: float
+    val_mpjae: float
+    best_mpjae: float
+    nominal_mpjae: float
+
+    @property
+    def throughput(self) -> float:
+        """Control steps per second, validation and set-up included."""
+        return self.steps / max(self.seconds, 1e-9)

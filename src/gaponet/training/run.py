@@ -16,7 +16,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -41,8 +41,8 @@ from gaponet.robot import RobotSpec
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
-from gaponet.structure import parse_json, validated
-from gaponet.training.budget import Budget
+from gaponet.structure import validated
+from gaponet.training.budget import Budget, Status
 from gaponet.training.checkpoint import (
     State,
     env_state,
@@ -50,65 +50,20 @@ from gaponet.training.checkpoint import (
     restore_warm,
     round_state,
     warm_state,
-    write_state,
 )
 from gaponet.training.config import TrainConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.gain import choose_gain
 from gaponet.training.inverse import inverse_labels
+from gaponet.training.kept import Kept
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import make_runner, trained_by, update
-from gaponet.training.sensor_fit import Report, points_of, report_of
+from gaponet.training.sensor_fit import points_of, torch_infer
 from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
 Array = np.ndarray
 
 VALIDATION_RUNS = 24  # free runs per validation at most, evenly picked
-
-
-@dataclass(frozen=True)
-class Status:
-    """What a progress bar shows."""
-
-    stage: str
-    fraction: float
-    steps: int
-    seconds: float
-    reward: float
-    val_mpjae: float
-    best_mpjae: float
-    nominal_mpjae: float
-
-    @property
-    def throughput(self) -> float:
-        """Control steps per second, validation and set-up included."""
-        return self.steps / max(self.seconds, 1e-9)
-
-
-@dataclass
-class Kept:
-    """What a run remembers: with the network and the random numbers, its checkpoint."""
-
-    best_state: State
-    trained_state: State
-    best: float = float("inf")
-    trained: float = float("inf")
-    """Validation error of the best network that was fitted, with gain 1."""
-    val: float = float("nan")
-    steps: int = 0
-    seconds: float = 0.0
-    """Trained up to the last checkpoint."""
-    rounds_done: int = 0
-    updates: int = 0
-    sensor_r2: Report | None = None
-    runner: State | None = None
-    env: State | None = None
-    """State of PPO's environments."""
-    warm: State | None = None
-    progress: list[dict[str, Any]] = field(default_factory=list)
-    """Lines of progress.jsonl."""
-    dataset: str = ""
-    """Hash of its recordings."""
 
 
 class Trainer:
@@ -155,7 +110,7 @@ class Trainer:
         self.began = time.monotonic()
         with writing(out, "run"):
             if resume:
-                self._load()
+                self.kept, self.rng = Kept.read(out, self.net, self.kept.dataset)
             self._write_config(holdout_units, resume)
         self.loggers = Loggers(log, out, asdict(config))
 
@@ -344,30 +299,7 @@ class Trainer:
 
     def _save(self) -> None:
         self.kept.seconds, self.began = self.seconds(), time.monotonic()
-        state = vars(self.kept) | {"net": self.net.state_dict(), "rng": torch.get_rng_state()}
-        write_state(self.out / "checkpoint.pt", state)
-        self._write_progress()
-
-    def _write_progress(self) -> None:
-        write_text(self.out / "progress.jsonl", "".join(json.dumps(line) + "\n" for line in self.kept.progress))
-
-    def _load(self) -> None:
-        try:
-            state = torch.load(self.out / "checkpoint.pt", weights_only=True)
-            self.net.load_state_dict(state.pop("net"))
-            self.rng = state.pop("rng")
-            self.kept = Kept(**state)
-        except Exception as error:  # torch and its unpickler raise of every kind
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
-            raise ModelError(f"{self.out}/checkpoint.pt: does not fit this model or is damaged ({reason})") from None
-        self.kept.sensor_r2 = report_of(self.kept.sensor_r2)
-        torch.set_rng_state(self.rng)
-        if not self.kept.progress:  # of a run from before checkpoints had it
-            file = self.out / "progress.jsonl"
-            lines = file.read_bytes().splitlines()
-            self.kept.progress = [parse_json(dict[str, Any], line, file, ModelError) for line in lines]
-        if self.kept.dataset not in ("", dataset_hash(self.dataset.entries)):
-            raise UsageError(f"{self.out}: was trained on other recordings than {self.dataset.path} holds; train anew")
+        self.kept.write(self.out, self.net)
 
     def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
         config = asdict(self.config) | {
@@ -380,7 +312,7 @@ class Trainer:
             save_robot(self.robot, kept)
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
-        self._write_progress()
+        self.kept.write_progress(self.out)
 
     def _conditions(self) -> set[tuple[float, str, float]]:
         return {(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.train_set}
@@ -426,14 +358,3 @@ def _parts(dataset: Dataset, config: TrainConfig, holdout_units: tuple[str, ...]
             "--rates and --train-share, or make another split with gaponet data split"
         )
     return read_split(config.split, dataset)
-
-
-def torch_infer(net: torch.nn.Module) -> Callable[[Array], Array]:
-    """A network as a function of numpy arrays, for validation while training."""
-    net.eval()
-
-    def infer(x: Array) -> Array:
-        with torch.inference_mode():
-            return net(torch.from_numpy(x)).numpy()
-
-    return infer

@@ -182,3 +182,14 @@ def points_of(net: DeltaNet) -> Infer | None:
             return net.offsets(torch.from_numpy(x)).numpy()  # type: ignore[operator]
 
     return infer
+
+
+def torch_infer(net: torch.nn.Module) -> Infer:
+    """A network as a function of numpy arrays, for validation while training."""
+    net.eval()
+
+    def infer(x: Array) -> Array:
+        with torch.inference_mode():
+            return net(torch.from_numpy(x)).numpy()
+
+    return infer

@@ -1,0 +1,84 @@
+"""What a run remembers: with the network and the random numbers, its checkpoint."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gaponet.errors import ModelError, UsageError
+from gaponet.files import write_text
+from gaponet.model.layers import DeltaNet
+from gaponet.structure import parse_json
+from gaponet.training.checkpoint import State, write_state
+from gaponet.training.sensor_fit import Report, report_of
+
+CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
+
+
+@dataclass
+class Kept:
+    """The best networks so far, what was done, and where the stages stand."""
+
+    best_state: State
+    trained_state: State
+    best: float = float("inf")
+    trained: float = float("inf")
+    """Validation error of the best network that was fitted, with gain 1."""
+    val: float = float("nan")
+    steps: int = 0
+    seconds: float = 0.0
+    """Trained up to the last checkpoint."""
+    rounds_done: int = 0
+    updates: int = 0
+    sensor_r2: Report | None = None
+    runner: State | None = None
+    env: State | None = None
+    """State of PPO's environments."""
+    warm: State | None = None
+    progress: list[dict[str, Any]] = field(default_factory=list)
+    """Lines of progress.jsonl."""
+    dataset: str = ""
+    """Hash of its recordings."""
+
+    def write(self, out: Path, net: DeltaNet) -> None:
+        """Write the checkpoint, and progress.jsonl beside it."""
+        write_state(out / CHECKPOINT, vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()})
+        self.write_progress(out)
+
+    def write_progress(self, out: Path) -> None:
+        """Write progress.jsonl anew."""
+        write_text(out / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.progress))
+
+    @classmethod
+    def read(cls, out: Path, net: DeltaNet, dataset: str) -> tuple[Kept, torch.Tensor]:
+        """Read a checkpoint: into the network, into torch's random numbers, and the rest.
+
+        Args:
+            out: Run folder.
+            net: Takes the weights.
+            dataset: Hash of the recordings to go on with.
+
+        Raises:
+            ModelError: Damaged, or of another network.
+            UsageError: Trained on other recordings.
+        """
+        try:
+            state = torch.load(out / CHECKPOINT, weights_only=True)
+            net.load_state_dict(state.pop("net"))
+            rng = state.pop("rng")
+            kept = cls(**state)
+            torch.set_rng_state(rng)
+        except Exception as error:  # torch and its unpickler raise of every kind
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            raise ModelError(f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})") from None
+        if kept.dataset not in ("", dataset):
+            raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
+        kept.sensor_r2 = report_of(kept.sensor_r2)
+        if not kept.progress:  # of a run from before checkpoints had it
+            lines = (out / PROGRESS).read_bytes().splitlines()
+            kept.progress = [parse_json(dict[str, Any], line, out / PROGRESS, ModelError) for line in lines]
+        return kept, rng
