@@ -8,7 +8,7 @@ import pytest
 from arm import TOML, commands, record, write_arm
 from runs import untrained
 
-from gaponet.cli.inputs import open_dataset
+from gaponet.api import open_dataset
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError

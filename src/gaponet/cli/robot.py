@@ -59,8 +59,8 @@ def list_robots(out: Out) -> None:
 
 def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: float) -> None:
     """How a robot's states arrive, and who publishes what; nothing is sent."""
+    from gaponet.deploy.drivers.link import measure
     from gaponet.deploy.drivers.open import open_driver
-    from gaponet.deploy.link import measure
 
     driver = open_driver(kind, name, **options)
     try:

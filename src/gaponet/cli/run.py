@@ -132,7 +132,7 @@ def run(
 def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     """Make everything, ask, run, and say how it went."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
-    from gaponet.deploy.controller import Controller, play, require_commanded
+    from gaponet.deploy.controller import Controller, play
     from gaponet.deploy.drivers.dry import DryRun
 
     spec = asked_robot(asked)
@@ -140,7 +140,7 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     clock = SimulatedClock() if fast else MonotonicClock()
     motion = find_motion(asked, spec)
     driver, facts = make_driver(asked, spec, clock, motion)
-    require_commanded(motion, spec, driver)
+    _require_commanded(motion, spec, driver)
     if asked.dry_run:
         driver = DryRun(driver)
     compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
@@ -166,6 +166,16 @@ def asked_robot(asked: Request) -> RobotSpec:
     from gaponet.robot import load_robot
 
     return load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
+
+
+def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
+    """Refuse a motion that moves joints which the driver does not command."""
+    left = [name for name in motion.moved(robot) if name not in driver.commanded]
+    if left:
+        raise UsageError(
+            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
+            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
+        )
 
 
 def find_motion(asked: Request, robot: RobotSpec) -> Motion:

@@ -33,7 +33,7 @@ Array = np.ndarray
 Policy = Callable[[int, State], Array | None]  # period since the start of the run, state → targets (n) rad; None: end
 
 
-class Compensator(Protocol):
+class Compensates(Protocol):
     """Changes a target so that the robot ends up where the target says (deploy.compensator). All joints, (n)."""
 
     def reset(self, target: Array, payload_mass: float | None = None) -> None:
@@ -55,16 +55,6 @@ def play(motion: Motion, dt: float) -> Policy:
     return lambda k, state: rows[k] if k < len(rows) else None
 
 
-def require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
-    """Refuse a motion that moves joints which the driver does not command."""
-    left = [name for name in motion.moved(robot) if name not in driver.commanded]
-    if left:
-        raise UsageError(
-            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
-            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
-        )
-
-
 class Controller:
     """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end."""
 
@@ -74,7 +64,7 @@ class Controller:
         robot: RobotSpec,
         config: ControlConfig | None = None,
         safety: SafetyConfig | None = None,
-        compensator: Compensator | None = None,
+        compensator: Compensates | None = None,
         clock: Clock | None = None,
         guard: bool = True,
         payload_mass: float | None = None,

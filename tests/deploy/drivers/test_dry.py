@@ -8,9 +8,9 @@ from gaponet.cli.main import main
 from gaponet.deploy.clock import SimulatedClock
 from gaponet.deploy.controller import Controller, play
 from gaponet.deploy.drivers.dry import DryRun, would_send
+from gaponet.deploy.drivers.link import measure
 from gaponet.deploy.drivers.open import open_driver
 from gaponet.deploy.drivers.virtual import VirtualDriver
-from gaponet.deploy.link import measure
 from gaponet.deploy.phases import ControlConfig
 from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion

@@ -13,128 +13,29 @@ its units, periods and metadata itself. Images and videos are left alone.
 
 from __future__ import annotations
 
-import os.path
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, cast
+from typing import Any
 
 import numpy as np
-from annotated_types import Interval, Len
-from typing_extensions import TypedDict
 
 from gaponet.data.formats import refuse_absurd, to_radians
+from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
 from gaponet.data.log import Channel, Log
-from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import JointMismatchError, LogError, UsageError
 from gaponet.robot import RobotSpec
-from gaponet.structure import parse_json, read_json, validated
 
 Array = np.ndarray
 
 OPTIONS = ("position_unit",)
-VERSION = "v3.0"
-FEATURES = {
-    "ctrl": "action",
-    "qpos": "observation.state",
-    "qvel": "observation.velocity",
-    "qacc": "observation.acceleration",
-    "tau": "observation.torque",
-    "tau_eq": "observation.equivalent_torque",
-    "temperature": "observation.temperature",
-}
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
-OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
 INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
-STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
-LATER = ("kp", "kd")  # not in the first exports
-
-
-AGAIN = "download or export it again"
-
-Name = Annotated[str, Len(1, 200)]
-Count = Annotated[int, Interval(ge=0, le=10**9)]
-Place = Annotated[int, Interval(ge=0, le=10**6)]
-
-
-class Info(TypedDict):
-    """meta/info.json, what is read of it."""
-
-    codebase_version: Name
-    fps: Annotated[float, Interval(ge=1, le=10_000)]
-    data_path: Annotated[str, Len(1, 500)]
-    features: dict[str, Any]
-
-
-class Feature(TypedDict):
-    """One of its features; names are a list, or a list in a dictionary, often with .pos behind each."""
-
-    shape: Annotated[list[Annotated[int, Interval(ge=1, le=1000)]], Len(1, 2)]
-    names: list[Name] | dict[str, Any] | None
-    info: NotRequired[dict[str, Any] | None]
-
-
-# One row of meta/episodes; beside it, in what gaponet exported, the fields of SequenceMeta.
-Episode = TypedDict("Episode", {
-    "episode_index": Count, "length": Annotated[int, Interval(ge=1, le=10**8)],
-    "data/chunk_index": Place, "data/file_index": Place, "tasks": NotRequired[list[str] | None],
-})  # fmt: skip
-NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
-
-
-class Task(TypedDict):
-    """One row of meta/tasks."""
-
-    index: Count
-    text: str
-
-
-class Stated(TypedDict):
-    """What a dataset says of itself."""
-
-    licence: NotRequired[str]
-    source: NotRequired[str]
-
-
-class Ours(TypedDict):
-    """gaponet.json, what is read of it."""
-
-    dt: Annotated[float, Interval(ge=1e-4, le=1)]
-    dataset: Stated
-
-
-@dataclass(frozen=True)
-class Set:
-    """One LeRobot folder: its info.json, its features that are read, its episodes; ours is None for a stock set."""
-
-    path: Path
-    info: Info
-    features: dict[str, Feature]
-    episodes: list[dict[str, Any]]
-    ours: Ours | None
-
-    @property
-    def dt(self) -> float:
-        """s, exact."""
-        return self.ours["dt"] if self.ours else 1 / self.info["fps"]
-
-    def data_file(self, episode: dict[str, Any]) -> Path:
-        """Where the frames of an episode are; never outside the set."""
-        given = self.info["data_path"]
-        number = lambda m: f"{episode[f'data/{m[1]}']:0{m[2] or 0}d}"  # noqa: E731
-        place = os.path.normpath(re.sub(r"\{(chunk_index|file_index)(?::0?(\d))?d?\}", number, given))
-        if re.search(r"[{}\0]", place) or os.path.isabs(place) or place.startswith(".."):
-            raise LogError(
-                f"{self.path}/meta/info.json: data_path '{given}' is not a path inside the set with "
-                f"{{chunk_index:03d}} and {{file_index:03d}}; {AGAIN}"
-            )
-        return self.path / place
 
 
 def find(path: Path) -> list[Path]:
     """The data file of every episode, of every set under the path."""
-    return [s.data_file(e) for s in _sets(path) for e in s.episodes]
+    return [s.data_file(e) for s in sets_under(path) for e in s.episodes]
 
 
 def read(
@@ -148,9 +49,9 @@ def read(
         joint_map: The set's name of a joint → the robot's.
         position_unit: One of POSITION_UNITS; not for what gaponet exported, which says rad itself.
     """
-    for part in _sets(path):
+    for part in sets_under(path):
         unit = _unit(part, position_unit)
-        tasks = _tasks(part)
+        tasks = tasks_of(part)
         open_file, table = Path(), None
         for episode in part.episodes:
             file = part.data_file(episode)
@@ -159,84 +60,6 @@ def read(
             assert table is not None
             log = table.episode(episode)
             yield _motion(episode, tasks), refuse_absurd(log, robot)
-
-
-def _sets(path: Path) -> list[Set]:
-    """The set at a path, or those in its folders."""
-    infos = [path / "meta" / "info.json"]
-    if not infos[0].is_file():
-        infos = sorted(path.glob("*/meta/info.json"))
-    if not infos:
-        raise LogError(f"{path}: no meta/info.json in it; point at a LeRobotDataset v3.0 folder")
-    return [_open(info) for info in infos]
-
-
-def _open(file: Path) -> Set:
-    info = read_json(Info, file, LogError, AGAIN, more=True)
-    version = info["codebase_version"]
-    if version.split(".")[0] != VERSION.split(".")[0]:
-        raise LogError(
-            f"{file}: codebase_version is {version}, this reads {VERSION}; convert the set with lerobot's "
-            "convert_dataset_v21_to_v30"
-        )
-    root, features = file.parents[1], info["features"]
-    ours = file.with_name(OURS)
-    told = (
-        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", more=True)
-        if ours.is_file()
-        else None
-    )
-    episodes = [row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, told)]
-    if not episodes:
-        raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
-    episodes.sort(key=lambda e: e["episode_index"])
-    known = {
-        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, more=True)
-        for f in FEATURES.values()
-        if f in features
-    }
-    return Set(root, info, known, episodes, told)
-
-
-def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
-    said = STATED if ours else ()
-    hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = _table(file, (*NEEDED, *(n for n in said if n not in LATER)), ("tasks", *(LATER if ours else ())), hint)
-    rows = _rows(file, table)
-    known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
-    return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
-
-
-def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
-    """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
-    where = f"{file}: episode {row['episode_index']}"
-    told = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
-    told["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
-    for name in LATER:
-        gains = told.pop(name, None)
-        if gains not in (None, "null"):
-            told[name] = parse_json(list[float], str(gains), f"{where}: {name}", LogError, hint)
-    stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
-    return row | {"stated": {name: stated[name] for name in STATED}}
-
-
-def _rows(file: Path, table: Any) -> list[dict[str, Any]]:
-    try:
-        return cast("list[dict[str, Any]]", table.to_pylist())
-    except ValueError as error:  # a date that Python cannot hold
-        raise LogError(f"{file}: not readable ({error}); {AGAIN}") from None
-
-
-def _tasks(part: Set) -> dict[int, str]:
-    """{task_index: text}; the text stands in the index of a pandas table, under either name."""
-    file = part.path / "meta" / "tasks.parquet"
-    if not file.is_file():
-        return {}
-    table = _table(file, ("task_index",), ("task", "__index_level_0__"))
-    if table.num_columns != 2:
-        raise LogError(f"{file}: no task and task_index in it; {AGAIN}")
-    rows = validated(list[Task], _rows(file, table.rename_columns(["index", "text"])), file, LogError, AGAIN)
-    return {row["index"]: row["text"] for row in rows}
 
 
 def _unit(part: Set, given: str | None) -> str:
@@ -278,7 +101,7 @@ class _Frames:
                     f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
                 )
         self.units = [self._joint_unit(j, unit) for j in self.joints]
-        table = _table(file, (*present.values(), *INDEX))
+        table = read_table(file, (*present.values(), *INDEX))
         self.columns = {
             c: _matrix(file, table, f, len(self.joints))[:, [names[c].index(j) for j in self.joints]]
             for c, f in present.items()
@@ -368,22 +191,3 @@ def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
         row = int(wrong.argmax()) if wrong.any() else int(flat.is_null().to_numpy(False).argmax()) // n
         raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
     return flat.to_numpy(zero_copy_only=False).astype(float).reshape(-1, n)
-
-
-def _table(file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN) -> Any:
-    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        parquet = pq.ParquetFile(file)
-        there = parquet.schema_arrow.names
-        for name in need:
-            if there.count(name) != 1:
-                text = "is missing" if name not in there else "stands twice"
-                raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
-        wanted = [*need, *(name for name in also if there.count(name) == 1)]
-        return parquet.read(columns=wanted).select(wanted)
-    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
-        reason = str(error).split("\n")[0].rstrip(".")
-        raise LogError(f"{file}: not a readable Parquet file ({reason}); {AGAIN}") from None

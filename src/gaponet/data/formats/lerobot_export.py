@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.data.formats.lerobot import FEATURES, LATER, OURS, STATED, VERSION
+from gaponet.data.formats.lerobot_set import FEATURES, LATER, OURS, STATED, VERSION
 from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
