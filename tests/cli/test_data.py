@@ -1,233 +1,101 @@
-"""gaponet import and doctor as a user runs them: one line for what is wrong, and nothing half-written."""
+"""gaponet data card, split, figures, export, and import of what was exported, as a user runs them."""
 
 import json
-import shutil
-from collections.abc import Callable
-from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from logs import arm_columns, late, table_text, wave, write_sage, write_so101
+from arm import recordings, write_arm
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.robot import RobotSpec
-
-SI = ["--position-unit", "rad", "--time-unit", "s"]
 
 
-def import_so101(logs: Path, out: Path, *more: str, robot: str = "so101") -> int:
-    who = ["--robot", robot, "--unit-id", "lab", "--payload-mass", "0"]
-    return main(["import", str(logs), *who, "--out", str(out), *more])
-
-
-def import_arm(logs: Path, arm: RobotSpec, out: Path, *more: str) -> int:
-    return import_so101(logs, out, *more, robot=str(arm.mjcf.parent))
-
-
-@pytest.fixture
-def logs(tmp_path):
-    """A SAGE folder with one SO-101 motion of 8 s, 2 periods late."""
-    ctrl = wave(400, 6)
-    ctrl[:, 5] = 0.5
-    write_sage(tmp_path / "logs" / "real" / "so101" / "custom" / "wave", ctrl, late(ctrl, 2))
-    return tmp_path / "logs"
-
-
-def test_import_says_what_came_in_and_that_nothing_was_applied(logs, tmp_path, capsys):
-    assert import_so101(logs, tmp_path / "data") == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert "1 sequences, 0.1 min at 49.85 Hz, robot so101, unit lab, payload 0 kg" in told
-    assert "nothing was applied to the data" in told
-    assert "Next: gaponet doctor" in told
-    assert len(Dataset(tmp_path / "data")) == 1
-    assert (tmp_path / "data" / "offsets.json").is_file()
-
-
-def test_import_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
-    assert import_so101(logs, tmp_path / "data", "--json") == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["sequences"] == 1
-    assert result["rate_hz"] == [49.85]
-    assert result["offsets_applied"] is False
-    assert result["offsets"]["elbow_flex"]["identifiable"] is False
-    (delays,) = result["delay_s"].values()
-    assert delays["elbow_flex"] == pytest.approx(0.04, abs=0.003)
-    assert delays["gripper"] is None
-
-
-def test_the_payload_must_be_said(logs, tmp_path, capsys):
-    assert main(["import", str(logs), "--robot", "so101", "--unit-id", "lab", "--out", str(tmp_path / "data")]) == 2
-    assert "this format does not say it: give --payload-mass 0 (kg in each hand" in capsys.readouterr().err
-    assert not (tmp_path / "data").exists()
-
-
-def test_names_are_mapped_one_option_each(tmp_path):
-    names = ("j1", "j2", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
-    write_sage(tmp_path / "logs" / "wave", wave(50, 6), wave(50, 6), names=names)
-    more = ["--map", "j1=shoulder_pan", "--map", "j2=shoulder_lift", "--format", "sage"]
-    assert import_so101(tmp_path / "logs", tmp_path / "data", *more) == 0
-
-
-def test_a_map_that_is_none_says_how_to_write_it(logs, tmp_path, capsys):
-    assert import_so101(logs, tmp_path / "data", "--map", "Elbow") == 2
-    assert capsys.readouterr().err.strip().endswith("Usage: --map Elbow: write NAME_IN_LOG=NAME_OF_ROBOT")
-
-
-def test_the_same_command_again_says_what_was_there(logs, tmp_path, capsys):
-    assert import_so101(logs, tmp_path / "data") == 0
-    assert import_so101(logs, tmp_path / "data") == 0
-    assert "1 there already, 0 added" in capsys.readouterr().out
-    assert len(Dataset(tmp_path / "data")) == 1
-
-
-def sage_with(change: Callable[[Path], object]) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        change(write_so101(folder / "real" / "so101" / "custom" / "wave"))
-        write_so101(folder / "real" / "so101" / "custom" / "before", rows=50)  # a good one, read first
-        return folder
-
-    return make
-
-
-def rewrite(name: str, old: str, new: str) -> Callable[[Path], object]:
-    def change(motion: Path) -> None:
-        text = (motion / name).read_text()
-        assert old in text
-        (motion / name).write_text(text.replace(old, new, 1))
-
-    return change
-
-
-def rewritten(**values: np.ndarray) -> Callable[[Path], object]:
-    ctrl = wave(60, 6)
-    return lambda motion: write_sage(motion, **({"ctrl": ctrl, "qpos": ctrl} | values))
-
-
-def with_nan(motion: Path) -> None:
-    qpos = wave(60, 6)
-    qpos[9, 2] = np.nan
-    write_sage(motion, wave(60, 6), qpos)
-
-
-def going_back(motion: Path) -> None:
-    time = 20060.0 * np.arange(60)
-    time[30] = time[10]
-    write_sage(motion, wave(60, 6), wave(60, 6), time=time)
-
-
-def cut_short(motion: Path) -> None:
-    state = motion / "state_motor.csv"
-    state.write_text(state.read_text()[:-40])
-
-
-def half_a_parquet(folder: Path) -> Path:
-    folder.mkdir()
-    pq.write_table(pa.table(arm_columns()), folder / "a.parquet")
-    whole = (folder / "a.parquet").read_bytes()
-    (folder / "b.parquet").write_bytes(whole[: len(whole) // 2])
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A user's robot folder and a dataset of six motions, alternately empty-handed and with 0.2 kg."""
+    folder = tmp_path_factory.mktemp("data")
+    robot = write_arm(folder / "arm")
+    dataset = Dataset.create(folder / "set", robot)
+    for sequence in recordings(robot, 6, rows=60):
+        dataset.append(sequence)
     return folder
 
 
-BROKEN = {
-    "missing column": (
-        sage_with(rewrite("state_motor.csv", "positions", "angles")),
-        r"state_motor.csv:1: column 'positions' is missing; the header has: type, timestamp, angles",
-    ),
-    "NaN": (sage_with(with_nan), "state_motor.csv:11: qpos of elbow_flex is not finite; repair or cut the row"),
-    "time going back": (sage_with(going_back), ".csv:32: time does not increase in channel"),
-    "wrong joint name": (
-        sage_with(rewrite("joint_list.txt", "Elbow", "Ellbow")),
-        "joint_list.txt names joint 'Ellbow', but robot 'so101' has: shoulder_pan, shoulder_lift, elbow_flex, "
-        "wrist_flex, wrist_roll, gripper. Map it with --map Ellbow=elbow_flex",
-    ),
-    "degrees": (
-        sage_with(rewritten(ctrl=wave(60, 6, amplitude=40.0))),
-        "positions must be in radians: these look like degrees",
-    ),
-    "empty file": (
-        sage_with(lambda motion: (motion / "control.csv").write_text("")),
-        "control.csv:1: header is '', expected type,timestamp,positions",
-    ),
-    "truncated CSV": (sage_with(cut_short), "state_motor.csv:61: expected TYPE,timestamp and 3 list(s) of 6 numbers"),
-    "half-written Parquet": (half_a_parquet, "b.parquet: not a readable Parquet file"),
-}
+def run(place, capsys, *words):
+    capsys.readouterr()
+    code = main([w.format(place) for w in words])
+    captured = capsys.readouterr()
+    assert code == 0, captured.err
+    return captured
 
 
-@pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_input_is_one_line_that_says_what_where_and_what_to_do(what, arm, tmp_path, capsys):
-    make, message = BROKEN[what]
-    logs, out = make(tmp_path / "logs"), tmp_path / "data"
-    code = import_arm(logs, arm, out, *SI) if what == "half-written Parquet" else import_so101(logs, out)
-    assert code == 2
-    printed = capsys.readouterr()
-    error = printed.err.strip().split("\n")[-1]
-    assert message in error
-    assert error.split(": ")[0] in ("Log", "JointMismatch")
-    assert "Traceback" not in printed.err
-    assert not out.exists()
-
-
-def test_another_robots_dataset_is_refused_and_left_as_it_was(arm, logs, tmp_path, capsys):
-    table = tmp_path / "wave.csv"
-    table.write_text(table_text(arm_columns()))
-    assert import_arm(table, arm, tmp_path / "data", *SI) == 0
-    before = {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()}
-    assert import_so101(logs, tmp_path / "data") == 2
-    error = capsys.readouterr().err.strip().split("\n")[-1]
-    assert error.startswith("Dataset: ")
-    assert "holds robot 'arm' (shoulder, elbow), not 'so101'" in error
-    assert "use --robot arm or another dataset folder" in error
-    assert {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()} == before
-
-
-def test_a_broken_file_leaves_an_existing_dataset_as_it_was(logs, tmp_path):
-    assert import_so101(logs, tmp_path / "data") == 0
-    before = {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()}
-    broken = sage_with(cut_short)(tmp_path / "broken")
-    assert import_so101(broken, tmp_path / "data") == 2
-    assert {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()} == before
-
-
-def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
-    table = tmp_path / "wave.csv"
-    table.write_text(table_text(arm_columns()))
-    assert import_arm(table, arm, tmp_path / "data") == 2
+def test_the_card_says_virtual_first_and_asks_for_the_licence(place, capsys):
+    told = run(place, capsys, "data", "card", "{}/set").out.split("\n")
+    assert told[0] == "set: 6 sequences, 0.00 h of arm, all on VIRTUAL robots"
+    assert "licence: not stated; set it with gaponet data card DIR --licence …" in told
     assert (
-        "the table's time unit is not given; say it with --position-unit rad --time-unit s" in capsys.readouterr().err
+        (place / "set" / "CARD.md")
+        .read_text(encoding="utf-8")
+        .startswith("# set: 6 sequences, 0.00 h of arm, all on V")
     )
 
 
-def test_doctor_speaks_and_ends_with_a_verdict(logs, tmp_path, capsys):
-    import_so101(logs, tmp_path / "data")
+def test_the_card_is_one_json_object_with_the_licence(place, capsys):
+    out = run(place, capsys, "data", "card", "{}/set", "--licence", "CC-BY-4.0", "--source", "test", "--json").out
+    card = json.loads(out)
+    assert (card["licence"], card["source"], card["total"]["frames"]) == ("CC-BY-4.0", "test", 360)
+    assert json.loads((place / "set" / "dataset.json").read_text())["licence"] == "CC-BY-4.0"
+
+
+def test_a_split_is_printed_and_written(place, capsys):
+    result = json.loads(
+        run(place, capsys, "data", "split", "{}/set", "--by", "payload", "--holdout", "0.2", "--json").out
+    )
+    assert result["split"].endswith("splits/payload-0.2.json")
+    assert result["parts"]["test"]["payloads_kg"] == ["0.2"]
+    assert result["parts"]["train"]["sequences"] == 2
+    table = run(place, capsys, "data", "split", "{}/set", "--by", "motion").out
+    assert "VIRTUAL robots; parts share no recording" in " ".join(table.split())
+
+
+def test_pictures_are_listed_and_what_is_left_out(place, capsys):
+    words = ["data", "figures", "{}/set", "--out", "{}/pictures", "--robot", "{}/arm", "--json"]
+    result = json.loads(run(place, capsys, *words).out)
+    assert len(result["figures"]) == 6
+    assert set(result["left_out"]) == {"torque_temperature", "gap_by_payload"}
+    assert (place / "pictures" / "joint_ranges.svg").is_file()
+
+
+def test_export_and_import_give_the_same_recordings(place, capsys):
+    run(place, capsys, "data", "export", "{}/set", "--out", "{}/lerobot")
+    told = run(place, capsys, "import", "{}/lerobot", "--robot", "{}/arm", "--out", "{}/again").out
+    assert "6 sequences" in told
+    assert "VIRTUAL robot arm, unit a, payload 0, 0.2 kg" in told
+    one, other = Dataset(place / "set"), Dataset(place / "again")
+    assert [e.hash for e in one.entries] == [e.hash for e in other.entries]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["data", "card", "{}/nowhere"], "Dataset: {}/nowhere: not a dataset"),
+        (["data", "split", "{}/set", "--by", "unit"], "Usage: {}/set: one unit only (a)"),
+        (["data", "split", "{}/set", "--by", "payload", "--holdout", "5"], "no payload '5' to hold out; it holds 0,"),
+        (["data", "figures", "{}/set", "--out", "{}/p", "--robot", "so101"], "holds robot 'arm'"),
+        (["data", "export", "{}/set", "--out", "{}/set"], "set: exists and is not an empty folder; choose a new one"),
+        (["import", "{}/set/sequences", "--robot", "{}/arm", "--out", "{}/new", "--format", "lerobot"],
+         "no meta/info.json in it; point at a LeRobotDataset v3.0 folder"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value[:2]),
+)  # fmt: skip
+def test_mistakes_get_one_line_and_exit_code_2(place, capsys, words, complaint):
     capsys.readouterr()
-    assert main(["doctor", str(tmp_path / "data")]) == 0
-    told = capsys.readouterr().out
-    assert "so101, 1 sequences, 1 motions" in told
-    assert "49.85" in told
-    assert told.strip().split("\n")[-1].startswith("Usable. Read the")
+    assert main([w.format(place) for w in words]) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert complaint.format(place) in last
+    assert not (place / "new").exists()
 
 
-def test_doctor_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
-    import_so101(logs, tmp_path / "data")
-    capsys.readouterr()
-    assert main(["doctor", str(tmp_path / "data"), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
-    assert result["sequences"][0]["rate_hz"] == 49.85
-    assert {f["level"] for f in result["findings"]} <= {"ok", "note", "warning", "error"}
-    assert [j["joint"] for j in result["joints"]][-1] == "gripper"
-
-
-def test_doctor_refuses_another_robot_and_a_damaged_file(logs, tmp_path, capsys):
-    import_so101(logs, tmp_path / "data")
-    assert main(["doctor", str(tmp_path / "data"), "--robot", "h1_2"]) == 2
-    assert "holds robot 'so101'" in capsys.readouterr().err
-    file = next((tmp_path / "data" / "sequences").iterdir())
-    file.write_bytes(file.read_bytes()[:100])
-    assert main(["doctor", str(tmp_path / "data")]) == 2
-    assert "not a readable Parquet file" in capsys.readouterr().err
-    shutil.rmtree(tmp_path / "data")
-    assert main(["doctor", str(tmp_path / "data")]) == 2
-    assert "not a dataset" in capsys.readouterr().err
+def test_an_action_that_is_none_lists_those_that_are(capsys):
+    with pytest.raises(SystemExit):
+        main(["data", "polish"])
+    assert "card" in capsys.readouterr().err

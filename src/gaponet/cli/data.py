@@ -1,194 +1,181 @@
-"""gaponet import, gaponet doctor."""
+"""gaponet data: card, split, figures, export."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 
-from gaponet import api
+from gaponet.api import open_dataset
 from gaponet.cli.out import Out
-from gaponet.data.signals import FAST
-from gaponet.errors import UsageError
-from gaponet.robot import RobotSpec, load_robot
-
-if TYPE_CHECKING:
-    from gaponet.data.doctor import Diagnosis
-    from gaponet.data.importer import ImportReport
-    from gaponet.data.offsets import JointOffset
-    from gaponet.data.store import Entry
-
-COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
-MAX_ROWS = 60
+from gaponet.data.store import Dataset
+from gaponet.progress import bar
 
 
-def import_logs(
-    src: tyro.conf.Positional[Path],
-    robot: str,
-    out: Path,
-    unit_id: str | None = None,
-    payload_mass: float | None = None,
-    payload_side: str | None = None,
-    map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: Literal["sage", "table", "lerobot"] | None = None,
-    columns: Path | None = None,
-    position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None,
-    level: Literal["joint", "upper_body", "whole_body"] | None = None,
-    kp: tuple[str, ...] = (),
-    kd: tuple[str, ...] = (),
+def card(
+    dataset: tyro.conf.Positional[Path],
+    licence: str | None = None,
+    source: str | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
-
-    Args:
-        src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
-        robot: Robot name or folder.
-        out: Dataset folder; appended to where it exists.
-        unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
-        payload_mass: kg in each hand; 0 when empty. Needed unless the format states it.
-        payload_side: Which hand carries it: both (default), or the side of one payload mount.
-        map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Of the logs; default by looking.
-        columns: Tables: TOML file that names columns and units.
-        position_unit: Tables and LeRobot: unit of positions; velocities are that per second. signed_percent: LeRobot's
-            older −100..100.
-        time_unit: Tables: unit of time.
-        level: What the motions move; whole_body by default.
-        kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
-            states, else the robot's.
-        kd: The same of the damping gain, N·m·s/rad.
-        json: One JSON object on stdout.
-    """
-    spec = load_robot(robot)
-    report = api.import_logs(
-        src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=joint_map(map), columns=columns, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
-    )  # fmt: skip
-    show_import(Out(json), report, spec)
-
-
-def doctor(
-    dataset: tyro.conf.Positional[Path], robot: str | None = None, json: tyro.conf.FlagCreatePairsOff[bool] = False
-) -> None:
-    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
+    """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
         dataset: Dataset folder.
+        licence: Record this licence in dataset.json, e.g. CC-BY-4.0; "" takes it away.
+        source: Record where the data come from: a paper, a laboratory, an address.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.card import make_card, write_card
+    from gaponet.data.card_text import card_text
+
+    out, data = Out(json), Dataset(dataset)
+    stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
+    if stated:
+        data.state(**stated)
+    with bar("reading") as update:
+        made = make_card(data, update)
+    write_card(data, made, card_text(made))
+    show_card(out, made)
+    out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
+    out.result(made)
+
+
+def split(
+    dataset: tyro.conf.Positional[Path],
+    by: Literal["motion", "unit", "payload"],
+    holdout: tuple[str, ...] = (),
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
+
+    Args:
+        dataset: Dataset folder.
+        by: What the test part has and the others have not.
+        holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.card import count
+    from gaponet.data.split import make_split, require_distinct_samples, write_split
+
+    out, data = Out(json), Dataset(dataset)
+    parts = make_split(data, by, holdout)
+    with bar("comparing") as update:
+        require_distinct_samples(data, parts, update)
+    path = write_split(data, parts, by, holdout)
+    rows: dict[str, dict[str, Any]] = {part: count(entries) | members(entries) for part, entries in parts.items()}
+    columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
+    virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
+    out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
+        [part, f"{r['sequences']:,}", f"{r['hours']:.2f}", f"{r['frames']:,}", str(r["motions"]),
+         some(r["units"]), some(r["payloads_kg"])]
+        for part, r in rows.items()
+    ])  # fmt: skip
+    out.say(f"written: {path!s}")
+    out.result({"split": str(path), "by": by, "parts": rows})
+
+
+def figures(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    robot: str | None = None,
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Draw the dataset: joint ranges, composition, torque and temperature, real against twin, gap against payload.
+
+    Sequences without a twin that a figure needs are replayed first.
+
+    Args:
+        dataset: Dataset folder.
+        out: Folder for the pictures, each as SVG and PNG.
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
-    from gaponet.data.doctor import inventory
+    from gaponet.eval.draw_dataset import draw_all
 
-    out = Out(json)
-    data, spec = api.open_dataset(dataset, robot)
-    diagnosis = api.doctor(data, spec)
-    out.say(f", {inventory(data)}", spec.name)
-    show_diagnosis(out, diagnosis)
-    out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
-
-
-def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
-    """("a=b",) → {"a": "b"}."""
-    for pair in pairs:
-        if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):
-            raise UsageError(f"--map {pair}: write NAME_IN_LOG=NAME_OF_ROBOT")
-    return {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)} or None
+    screen = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    with bar("drawing") as update:
+        written, left_out = draw_all(data, spec, out, update)
+    for path in written:
+        screen.say(f"written: {path!s}")
+    for name, reason in left_out.items():
+        screen.say(f"  {name}: {reason}", "left out", "yellow")
+    screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
-def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
-    """What came in, the lag and the offsets of each joint, and what to do next."""
-    entries, data = report.entries or report.present, report.dataset
-    minutes = sum(e.rows * e.dt for e in entries) / 60
-    rates = sorted({round(1 / e.dt, 2) for e in entries})
-    units = ", ".join(dict.fromkeys(e.meta.unit_id for e in entries))
-    payloads = ", ".join(f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries}))
-    virtual = "VIRTUAL " if any(e.meta.virtual for e in entries) else ""
-    if report.present:
-        out.say(f"{len(report.present)} there already, {len(report.entries)} added")
-    out.say(
-        f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
-        f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
-    )
-    lags = {name: fast_lags(entries, name) for name in robot.operated}
-    offsets = report.offsets.joints if report.offsets else {}
-    show_offsets(out, lags, offsets)
-    if offsets:
-        out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
-    out.say(f"Next: gaponet doctor {data.path!s}")
-    out.result({
-        "dataset": str(data.path), "imported": [e.id for e in report.entries],
-        "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
-        "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings["delay_s"] for e in entries},
-        "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
-    })  # fmt: skip
+def export(
+    dataset: tyro.conf.Positional[Path],
+    out: Path,
+    format: Literal["lerobot"] = "lerobot",
+    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
+    """Write a dataset in another format; gaponet import reads it back without loss.
 
+    Args:
+        dataset: Dataset folder.
+        out: New folder.
+        format: lerobot: LeRobotDataset v3.0, one set for each rate and choice of channels.
+        json: One JSON object on stdout.
+    """
+    from gaponet.data.formats.lerobot_export import export_lerobot
 
-def show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
-    """Lag and static errors by joint, and why a zero offset is not identified."""
-    rows = []
-    for name, found in lags.items():
-        median = f"{np.median(found) * 1e3:.0f}" if found else "–"
-        joint = offsets.get(name)
-        at_rest = [mrad(joint.static_error, joint.stiction_band), mrad(joint.tracking_offset)] if joint else ["–", "–"]
-        zero = mrad(joint.zero_offset, joint.zero_std) if joint else "–"
-        rows.append([name, median, *at_rest, zero if joint and joint.identifiable else f"({zero})"])
-    out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset", "zero"], rows)
-    if not offsets:
-        return
-    out.say(
-        "at rest: state − command half way between both approaches, ± stiction; offset: what of it the nominal model's "
-        "gravity sag leaves; zero: turn of the encoder zero that would explain it, ± standard error, in brackets where "
-        "it is not identified"
-    )
-    for reason in dict.fromkeys(joint.reason for joint in offsets.values() if joint.reason):
-        joints = ", ".join(name for name, joint in offsets.items() if joint.reason == reason)
-        out.say(f"zero not identified for {joints}: {reason}")
-
-
-def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
-    """Tables of sequences and joints, the findings, the verdict."""
-    shown = diagnosis.sequences[:MAX_ROWS]
-    columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
-    out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
-        [r["motion"], f"{r['payload_mass']:g}", f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}",
-         f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}", span(list(r["fast_lag_s"].values()))]
-        for r in shown
+    screen, data = Out(json), Dataset(dataset)
+    with bar("exporting") as update:
+        sets = export_lerobot(data, out, update)
+    screen.table(f"{out!s}: LeRobotDataset v3.0", ["set", "episodes", "frames", "fps"], [
+        [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in sets
     ])  # fmt: skip
-    if len(shown) < len(diagnosis.sequences):
-        out.say(f"… and {len(diagnosis.sequences) - len(shown)} more; --json lists all")
-    columns = ["joint", "commanded, rad", "lag", "at rest", "rests"]
-    out.table("Joints; fast lag in ms, error at rest ± stiction in mrad", columns, [
-        [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), lag(r["lag_s"]),
-         mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
-        for r in diagnosis.joints
-    ])  # fmt: skip
-    for finding in diagnosis.findings:
-        out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
-    out.say("", diagnosis.verdict)
+    screen.say(f"Back: gaponet import {out!s} --format lerobot --robot {data.robot_name} --out NEW")
+    screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
 
 
-def fast_lags(entries: list[Entry], joint: str) -> list[float]:
-    """Lags of a joint in the sequences that command it fast, s."""
-    found = [e.findings["delay_s"][joint] for e in entries if (e.findings["fast_speed"][joint] or 0) >= FAST]
-    return [lag for lag in found if lag is not None]
+# Each is run while the command line is parsed; what is left to call is nothing.
+Action = (
+    Annotated[None, tyro.conf.subcommand("card", constructor=card)]
+    | Annotated[None, tyro.conf.subcommand("split", constructor=split)]
+    | Annotated[None, tyro.conf.subcommand("figures", constructor=figures)]
+    | Annotated[None, tyro.conf.subcommand("export", constructor=export)]
+)
 
 
-def lag(values: dict[str, float] | None) -> str:
-    """Median and range, "104 (81–120)"."""
-    return f"{values['median'] * 1e3:.0f} ({span([values['min'], values['max']])})" if values else "–"
+def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+    """What a dataset holds: its card, splits, pictures and export."""
 
 
-def span(seconds: list[float]) -> str:
-    """[0.08, 0.12] → "80–120" ms."""
-    low, high = (f"{f(seconds) * 1e3:.0f}" for f in (min, max)) if seconds else ("–", "–")
-    return low if low == high else f"{low}–{high}"
+def show_card(out: Out, made: dict[str, Any]) -> None:
+    """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
+    from gaponet.data.card import NOT_STATED
+    from gaponet.data.card_text import TITLES, headline, number
+
+    out.say("", headline(made))
+    for name, shares in made["shares"].items():
+        out.table("", [TITLES[name], "sequences", "hours", "frames", "motions"], [
+            [key, f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", str(c["motions"])]
+            for key, c in shares.items()
+        ])  # fmt: skip
+    repeated = made["repeatability"]
+    if repeated["channels"]:
+        spread = ", ".join(f"{name} {number(c['mean'])} {c['unit']}" for name, c in repeated["channels"].items())
+        out.say(
+            f"repeatability (std over {repeated['sequences']} repetitions in {repeated['groups']} groups): {spread}"
+        )
+    else:
+        out.say("repeatability: no motion was repeated with the same command, unit and payload")
+    for name in ("licence", "source"):
+        ask = f"; set it with gaponet data card DIR --{name} …" if made[name] == NOT_STATED else ""
+        out.say(f"{name}: {made[name]}{ask}")
 
 
-def mrad(value: float | None, band: float | None = None) -> str:
-    """0.037, 0.031 → "+37 ± 31"."""
-    if value is None:
-        return "–"
-    return f"{value * 1e3:+.0f}" + (f" ± {band * 1e3:.0f}" if band is not None else "")
+def members(entries: list[Any]) -> dict[str, list[str]]:
+    """Which units and payloads."""
+    return {
+        "units": sorted({e.meta.unit_id for e in entries}),
+        "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
+    }
+
+
+def some(names: list[str]) -> str:
+    """Up to four, and how many more."""
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

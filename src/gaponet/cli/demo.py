@@ -62,7 +62,7 @@ def demo(
 def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
     """Import logs or collect from the virtual fleet; returns the units to hold out of training."""
     if data is not None:
-        from gaponet.cli.data import import_logs
+        from gaponet.cli.logs import import_logs
 
         import_logs(data, robot, unit_id="lab", payload_mass=0.0, out=path)
         return ()

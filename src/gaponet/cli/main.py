@@ -21,9 +21,9 @@ from gaponet.text import plain
 # Task → command → module:function. A module is imported when its command is run; help reads what it says of itself.
 TASKS = {
     "Logs": {
-        "import": "gaponet.cli.data:import_logs",
-        "doctor": "gaponet.cli.data:doctor",
-        "data": "gaponet.cli.dataset:data",
+        "import": "gaponet.cli.logs:import_logs",
+        "doctor": "gaponet.cli.logs:doctor",
+        "data": "gaponet.cli.data:data",
         "collect": "gaponet.cli.collect:collect",
         "robot": "gaponet.cli.robot:robot",
     },

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.formats import find_logs, read_logs
+from gaponet.data.holds import Holds, find_holds
 from gaponet.data.log import Log
 from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
@@ -108,9 +109,10 @@ def import_logs(
         known = Dataset.peek(out, robot)
         if known is not None:
             read_offsets(known)  # a damaged one is said before anything is read
-        dataset, added, present = _import(src, out, robot, given, fmt, progress, options)
+        rests: dict[str, Holds] | None = {} if gravity else None
+        dataset, added, present = _import(src, out, robot, given, fmt, progress, options, rests)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
-        offsets = {unit: fit_unit(dataset, robot, unit, gravity) for unit in units} if gravity else {}
+        offsets = {unit: fit_unit(dataset, robot, unit, gravity, rests) for unit in units} if gravity else {}
         for unit, fitted in offsets.items():
             record_offsets(dataset, unit, fitted, simulator)
     return ImportReport(dataset, added, present, next(iter(offsets.values())) if len(offsets) == 1 else None)
@@ -124,8 +126,11 @@ def _import(
     fmt: str | None,
     progress: Progress | None,
     options: dict[str, Any],
+    rests: dict[str, Holds] | None,
 ) -> tuple[Dataset, list[Entry], list[Entry]]:
     """Read and check all, then write what is new; where all is too much to hold, read it again for writing.
+
+    Each recording is hashed once, and its rests, by hash, are put into `rests` where they are asked for.
 
     Returns:
         Dataset, entries added, entries that were there.
@@ -151,13 +156,15 @@ def _import(
     present = [entry for digest, _ in digests if (entry := dataset.find(digest))]
     taken = Counter(_slot(e.meta) for e in dataset.entries)
     added = []
-    for sequence in held if size <= HOLD else again:
-        if dataset.find(sequence.content_hash()):
+    for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
+        if rests is not None:
+            rests[digest] = find_holds(sequence, robot.operated_index)
+        if dataset.find(digest):
             continue
         slot = _slot(sequence.meta)
         if sequence.meta.repetition < 0:  # the format does not state it
             sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
-        added.append(dataset.append(sequence, findings(sequence)))
+        added.append(dataset.append(sequence, findings(sequence), digest))
         taken[slot] += 1
     return dataset, added, present
 

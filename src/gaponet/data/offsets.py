@@ -96,13 +96,17 @@ class _Rests:
     used: Array
 
 
-def fit_unit(dataset: Dataset, robot: RobotSpec, unit_id: str, gravity: Gravity) -> UnitOffsets:
-    """Fit the offsets of one unit from all its sequences, reading them one at a time."""
+def fit_unit(
+    dataset: Dataset, robot: RobotSpec, unit_id: str, gravity: Gravity, known: dict[str, Holds] | None = None
+) -> UnitOffsets:
+    """Fit the offsets of one unit from all its sequences; those whose rests are known, by hash, are not read again."""
+    known = known or {}
     found: dict[Condition, list[Holds]] = {}
     for entry in dataset.entries:
         if entry.meta.unit_id == unit_id:
             key = (entry.meta.payload_mass, entry.meta.payload_side)
-            found.setdefault(key, []).append(find_holds(dataset.read(entry), robot.operated_index))
+            rests = known.get(entry.hash) or find_holds(dataset.read(entry), robot.operated_index)
+            found.setdefault(key, []).append(rests)
     n = len(robot.joint_names)
     return fit_offsets({key: join(parts, n) for key, parts in found.items()}, robot, gravity)
 

@@ -173,13 +173,14 @@ class Dataset:
             self.header = {k: v for k, v in (self.header | fields).items() if v != ""}
             write_text(self.path / "dataset.json", json.dumps(self.header, indent=1, ensure_ascii=False) + "\n")
 
-    def append(self, sequence: Sequence, findings: dict[str, Any] | None = None) -> Entry:
-        """Add a sequence; one with the same content is refused with its name."""
+    def append(
+        self, sequence: Sequence, findings: dict[str, Any] | None = None, content_hash: str | None = None
+    ) -> Entry:
+        """Add a sequence; one with the same content is refused with its name. Its hash is computed if not given."""
         with self.writing():
-            return self._append(sequence, findings or {})
+            return self._append(sequence, findings or {}, content_hash or sequence.content_hash())
 
-    def _append(self, sequence: Sequence, findings: dict[str, Any]) -> Entry:
-        digest = sequence.content_hash()
+    def _append(self, sequence: Sequence, findings: dict[str, Any], digest: str) -> Entry:
         twin = self.find(digest)
         if twin is not None:
             raise DatasetError(
