@@ -139,7 +139,7 @@ class Seen:
     @classmethod
     def by(cls, run: Path) -> Seen:
         """What this run has seen."""
-        model, split = GapModel.load(run), read_split(run)
+        model, split = GapModel.load(run), split_of_run(run)
         used = ("train", "val")
         hashes = {h for part in used for h in split[part].values()}
         hashes |= {h for c in calibration.load(run, model.weights_hash()).values() for h in c.logs}
@@ -150,7 +150,7 @@ class Seen:
         return entry.hash in self.hashes or (entry.hash not in self.test and entry.meta.motion in self.motions)
 
 
-def read_split(run: Path) -> dict[str, dict[str, str]]:
+def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     """{part: {sequence id: content hash}} of a run."""
     hint = "give a run folder of gaponet train"
     return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]

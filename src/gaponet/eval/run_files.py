@@ -183,7 +183,7 @@ class Panel(TypedDict):
     floor: Floor
 
 
-class Budget(Panel):
+class BudgetFile(Panel):
     """budget.json."""
 
     by_joint: dict[str, Panel]
@@ -198,7 +198,7 @@ def read_budget(run: Path) -> dict[str, Any] | None:
     file = run / "budget.json"
     if not file.is_file():
         return None
-    budget = read_json(Budget, file, ModelError, "make it again with gaponet budget", more=True)
+    budget = read_json(BudgetFile, file, ModelError, "make it again with gaponet budget", more=True)
     steps = list(budget["left"])
     if not steps or any(list(panel["left"]) != steps for panel in budget["by_joint"].values()):
         raise ModelError(f"{file}: by_joint: should have the steps of left; make it again with gaponet budget")

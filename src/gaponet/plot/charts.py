@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Spread(Protocol):
+class Interval(Protocol):
     """One number measured several times (study.table)."""
 
     @property
@@ -36,8 +36,8 @@ class Once:
 
 Array = np.ndarray
 
-Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
-Dot = tuple[str, str, Spread, bool]  # group, name, value, whether it is the default
+Bars = Mapping[str, tuple[str, ListOf[Interval]]]  # label → colour, value of each group
+Dot = tuple[str, str, Interval, bool]  # group, name, value, whether it is the default
 GAP = 0.7  # between groups, rows
 
 
@@ -65,7 +65,7 @@ def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = 
     ax.grid(axis="x", visible=False)
 
 
-def spreads(values: ListOf[Spread]) -> Array | None:
+def spreads(values: ListOf[Interval]) -> Array | None:
     """Lengths of error bars; None where nothing was measured twice."""
     std = np.array([v.std if v.std == v.std else 0.0 for v in values])
     return std if std.any() else None
@@ -169,7 +169,7 @@ def _limit(values: ListOf[float]) -> float:
 
 @styled
 def lines(
-    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
+    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Interval]]]]],
     axes: tuple[str, str],
     ticks: ListOf[tuple[float, str]] = (),
     log: bool = False,

@@ -48,7 +48,7 @@ Seeds = dict[str, dict[int, float]]  # word → seed → MPJAE of nominal
 
 
 @dataclass(frozen=True)
-class Row:
+class Setting:
     """A line of the table."""
 
     factor: str
@@ -58,7 +58,7 @@ class Row:
     paper: tuple[float, float] | None = None
 
 
-def rows(study: Study) -> tuple[list[Row], list[str]]:
+def rows(study: Study) -> tuple[list[Setting], list[str]]:
     """All lines that the dataset allows, and why others are missing."""
     config, factors, missing = study.config, list(FACTORS), []
     if len({e.meta.payload_mass for e in study.data.entries}) < 2:
@@ -77,7 +77,7 @@ def rows(study: Study) -> tuple[list[Row], list[str]]:
     found = []
     for factor, settings in factors:
         for setting, change in settings:
-            found.append(Row(factor, setting, _word(change, config), PAPER.get(change)))
+            found.append(Setting(factor, setting, _word(change, config), PAPER.get(change)))
     return found, missing
 
 
@@ -131,7 +131,7 @@ class Ablation:
         return found.result(study, "ablation", "Ablation of the operator", [table], {"ablation": figure}, said)
 
 
-def _table(lines: list[Row], found: Found, seeds: Seeds, worth: Mapping[str, Spread]) -> Table:
+def _table(lines: list[Setting], found: Found, seeds: Seeds, worth: Mapping[str, Spread]) -> Table:
     new = any("new" in f for part in found.runs.values() for f in part)
     table: list[tuple[Any, ...]] = []
     for row in lines:
@@ -162,7 +162,7 @@ def _paired(seeds: Seeds, word: str, other: str) -> Spread:
     return Spread.of([a[seed] / b[seed] for seed in a if seed in b])
 
 
-def _sentences(lines: list[Row], seeds: Seeds, worth: Mapping[str, Spread]) -> list[str]:
+def _sentences(lines: list[Setting], seeds: Seeds, worth: Mapping[str, Spread]) -> list[str]:
     """The best and the worst of each choice against the default, and where the paper found otherwise."""
     if DEFAULT not in seeds:
         return []
@@ -175,7 +175,7 @@ def _sentences(lines: list[Row], seeds: Seeds, worth: Mapping[str, Spread]) -> l
     return [*out, *_against_paper(lines, seeds)]
 
 
-def _against_paper(lines: list[Row], seeds: Seeds) -> list[str]:
+def _against_paper(lines: list[Setting], seeds: Seeds) -> list[str]:
     """Pairs of settings that the paper orders, beside our order."""
     known = [(r, r.paper) for r in lines if r.paper and r.word in seeds]
     out = []
@@ -197,5 +197,5 @@ def _against_paper(lines: list[Row], seeds: Seeds) -> list[str]:
     return out
 
 
-def _left(seeds: Seeds, row: Row) -> float:
+def _left(seeds: Seeds, row: Setting) -> float:
     return Spread.of(seeds[row.word].values()).mean

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from gaponet.data.json_file import read_kept, write_json
 from gaponet.errors import ModelError
-from gaponet.eval.evaluate import read_split
+from gaponet.eval.evaluate import split_of_run
 from gaponet.eval.whose import label
 from gaponet.sim.model import model_hash
 from gaponet.study.measure import Outcome, evaluate_baselines, train_and_evaluate
@@ -125,7 +125,7 @@ def baselines(cell: Cell, study: Study) -> Outcome:
     fitted = (cell.folder / "delay_offset.json").read_text(encoding="utf-8")
     nominal = study.robot.nominal or study.robot
     identified = study.identified or (study.robot if study.robot.nominal else None)
-    parts = [*sorted(read_split(cell.folder)["test"].values()), fitted, model_hash(nominal), *cell.holdout_units]
+    parts = [*sorted(split_of_run(cell.folder)["test"].values()), fitted, model_hash(nominal), *cell.holdout_units]
     parts += [model_hash(identified)] if identified else []
     file = study.out / "baselines" / f"{hashlib.sha256(' '.join(parts).encode()).hexdigest()[:12]}.json"
     if not file.is_file():

@@ -24,7 +24,7 @@ TALLEST = 0.8  # of the width
 
 
 @dataclass(frozen=True)
-class Layout:
+class Tiles:
     """Pixels: a head line, the robots, their labels, and the course of the error, from top to bottom."""
 
     width: int
@@ -40,7 +40,7 @@ class Layout:
         return self.head + self.robots + self.labels + self.course
 
     @classmethod
-    def of(cls, scene: Scene, width: int, course: bool) -> Layout:
+    def of(cls, scene: Scene, width: int, course: bool) -> Tiles:
         """The height that the robots need at this width."""
         if not 160 <= width <= 3840:
             raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
@@ -69,7 +69,7 @@ class Camera:
             span: Time on that axis, s.
         """
         self.scene, self.speed, self.magnify = scene, speed, magnify
-        self.layout = Layout.of(scene, width - width % 2, course)
+        self.layout = Tiles.of(scene, width - width % 2, course)
         self.span = (span[0], min(span[1], (len(scene.shown.real) - 1) * scene.shown.real.dt))
         self.lens = self._lens()
         self.renderer = _renderer(scene.model, self.layout.robots, self.layout.width)

@@ -17,7 +17,7 @@ from gaponet.motion.collision import Shapes
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
 from gaponet.structure import read_toml
-from gaponet.view.side_by_side import Motion, SideBySide
+from gaponet.view.side_by_side import Played, SideBySide
 
 Array = np.ndarray
 
@@ -116,7 +116,7 @@ class Scene:
         across, up = self.view.axes
         return across * (left + right) / 2 + up * (bottom + top) / 2
 
-    def _haunted(self) -> list[Motion]:
+    def _haunted(self) -> list[Played]:
         return [m for m in self.shown.motions if m.method != "recorded"]
 
     def _address(self, prefix: str) -> Array:

@@ -24,7 +24,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True)
-class Motion:
+class Played:
     """One copy of the robot.
 
     Attributes:
@@ -66,7 +66,7 @@ class SideBySide:
 
     real: Sequence
     robot: RobotSpec
-    motions: tuple[Motion, ...]
+    motions: tuple[Played, ...]
     seen: bool | None
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
@@ -150,5 +150,5 @@ def side_by_side(
         shown[method] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
     op = robot.operated_index
-    motions = tuple(Motion(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
+    motions = tuple(Played(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
     return SideBySide(real, robot, motions, any(entry in Seen.by(run) for run in runs) if runs else None)

@@ -11,7 +11,7 @@ import tomllib
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
 from gaponet.structure import validated
-from gaponet.virtual.fleet import FLEETS, UNITS, Table, complete, draw, to_toml
+from gaponet.virtual.fleet import FLEETS, UNITS, FleetTable, complete, draw, to_toml
 
 MARK = "\n# ---- drawn units ----\n"
 
@@ -20,7 +20,7 @@ def main(fleet: str, robot_name: str) -> None:
     """Keep everything above the mark, replace everything below."""
     path = FLEETS / f"{fleet}.toml"
     head = path.read_text(encoding="utf-8").split(MARK)[0]
-    table = validated(Table, tomllib.loads(head), path, UsageError)
+    table = validated(FleetTable, tomllib.loads(head), path, UsageError)
     seed, laws = table["seed"], complete(table["distribution"], path)
     robot = load_robot(robot_name)
     units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}

@@ -51,7 +51,7 @@ class Distribution:
     of_effort: bool = False  # in parts of the joint's torque limit
 
 
-class Table(TypedDict):
+class FleetTable(TypedDict):
     """A fleet file; robot: robot → unit → parameter, or the parameters of each joint."""
 
     seed: Annotated[int, Interval(ge=0, le=2**63)]
@@ -94,7 +94,7 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
         UsageError: No such fleet, or the file is not one; with the file and what is wrong.
     """
     path, loaded = load_toml("fleet", FLEETS, name_or_path)
-    table = validated(Table, loaded, path, UsageError)
+    table = validated(FleetTable, loaded, path, UsageError)
     seed, laws = table["seed"], complete(table["distribution"], path)
     saved = table.get("robot", {}).get(robot.name)
     if saved is None:

@@ -16,7 +16,7 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import equivalent_torque
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.virtual.fleet import Fleet
-from gaponet.virtual.unit import Event, VirtualRobot
+from gaponet.virtual.unit import UnitEvent, VirtualRobot
 
 Array = np.ndarray
 
@@ -99,7 +99,7 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
     return sequences
 
 
-def _events(seen: list[Event], end: float) -> list[dict[str, Any]]:
+def _events(seen: list[UnitEvent], end: float) -> list[dict[str, Any]]:
     """Start, what happened, end: each with its time in the recording, s."""
     middle = [{k: v for k, v in asdict(e).items() if v != ""} for e in seen if e.time < end]
     return [{"time": 0.0, "kind": "motion_start"}, *middle, {"time": round(end, 4), "kind": "motion_end"}]

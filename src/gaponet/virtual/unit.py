@@ -27,7 +27,7 @@ HOT = 80.0  # °C: winding temperature from which a unit reports it
 
 
 @dataclass(frozen=True)
-class Event:
+class UnitEvent:
     """Something that a unit reports beside its readings: kind is packet_lost, torque_limit or hot."""
 
     time: float  # s since reset
@@ -128,7 +128,7 @@ class VirtualRobot:
         self._push = np.zeros_like(target)
         self.backlash.reset(self._motor_torque())
         self._squares = np.zeros_like(target)
-        self.events: list[list[Event]] = [[] for _ in seeds]
+        self.events: list[list[UnitEvent]] = [[] for _ in seeds]
         self._reported = np.zeros((2, *target.shape), bool)
 
     def set_gains(self, kp: Array, kd: Array, effort: Array | None = None, torque: Array | float = 0.0) -> None:
@@ -225,10 +225,10 @@ class VirtualRobot:
             return
         for i in rows:
             if lost[i]:
-                self.events[i].append(Event(round(self._now, 4), "packet_lost"))
+                self.events[i].append(UnitEvent(round(self._now, 4), "packet_lost"))
             for kind, column in zip(*np.nonzero(begun[:, i]), strict=True):
                 joint = self.robot.joint_names[self.active[column]]
-                self.events[i].append(Event(round(self._now, 4), ("torque_limit", "hot")[kind], joint))
+                self.events[i].append(UnitEvent(round(self._now, 4), ("torque_limit", "hot")[kind], joint))
 
     def _draw(self) -> None:
         noise = np.stack([rng.standard_normal((NOISE_ROWS, 3, self.n)) for rng in self._rng])

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gaponet.study.played.kept import Kept, revived
+from gaponet.study.played.kept import KeptParts, revived
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,11 @@ def test_a_part_is_made_once_for_the_same_facts(tmp_path):
         made.append(1)
         return {"rows": [Row("a", None, np.nan, np.arange(3.0)), Row("b", 1, 0.25, np.zeros(2, np.float32))]}
 
-    kept = Kept(tmp_path / "parts", "robot", np.arange(4.0))
+    kept = KeptParts(tmp_path / "parts", "robot", np.arange(4.0))
     first, again = kept("gaponet", 0, make=make), kept("gaponet", 0, make=make)
     assert len(made) == 1
     assert first == again
-    Kept(tmp_path / "parts", "robot", np.arange(4.0) + 1e-6)("gaponet", 0, make=make)
+    KeptParts(tmp_path / "parts", "robot", np.arange(4.0) + 1e-6)("gaponet", 0, make=make)
     kept("gaponet", 1, make=make)
     assert len(made) == 3
 
@@ -41,7 +41,7 @@ def test_what_failed_is_not_kept(tmp_path):
     def fails():
         raise KeyboardInterrupt
 
-    kept = Kept(tmp_path)
+    kept = KeptParts(tmp_path)
     with suppress(KeyboardInterrupt):
         kept("x", make=fails)
     assert kept("x", make=lambda: {"ok": True}) == {"ok": True}

@@ -21,7 +21,7 @@ import numpy as np
 
 from gaponet.deploy.driver import DriverError, End, Fault, State
 from gaponet.deploy.drivers import feetech as reg
-from gaponet.deploy.drivers.so101_calibration import SPEAK, STEP, Row, numbered, read_calibration, settle
+from gaponet.deploy.drivers.so101_calibration import SPEAK, STEP, ServoRow, numbered, read_calibration, settle
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 
@@ -138,7 +138,7 @@ class SO101Driver:
                 )
         numbers = dict(zip(self.joint_names, servos, strict=True))
         held = {
-            joint: Row(id=servo, drive_mode=0, **{name: bus.read(servo, r) for name, r in HELD.items()})
+            joint: ServoRow(id=servo, drive_mode=0, **{name: bus.read(servo, r) for name, r in HELD.items()})
             for joint, servo in numbers.items()
         }
         self.steps = settle(self.given, held, self.robot, self.port)

@@ -26,7 +26,7 @@ Position = Annotated[int, at.Interval(ge=0, le=STEPS - 1)]
 
 
 @dataclass(frozen=True)
-class Row:
+class ServoRow:
     """One joint's row of the file; the register of that name holds the same, drive_mode and id aside."""
 
     id: Annotated[int, at.Interval(ge=1, le=253)]
@@ -36,14 +36,14 @@ class Row:
     range_max: Position
 
 
-class Calibration:
+class ArmCalibration:
     """Encoder steps ↔ rad of every joint, in the robot's order.
 
     0 rad is the middle of a joint's calibrated range, as in LeRobot. The gripper's is where it is in the MJCF: its
     lower limit is the end of the range at which the jaw is closed.
     """
 
-    def __init__(self, rows: dict[str, Row], robot: RobotSpec) -> None:
+    def __init__(self, rows: dict[str, ServoRow], robot: RobotSpec) -> None:
         """
         Args:
             rows: By joint.
@@ -72,14 +72,14 @@ class Calibration:
         return np.clip(np.rint(qpos / (STEP * self.sign) + self.zero), self.low, self.high).astype(int)
 
 
-def read_calibration(path: str | Path, robot: RobotSpec) -> Calibration:
+def read_calibration(path: str | Path, robot: RobotSpec) -> ArmCalibration:
     """The calibration of a file that lerobot-calibrate wrote.
 
     Raises:
         UsageError: The file is not one, or lacks a joint.
     """
     hint = f"give the file that lerobot-calibrate wrote for this arm ({WHERE})"
-    rows = read_json(dict[str, Row], Path(path), UsageError, hint)
+    rows = read_json(dict[str, ServoRow], Path(path), UsageError, hint)
     for joint in SPEAK:
         if joint not in rows:
             raise UsageError(f"{path}: no joint '{joint}', only {', '.join(rows) or 'none'}; {hint}")
@@ -87,17 +87,17 @@ def read_calibration(path: str | Path, robot: RobotSpec) -> Calibration:
             raise UsageError(f"{path}: {joint}: range_min is not below range_max; calibrate again")
     if len({rows[joint].id for joint in SPEAK}) < len(SPEAK):
         raise UsageError(f"{path}: two joints have the same id; {hint}")
-    return Calibration({joint: rows[joint] for joint in SPEAK}, robot)
+    return ArmCalibration({joint: rows[joint] for joint in SPEAK}, robot)
 
 
-def numbered(robot: RobotSpec) -> Calibration:
+def numbered(robot: RobotSpec) -> ArmCalibration:
     """Calibration of an arm of which only the servos' numbers are known, 1 to 6."""
-    whole = {joint: Row(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS - 1)
+    whole = {joint: ServoRow(id=i + 1, drive_mode=0, homing_offset=0, range_min=0, range_max=STEPS - 1)
              for i, joint in enumerate(SPEAK)}  # fmt: skip
-    return Calibration(whole, robot)
+    return ArmCalibration(whole, robot)
 
 
-def settle(given: Calibration | None, held: dict[str, Row], robot: RobotSpec, port: str) -> Calibration:
+def settle(given: ArmCalibration | None, held: dict[str, ServoRow], robot: RobotSpec, port: str) -> ArmCalibration:
     """The calibration that holds: the file's if the servos hold the same, or the servos' own without a file.
 
     Raises:
@@ -110,7 +110,7 @@ def settle(given: Calibration | None, held: dict[str, Row], robot: RobotSpec, po
                 f"{port}: the servos hold no calibration (no limits in {', '.join(blank)}); run lerobot-calibrate, "
                 f"which writes it into them, and say --calibration FILE ({WHERE})"
             )
-        return Calibration(held, robot)
+        return ArmCalibration(held, robot)
     for joint in SPEAK:
         for field in ("homing_offset", "range_min", "range_max"):
             said, found = getattr(given.rows[joint], field), getattr(held[joint], field)

@@ -17,7 +17,7 @@ import numpy as np
 from gaponet.deploy.clock import uncollected
 from gaponet.deploy.drivers import feetech as reg
 from gaponet.deploy.drivers.so101 import FULL, STALL_CURRENT, STIFFNESS
-from gaponet.deploy.drivers.so101_calibration import GRIPPER, SPEAK, STEP, STEPS, TURNS, Calibration, Row
+from gaponet.deploy.drivers.so101_calibration import GRIPPER, SPEAK, STEP, STEPS, TURNS, ArmCalibration, ServoRow
 from gaponet.deploy.drivers.virtual import LiveUnit
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
@@ -46,7 +46,7 @@ class VirtualSO101:
         self.robot = robot
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(SPEAK)  # servo number − 1 → joint
-        self.calibration = Calibration(_as_calibrated(robot), robot)
+        self.calibration = ArmCalibration(_as_calibrated(robot), robot)
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.port, self._slave = os.ttyname(slave), slave
@@ -179,7 +179,7 @@ class VirtualSO101:
         self.live.set_gains(kp, kd, effort)
 
 
-def _as_calibrated(robot: RobotSpec) -> dict[str, Row]:
+def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
     """What LeRobot's calibration finds on an arm whose joints stop where the MJCF's do."""
     rows = {}
     for number, joint in enumerate(SPEAK, 1):
@@ -187,7 +187,7 @@ def _as_calibrated(robot: RobotSpec) -> dict[str, Row]:
         half = (STEPS - 1) / 2 if joint == TURNS else (high - low) / 2 / STEP
         middle = STEPS / 2 - (0.5 if joint == TURNS else 300 if joint == GRIPPER else 0)
         ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
-        rows[joint] = Row(id=number, drive_mode=0, homing_offset=17 * number, **ends)
+        rows[joint] = ServoRow(id=number, drive_mode=0, homing_offset=17 * number, **ends)
     return rows
 
 

@@ -14,7 +14,7 @@ from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.study.played.goals import Plan, Planner
-from gaponet.study.played.kept import Kept, revived
+from gaponet.study.played.kept import KeptParts, revived
 from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, side_by_side, with_payloads
 from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
@@ -108,7 +108,7 @@ def deliver(
     mass, seeds = np.array([p for _, p in pairs]), list(range(len(pairs)))
     asked = {id(plan): planner.places(plan.ctrl) for plan in plans}
     last, shown = round(LAST / robot.dt), len(pairs) // 2 // len(payloads) * len(payloads) + len(payloads) - 1
-    kept = Kept(folder, "delivery", model_hash(robot), unit, plans, payloads)
+    kept = KeptParts(folder, "delivery", model_hash(robot), unit, plans, payloads)
     found: list[Placed] = []
     costs: list[Cost] = []
     places: dict[str, Array] = {}

@@ -18,7 +18,7 @@ from gaponet.data.json_file import finite, read_kept, write_json
 T = TypeVar("T")
 
 
-class Kept:
+class KeptParts:
     """Answers of calls by everything that they depend on, a JSON file each; without a folder, nothing is kept."""
 
     def __init__(self, folder: Path | None, *facts: Any) -> None:

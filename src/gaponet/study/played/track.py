@@ -15,7 +15,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
-from gaponet.study.played.kept import Kept, revived
+from gaponet.study.played.kept import KeptParts, revived
 from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, side_by_side, with_payloads
 from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
@@ -87,7 +87,7 @@ def track(
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
     lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)
     mass = np.array([p for _, p in pairs])
-    kept = Kept(folder, "tracking", model_hash(robot), unit, unit_id, list(motions), payloads)
+    kept = KeptParts(folder, "tracking", model_hash(robot), unit, unit_id, list(motions), payloads)
 
     def drive(name: str, driven: Driven | None) -> Played:
         return play(robot, unit, targets, mass, list(range(len(pairs))), driven, lengths, partial(tell, name))
@@ -123,7 +123,7 @@ def align(
     robot: RobotSpec,
     trained: ListOf[Trained],
     tell: Tell = lambda what, share: None,
-    kept: Kept = Kept(None),  # noqa: B008
+    kept: KeptParts = KeptParts(None),  # noqa: B008
 ) -> list[Score]:
     """Free runs of every simulator under the recordings' targets, from their first state.
 

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import UsageError
-from gaponet.eval.evaluate import read_split
+from gaponet.eval.evaluate import split_of_run
 from gaponet.motion.files import SUFFIXES, read_motion
 from gaponet.motion.library import Library
 from gaponet.motion.upper_body import BUILDERS
@@ -119,7 +119,7 @@ def require_unseen(
 
 def trained_on(dataset: Dataset, trained: ListOf[Trained]) -> set[str]:
     """Names of the motions that any of the runs was trained or chosen on."""
-    hashes = {h for t in trained for part in ("train", "val") for h in read_split(t.run)[part].values()}
+    hashes = {h for t in trained for part in ("train", "val") for h in split_of_run(t.run)[part].values()}
     found = {e.meta.motion for e in dataset.entries if e.hash in hashes}
     if not found:
         raise UsageError(f"{dataset.path}: holds nothing that these runs were trained on; give the dataset of the runs")
