@@ -22,7 +22,7 @@ from gaponet.data.pair import Twin
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
 from gaponet.eval import run_files
-from gaponet.eval.evaluate import read_split as read_run_split
+from gaponet.eval.evaluate import split_of_run as read_run_split
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
