@@ -1,4 +1,4 @@
-# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types.
+# make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types. make site: docs/ as a site.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers adversary fuzz kills check clean
+.PHONY: setup demo test faults peers adversary fuzz kills check site clean
 
 setup: $(VENV)/.done
 
@@ -55,5 +55,9 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# docs/ as a site in site/; a broken link or a name that is not in the package ends the build.
+site: setup
+	$(BIN)/zensical build --strict --clean
+
 clean:
-	rm -rf $(VENV) demo_run kills_work .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) site demo_run kills_work .pytest_cache .ruff_cache .mypy_cache

@@ -23,3 +23,10 @@ def test_parts_that_run_side_by_side_are_told_together(capfd):
     with progress.bars("runs", 4) as show:
         show({"mlp seed 0": (0.5, "round 3"), "gaponet seed 0": (0.25, "")}, 1)
     assert capfd.readouterr().err == "runs: 44 %, 0 s, 1 of 4 done; mlp seed 0 50 % round 3; gaponet seed 0 25 %\n"
+
+
+def test_in_a_notebook_progress_is_text_on_stderr(capfd, monkeypatch):
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+    with progress.bar("training") as update:
+        update(1, 2, "half")
+    assert capfd.readouterr().err.startswith("training: 50 %")

@@ -71,8 +71,8 @@ def import_logs(
         out: Dataset folder; appended to where it exists.
         unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
         payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
-        options: Of data.importer.import_logs: payload_side, level, fmt, kp, kd, joint_map, columns, position_unit,
-            time_unit.
+        options: payload_side, level, fmt, kp, kd, joint_map, columns, position_unit, time_unit, as
+            data.importer.import_logs takes them.
 
     Raises:
         LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
@@ -93,7 +93,18 @@ def import_logs(
 
 
 def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> Diagnosis:
-    """Look through a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque."""
+    """Look through a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
+
+    Args:
+        dataset: Recordings.
+        robot: Another robot than the one that the dataset keeps.
+
+    Returns:
+        verdict, one sentence; findings, worst first; one row of numbers per sequence and per joint.
+
+    Raises:
+        DatasetError: The folder is no dataset, or damaged.
+    """
     from gaponet.data.doctor import diagnose
 
     data, spec = open_dataset(dataset, robot)
@@ -102,7 +113,18 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:
-    """Replay every sequence in the nominal simulator and keep the twin beside it; returns how many were made."""
+    """Replay every sequence in the nominal simulator and keep the twin beside it; twins already there stay.
+
+    Args:
+        dataset: Recordings.
+        robot: Another robot than the one that the dataset keeps.
+
+    Returns:
+        How many twins were made.
+
+    Raises:
+        DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
+    """
     from gaponet.sim.pairing import pair_dataset
 
     data, spec = open_dataset(dataset, robot)
@@ -114,11 +136,11 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> in
 def gap(
     dataset: Dataset | Place, robot: RobotSpec | Place | None = None, motions: tuple[str, ...] = ()
 ) -> dict[str, Any]:
-    """How far the nominal simulator is from the robot, in whole-motion free run.
+    """Measure how far the nominal simulator is from the robot, in whole-motion free run.
 
     Args:
         dataset: Sequences without a twin are replayed first.
-        robot: If not the one that the dataset keeps.
+        robot: Another robot than the one that the dataset keeps.
         motions: Only these.
 
     Returns:
@@ -145,7 +167,7 @@ def gap(
 
 @dataclass(frozen=True)
 class Identification:
-    """What identification found, and what it is worth.
+    """The identified robot, and its error on validation motions.
 
     Attributes:
         found: Robot with identified servos, window RMS before and after [rad], warnings.
@@ -175,6 +197,9 @@ def identify(
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
         mixed_gains: Take recordings made with different kp or kd together.
+
+    Raises:
+        DatasetError, UsageError: A unit is not there, or gains differ.
     """
     from gaponet.data.sequence import require_same_gains
     from gaponet.data.split import split_entries
@@ -227,13 +252,17 @@ def train(
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else (train.config); default TrainConfig().
         model: gaponet, or a baseline: mlp, transformer, fno, inverse; default that of the config.
-        robot: If not the one that the dataset keeps, e.g. the folder that identify wrote.
+        robot: Another robot than the one that the dataset keeps, e.g. the folder that identify wrote.
         holdout_units: Units never trained on; their test motions stay in the test part.
         resume: Go on with the run in out.
         log: tensorboard, wandb.
 
+    Returns:
+        The exported model; RUN/model holds it.
+
     Raises:
         ModelError: The budget bought no training step.
+        DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
     from gaponet.files import writing
     from gaponet.training.budget import Budget, Status
@@ -268,7 +297,10 @@ def evaluate(
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these.
-        robot: If not the one that the dataset keeps.
+        robot: Another robot than the one that the dataset keeps.
+
+    Raises:
+        DatasetError, ModelError: A recording is not there or was used in training, or a model fits another robot.
     """
     from gaponet.eval.evaluate import evaluate as step
     from gaponet.eval.evaluate import save
@@ -305,8 +337,11 @@ def calibrate(
             where the unit played none of them.
         seconds: How much of the recordings to use, in windows of 8 s.
         unknown_payload: Do not believe the recordings' payload, estimate it too; all must carry the same.
-        robot: If not the one that the dataset keeps.
+        robot: Another robot than the one that the dataset keeps.
         mixed_gains: Take recordings made with different kp or kd together.
+
+    Raises:
+        UsageError, ModelError: The unit is not named, or the model fits another robot.
     """
     from gaponet.data.sequence import require_same_gains
     from gaponet.eval.evaluate import corrected_robot

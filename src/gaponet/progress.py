@@ -49,7 +49,7 @@ def bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
 
 @contextmanager
 def _progress(title: str) -> Iterator[Show]:
-    console = Console(stderr=True)
+    console = Console(stderr=True, force_jupyter=False)  # in a notebook it is text as well
     if not console.is_terminal:
         yield _lines(title, console)
         return

@@ -59,7 +59,7 @@ class RobotSpec:
         damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
             where the MJCF's stands.
         delay: From command to servo, (n), s.
-        offset: Of the servo's zero: it aims at command + offset, (n), rad.
+        offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
     """
 

@@ -22,7 +22,12 @@ from gaponet.robot import RobotSpec
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """findings: worst first. sequences, joints: one row of numbers each, for tables."""
+    """What was found in a dataset.
+
+    Attributes:
+        findings: What to look at, worst first.
+        sequences, joints: One row of numbers each, for tables.
+    """
 
     findings: list[Finding]
     sequences: list[dict[str, Any]]

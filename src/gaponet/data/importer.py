@@ -34,8 +34,8 @@ class ImportReport:
     """What one import added.
 
     Attributes:
-        entries: Added.
-        present: There before, by the content of the source's other recordings.
+        entries: Sequences that were added.
+        present: Sequences of this source that were there before, by their content.
         offsets: None where no gravity model was given or several units were recorded.
     """
 

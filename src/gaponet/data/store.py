@@ -148,7 +148,7 @@ class Dataset:
         return len(self.entries)
 
     def hours(self) -> float:
-        """Recorded time."""
+        """Recorded time in all, h."""
         return sum(e.rows * e.dt for e in self.entries) / 3600
 
     def find(self, content_hash: str) -> Entry | None:

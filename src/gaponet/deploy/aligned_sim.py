@@ -92,13 +92,13 @@ class AlignedSim:
         ctrl: Array | None = None,
         ids: Array | slice = slice(None),
     ) -> None:
-        """Begin anew.
+        """Start the simulations, or some of them, in a new state.
 
         Args:
             qpos: Positions, rad; default home.
             qvel: Velocities, rad/s.
             ctrl: Target in force before, rad, which late servos (robot.delay) still follow; default qpos.
-            ids: Only these simulations, (k,); arrays are then (k, n).
+            ids: Which simulations, (k,); arrays are then (k, n).
         """
         count = len(np.arange(self.num_envs)[ids])
         q = np.broadcast_to(self.qpos_home if qpos is None else np.asarray(qpos, float), (count, self.n))
@@ -111,7 +111,7 @@ class AlignedSim:
         self._asked = self.target[:, self.op]
 
     def step(self, ctrl: Array) -> None:
-        """Ask for targets, rad, for one control period."""
+        """Step one control period under targets `ctrl`, rad, which the model corrects."""
         sim, op, target = self.sim, self.op, self.target
         target[:] = ctrl
         self._asked = target[:, op]

@@ -106,14 +106,14 @@ class Compensator:
         Args:
             robot: The simulator that the model corrects (AlignedSim).
             model: What training made.
-            config: How.
+            config: How the robot is made to follow.
             dt: Control period, s; default the robot's.
             num_envs: Robots side by side; None for one, with arrays (n,).
-            payload_side: Which hands carry it.
+            payload_side: The hands that carry the payload: "both", or the side of one mount.
             payload_step: Masses that the shadow can carry are this far apart, up to the heaviest trained on, kg.
-            nthread: Threads.
+            nthread: Threads of the shadow simulators.
             extrapolate: Take payloads beyond those trained on, up to the model's payload_max.
-            calibration: Of the unit that is commanded (gaponet calibrate): the shadow is that unit.
+            calibration: What `calibrate` found for the unit that is commanded; the shadow is then that unit.
         """
         self.dt = robot.dt if dt is None else dt
         model.require(robot, self.dt)
@@ -152,7 +152,7 @@ class Compensator:
         """Begin at rest at a target, uncompensated; commands blend in from there.
 
         Args:
-            target: In force, rad.
+            target: The target in force, rad.
             payload_mass: kg, one number or (num_envs,); None to estimate it from commands and positions.
 
         Raises:
@@ -200,8 +200,9 @@ class Compensator:
         Args:
             target: What the robot is asked for, rad; with a lead, that many periods from now. Where it is not a number,
                 the last that was one holds.
-            qpos, qvel: Measured now, rad, rad/s; qpos None where no fresh state has arrived: feedback then waits, as it
-                does where one of these is not a number.
+            qpos: Measured now, rad; None where no fresh state has arrived: feedback then waits, as it does where qpos
+                or qvel is not a number.
+            qvel: Measured now, rad/s.
             tau: Measured joint torque, N·m, for the payload estimate; default that of the servo law, kp (u − q) − kd q̇.
         """
         told = self._all(target)

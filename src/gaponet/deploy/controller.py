@@ -76,14 +76,14 @@ class Controller:
         Args:
             driver: The robot; not yet connected.
             robot: Its type.
-            config: Timing.
-            safety: Limits and watchdogs.
-            compensator: Between targets and commands.
+            config: Times of the phases.
+            safety: Limits and watchdogs; default SafetyConfig().
+            compensator: Turns targets into commands; without one targets are sent as they are.
             clock: Default the machine's monotonic clock.
             guard: Start the process that damps the robot if this one dies, where the driver has one.
             payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
-            on_event: Told every change of phase.
-            on_connect: Given the robot once it has answered and nothing was commanded; may refuse it.
+            on_event: Called with every change of phase.
+            on_connect: Called with the driver once the robot has answered and nothing was commanded; may refuse it.
             meta: Kept with the recording (unit, model…).
         """
         self.driver, self.robot, self.compensator = driver, robot, compensator
@@ -109,11 +109,11 @@ class Controller:
         self._unfresh: Fault | None = None
 
     def run(self, policy: Policy, keys: bool = False) -> Recording:
-        """Go through all phases; returns when stopped.
+        """Go through all phases and return what was recorded, when the policy ends or the run is stopped.
 
         Args:
-            policy: Targets of the run, asked once a period.
-            keys: Any key on the terminal stops.
+            policy: Says the targets of the run, once a control period.
+            keys: Whether any key on the terminal stops the run.
 
         Raises:
             DriverError: The robot could not be reached; nothing was commanded.

@@ -41,7 +41,7 @@ class MujocoAligner:
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand. Give the scene that mass as well.
-            prefix: Of the robot's names in the scene ("left/").
+            prefix: What stands before the robot's names in the scene ("left/").
             extrapolate: Take a payload beyond those trained on.
         """
         model.require_rate(dt)
@@ -74,7 +74,7 @@ class MujocoAligner:
                     )
 
     def reset(self) -> None:
-        """Another motion begins."""
+        """Forget the past, because another motion begins."""
         self.loop.reset()
 
     def __call__(self, data: mujoco.MjData, ctrl: Array) -> Array:

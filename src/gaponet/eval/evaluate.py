@@ -37,7 +37,14 @@ ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Free runs by method, their metrics, and the corrections applied by each learned model."""
+    """Free runs by method, their metrics, and the corrections applied by each learned model.
+
+    Attributes:
+        result: methods → method → metrics (mpjae rad, q_dis rad·s, …), and by_joint, by_motion, … the same; unseen says
+            whether no recording was used in training.
+        runs: Method → free runs, one per sequence.
+        deltas: Method → corrections applied, (T, n operated) rad, one array per sequence.
+    """
 
     result: dict[str, Any]
     runs: dict[str, list[Run]]

@@ -194,7 +194,7 @@ class GapModel:
         Args:
             path: Folder.
             backend: onnxruntime, or numpy, which needs nothing else.
-            threads: Of onnxruntime; 0 for all cores, which pays for hundreds of robots at once.
+            threads: How many onnxruntime uses; 0 for all cores, which pays for hundreds of robots at once.
 
         Raises:
             ModelError: Missing or damaged file, or one written by a newer version.
@@ -292,7 +292,7 @@ class GapModel:
             )
 
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
-        """For sim.replay and the aligned simulator; refuses a robot the model was not trained on."""
+        """The corrections for sim.replay and AlignedSim; refuses a robot the model was not trained on."""
         self.require(robot)
         points = None
         if self.config.learns_points:
@@ -302,7 +302,7 @@ class GapModel:
         return DeltaCorrector(self.infer, self.config, robot, points)
 
     def weights_hash(self) -> str:
-        """12 hex digits of model.onnx."""
+        """First 12 hex digits of the SHA-256 of model.onnx."""
         return sha256(self.path / WEIGHTS)[:12]
 
 

@@ -37,11 +37,11 @@ class Calibration:
     """One unit's servo parameters.
 
     Attributes:
-        unit_id: Whose.
+        unit_id: The unit.
         weights: Hash of the model.onnx that they were fitted under.
         servos: Joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
         logs: Content hashes of the recordings used.
-        seconds: How much of them.
+        seconds: How many seconds of them.
         before, after: RMS error of the windows fitted, rad.
         payload_mass, payload_std: What the unit carried, kg, and its standard error, where nobody knew; else None.
     """

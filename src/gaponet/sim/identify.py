@@ -33,8 +33,8 @@ class Identified:
         robot: The same robot with identified parameters.
         before, after: RMS error of the windows, rad.
         warnings: What the recordings do not determine, or what ended at a bound.
-        evaluations: Of the whole set of windows, Jacobians not counted.
-        payload_mass, payload_std: kg in each hand that is said to carry, where it was asked for.
+        evaluations: How often the whole set of windows was simulated, Jacobians not counted.
+        payload_mass, payload_std: Estimated kg in each hand that carries, and its standard error, where asked for.
     """
 
     robot: RobotSpec

@@ -1,0 +1,39 @@
+"""The notebook runs from its first cell to its last, and its model is better than the simulator it corrects."""
+
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+
+pytest.importorskip("ipykernel")
+from jupyter_client import AsyncKernelManager
+from nbclient import NotebookClient
+
+FILE = Path(__file__).parents[2] / "examples" / "quickstart.ipynb"
+
+
+def texts(notebook):
+    for cell in notebook.cells:
+        for out in cell.get("outputs", ()):
+            yield out.get("text") or out.get("data", {}).get("text/plain", "")
+
+
+def test_the_notebook_goes_from_logs_to_a_model_that_is_better_than_the_simulator_on_motions_never_seen(
+    tmp_path, tmp_path_factory, monkeypatch
+):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
+    kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=str(tmp_path_factory.mktemp("k") / "s"))
+    notebook = nbformat.read(FILE, 4)
+    NotebookClient(notebook, timeout=300, km=kernel).execute()
+    said = "\n".join(texts(notebook))
+    error = {name: float(x) for name, x in re.findall(r"'(\w+)': '([\d.]+) mrad'", said)}
+    assert error["gaponet"] < 0.5 * error["nominal"]
+    assert any("image/png" in out.get("data", {}) for cell in notebook.cells for out in cell.get("outputs", ()))
+
+
+def test_the_notebook_as_it_is_kept_shows_results_and_no_place_of_the_machine_that_made_them():
+    kept = "\n".join(texts(nbformat.read(FILE, 4)))
+    assert re.search(r"'gaponet': '[\d.]+ mrad'", kept)
+    assert not re.search(r"/(tmp|home|work|root)/", FILE.read_text(encoding="utf-8"))
