@@ -15,7 +15,7 @@ from typing import Any
 
 import tyro
 
-GAPONET = [sys.executable, "-m", "gaponet.cli.main"]
+GAPONET = [sys.executable, "-m", "gaponet"]
 
 
 def main(

@@ -43,7 +43,7 @@ def main(
         no_stop: Let a late loop and an old state pass, and count them.
     """
     robot = load_robot("h1_2")
-    command = [sys.executable, "-m", "gaponet.cli.main", "virtual", "serve", "--payload-mass", str(payload_mass)]
+    command = [sys.executable, "-m", "gaponet", "virtual", "serve", "--payload-mass", str(payload_mass)]
     command += ["--domain", str(domain), "--rate", str(state_rate)]
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:

@@ -10,10 +10,15 @@ The names below are what is public. `import gaponet` loads numpy alone; simulato
 by the functions that use them.
 """
 
+from __future__ import annotations
+
 from importlib import import_module
-from typing import Any
 
 from gaponet.errors import GAPONetError
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import Any
 
 __version__ = "0.1.0"
 

@@ -11,7 +11,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -43,8 +43,7 @@ def whole(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         sync(path.parent)
     except OSError as error:
-        error.filename, error.filename2 = str(path), None
-        raise
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -147,12 +146,17 @@ def _sole(folder: Path, kind: str, wait: float) -> int:
         time.sleep(0.05)
 
 
-def lock(path: Path) -> int | None:
-    """Lock a file, made if missing, against other processes; returns its descriptor, None where another has it."""
+def lock(path: Path, opened: Callable[[Path], int] | None = None) -> int | None:
+    """Lock a file, made if missing, against other processes; returns its descriptor, None where another has it.
+
+    Args:
+        path: The file.
+        opened: Opens it, for a file that may be another user's; by default it is opened for writing.
+    """
     import fcntl
 
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = opened(path) if opened else os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):

@@ -5,7 +5,8 @@ import json
 
 import numpy as np
 import pytest
-from arm import commands
+from arm import TOML, commands, write_arm
+from runs import untrained
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
@@ -72,3 +73,14 @@ def test_a_real_robot_is_not_moved_without_asking(arm, tmp_path, capsys, monkeyp
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main(["run", "--driver", "unitree", "--motion", str(tmp_path / "still.npz")]) == 2
     assert "no terminal to ask on" in capsys.readouterr().err
+
+
+def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(arm, motion, tmp_path, capsys):
+    model = untrained(tmp_path / "run", arm, Dataset.create(tmp_path / "set", arm))
+    write_arm(tmp_path / "stiffer", TOML.replace("kp = 20.0", "kp = 40.0"))
+    for place in (model, model / "model"):
+        words = ["run", "--motion", motion, "--model", str(place), *FAST]
+        assert main(words) == 0
+        assert json.loads(capsys.readouterr().out)["robot"] == arm.name
+        assert main([*words, "--robot", str(tmp_path / "stiffer")]) == 2
+        assert "another robot, or other gains or inertias" in " ".join(capsys.readouterr().err.split())

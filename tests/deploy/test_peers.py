@@ -28,7 +28,7 @@ pytestmark = pytest.mark.peers
 
 DOMAIN = 20 + os.getpid() % 150
 SECONDS = float(os.environ.get("GAPONET_PEER_SECONDS", "60"))
-GAPONET = [sys.executable, "-m", "gaponet.cli.main"]
+GAPONET = [sys.executable, "-m", "gaponet"]
 PINNED = "cyclonedds==0.10.2"  # has wheels up to Python 3.10
 
 

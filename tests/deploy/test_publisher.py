@@ -11,7 +11,7 @@ from gaponet.deploy.publisher import sole_publisher
 from gaponet.errors import UsageError
 
 TRY = """
-import os, sys
+import fcntl, os, sys
 sys.path[:0] = sys.argv[2:]
 from gaponet.deploy.publisher import sole_publisher
 from gaponet.errors import UsageError

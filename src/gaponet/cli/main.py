@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import io
 import os
 import signal
@@ -67,13 +68,13 @@ def load(command: str) -> Callable[..., Any]:
     return getattr(import_module(module), function)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns its exit code."""
+def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
+    """Run a command; returns its exit code. `begin` is called when all options are understood, before the command is."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack our letters, and a file's name may be no text
             stream.reconfigure(errors="backslashreplace")
     try:
-        _run(list(sys.argv[1:] if argv is None else argv))
+        _run(list(sys.argv[1:] if argv is None else argv), begin)
         sys.stdout.flush()
     except GAPONetError as error:
         return _say(f"{type(error).__name__.removesuffix('Error')}: {error}")
@@ -95,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(argv: list[str]) -> None:
+def _run(argv: list[str], begin: Callable[[], object]) -> None:
     if argv == ["--version"]:
         from gaponet import __version__
 
@@ -111,8 +112,16 @@ def _run(argv: list[str]) -> None:
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
 
+    def begun(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def run(*args: Any, **kwargs: Any) -> Any:
+            begin()
+            return command(*args, **kwargs)
+
+        return run
+
     tyro.extras.subcommand_cli_from_dict(
-        {name: load(name) for name in (COMMANDS if completing else (name,))},
+        {name: begun(load(name)) for name in (COMMANDS if completing else (name,))},
         prog="gaponet",
         description=ABOUT,
         args=argv,
@@ -144,19 +153,3 @@ def _say(text: str) -> int:
     """An error in one line, and its exit code."""
     print(plain(text), file=sys.stderr)
     return 2
-
-
-def entry() -> None:
-    """Console script."""
-    try:
-        code = main()
-    except KeyboardInterrupt:  # while an error was being said
-        code = 128 + signal.SIGINT
-    signal.signal(
-        signal.SIGINT, signal.SIG_DFL
-    )  # what is left is Python's own end, which a second Ctrl-C may cut short
-    sys.exit(code)
-
-
-if __name__ == "__main__":
-    entry()

@@ -97,7 +97,7 @@ def run(
     Args:
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz).
         driver: virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial).
-        robot: Name or folder; default h1_2, or so101 with that driver.
+        robot: Name or folder; default the one that the model's run keeps; without a model h1_2, or so101 with so101.
         model: Run or artifact folder: compensate with it, so that the robot gets to where the motion says.
         payload_mass: kg in each hand; with a model, None estimates it.
         payload_side: both, or one hand.
@@ -162,9 +162,17 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
 
 
 def asked_robot(asked: Request) -> RobotSpec:
-    """The robot named, or the driver's usual one."""
+    """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
+    from gaponet.errors import ModelError
     from gaponet.robot import load_robot
+    from gaponet.robot_folder import keeps_robot, kept_robot
+    from gaponet.sim.kept import require_kept
 
+    place = None if asked.model is None else asked.model.parent if asked.model.name == "model" else asked.model
+    if place is not None and asked.robot is not None:
+        return require_kept(place, load_robot(asked.robot), ModelError, "leave --robot out")
+    if place is not None and keeps_robot(place):
+        return kept_robot(place, "")
     return load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
 
 

@@ -68,6 +68,8 @@ def virtual(
     from gaponet.virtual.fleet import load_fleet
 
     out, spec = Out(), load_robot(robot)
+    if heard and not heard.parent.is_dir():  # said now, not when all has been heard
+        raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
     natural = "serial" if spec.name == "so101" else "dds"
     if (transport or natural) != natural:
         raise UsageError(f"--transport {transport}: {spec.name} speaks {natural}")

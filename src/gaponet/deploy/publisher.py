@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 from collections.abc import Iterator
@@ -10,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gaponet.errors import UsageError
+from gaponet.files import lock
 
 LOCKS = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR says
 
@@ -24,14 +24,12 @@ def sole_publisher(address: str) -> Iterator[int]:
     name = re.sub(r"[^A-Za-z0-9]+", "-", address).strip("-")
     path = LOCKS / f"gaponet-{name}.lock"
     try:
-        descriptor = _opened(path)
+        descriptor = lock(path, _opened)
     except OSError as error:
         raise UsageError(f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner") from None
+    if descriptor is None:
+        raise UsageError(f"{address}: another process commands this robot ({path}); stop it first")
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"{address}: another process commands this robot ({path}); stop it first") from None
         yield descriptor
     finally:
         os.close(descriptor)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 from gaponet.files import whole
+from gaponet.text import plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,6 +35,7 @@ STYLE: dict[Any, Any] = {
 }
 DASHED = (0, (4, 1.5))
 ENTRY = 1.9  # inches that a legend's entry takes
+LONGEST, LABEL = 120, 32  # letters of a line, and of one beside an axis or in a legend
 
 
 def figure(width: float, height: float) -> Figure:
@@ -44,16 +46,37 @@ def figure(width: float, height: float) -> Figure:
 
 
 def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
-    """Decorator: draw under STYLE."""
+    """Decorator: draw under STYLE, whatever names hold."""
 
     @wraps(draw)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
         import matplotlib as mpl
 
         with mpl.rc_context(STYLE):
-            return draw(*args, **kwargs)
+            return _printable(draw(*args, **kwargs))
 
     return wrapped
+
+
+def _printable(fig: Figure) -> Figure:
+    """The same figure with words that can be drawn: controls are escapes, which no font has nor an SVG may hold, and of
+    a line longer than there is room for, the middle is left out."""
+    from matplotlib.legend import Legend
+    from matplotlib.text import Text
+    from matplotlib.ticker import FixedFormatter, FuncFormatter
+
+    def lines(text: str, most: int) -> str:
+        every = map(plain, text.split("\n"))
+        return "\n".join(s if len(s) <= most else f"{s[: most // 2]}…{s[-most // 2 :]}" for s in every)
+
+    for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
+        ticks = axis.get_major_formatter()
+        if isinstance(ticks, (FixedFormatter, FuncFormatter)):
+            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), LABEL)))  # type: ignore[misc]
+    entries = {text for legend in fig.findobj(Legend) for text in legend.get_texts()}
+    for text in fig.findobj(Text):
+        text.set_text(lines(text.get_text(), LABEL if text in entries else LONGEST))
+    return fig
 
 
 def legend(fig: Figure, title: str = "", below: bool = False) -> None:

@@ -53,7 +53,7 @@ def watch(scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
             scene.model, scene.data, key_callback=play.key, show_left_ui=False, show_right_ui=False
         )
     except RuntimeError as error:  # macOS: the window belongs to the main thread
-        raise UsageError(f"{error}. Run: mjpython -m gaponet.cli.main view …, or use --render or --web") from None
+        raise UsageError(f"{error}. Run: mjpython -m gaponet view …, or use --render or --web") from None
     with window:
         with window.lock():
             _aim(window.cam, scene)

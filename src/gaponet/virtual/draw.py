@@ -9,6 +9,7 @@ import sys
 import tomllib
 
 from gaponet.errors import UsageError
+from gaponet.files import write_text
 from gaponet.robot import load_robot
 from gaponet.structure import validated
 from gaponet.virtual.fleet import FLEETS, UNITS, FleetTable, complete, draw, to_toml
@@ -24,7 +25,7 @@ def main(fleet: str, robot_name: str) -> None:
     seed, laws = table["seed"], complete(table["distribution"], path)
     robot = load_robot(robot_name)
     units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
-    path.write_text(head + MARK + to_toml(robot, units), encoding="utf-8")
+    write_text(path, head + MARK + to_toml(robot, units))
 
 
 if __name__ == "__main__":

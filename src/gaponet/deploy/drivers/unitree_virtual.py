@@ -18,6 +18,7 @@ from gaponet.deploy.clock import MonotonicClock, uncollected
 from gaponet.deploy.drivers import hg
 from gaponet.deploy.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
 from gaponet.deploy.drivers.virtual import LiveUnit
+from gaponet.files import whole
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
@@ -48,7 +49,8 @@ class Heard:
 
     def save(self, path: Path) -> None:
         """Write what was heard as npz."""
-        np.savez_compressed(path, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
+        with whole(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
 
 
 class VirtualH12:
