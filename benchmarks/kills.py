@@ -8,6 +8,7 @@ Records a small VIRTUAL SO-101 set in WORK/input, then carries out each command 
     full       on a tmpfs that is too small, then on the same one made larger (root only)
     read_only  on a tmpfs mounted read-only (root only)
     races      twice at once into one folder
+    mixed      import and collect at once into one dataset; the one refused follows
     foreign    into a folder that holds a `.git`
 
 What is compared at the end of each is the content of the folder. Prints one JSON object; exits with 1 where a content
@@ -43,6 +44,7 @@ from gaponet.files import MARK
 TRAIN = ["--model.history", "2", "--warm-start.num-envs", "16", "--warm-start.steps", "40", "--warm-start.rounds", "3",
          "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip
 LIMIT_S = 600.0
+REFUSALS = ("Folder", "File", "Usage", "Dataset", "Model")  # what an error's line may begin with
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,13 @@ class Trial:
         text = self.log.read_text(errors="replace") if self.log.is_file() else ""
         if code not in meant or "Traceback" in text:
             self.wrong.append(f"{what}: exit {code}: {text.strip().splitlines()[-1:] or ''}")
-        elif code == 2 and text.strip().splitlines()[-1].split(":")[0] not in ("Folder", "File", "Usage", "Dataset"):
+        elif code == 2 and text.strip().splitlines()[-1].split(":")[0] not in (
+            "Folder",
+            "File",
+            "Usage",
+            "Dataset",
+            "Model",
+        ):
             self.wrong.append(f"{what}: no one-line error: {text.strip().splitlines()[-1]}")
         self.log.unlink(missing_ok=True)
 
@@ -284,6 +292,36 @@ class Trial:
             self.wrong.append(f"foreign: {out} was changed")
 
 
+def mixed(given: Path, work: Path, turns: int = 5) -> dict[str, Any]:
+    """Two commands at once into one dataset: one waits or is refused, and both together add what each adds alone."""
+    both = [cases(given)[name] for name in ("import", "collect")]
+    count: Counter[str] = Counter()
+    wrong: list[str] = []
+    work.mkdir()
+
+    def hashes(out: Path) -> list[str]:
+        data = Dataset(out)
+        data.sequences()
+        return sorted(e.hash for e in data.entries)
+
+    for i, case in enumerate(both):
+        wait(start(case.argv(work / f"alone-{i}"), work / "alone.txt"))
+    expected = sorted(set(hashes(work / "alone-0")) | set(hashes(work / "alone-1")))
+    for turn in range(turns):
+        out, log = work / f"mixed-{turn}", work / f"mixed-{turn}.txt"
+        running = [start(case.argv(out), log) for case in both[:: 1 - 2 * (turn % 2)]]
+        codes = [wait(process) for process in running][:: 1 - 2 * (turn % 2)]
+        count["refused"] += codes.count(2)
+        codes += [wait(start(case.argv(out), log)) for case, code in zip(both, codes, strict=True) if code == 2]
+        count["mixed"] += 1
+        stored = [p.stem for p in (out / "sequences").iterdir()]
+        if hashes(out) != expected or sorted(stored) != sorted(e.id for e in Dataset(out).entries):
+            wrong.append(f"mixed: {out} does not hold what both add")
+        if set(codes) - {0, 2} or "Traceback" in log.read_text(errors="replace"):
+            wrong.append(f"mixed: exit codes {codes}; see {log}")
+    return {**count, "wrong": wrong}
+
+
 def size(folder: Path) -> float:
     """What a folder takes on a disk, bytes."""
     return sum(4096 * (1 + f.stat().st_size // 4096) for f in folder.rglob("*"))
@@ -320,6 +358,9 @@ def main() -> int:
         found[name] = {"whole_s": round(trial.duration, 1), **trial.count, "wrong": trial.wrong}
         wrong += len(trial.wrong)
         print(f"{name}: {found[name]}", file=sys.stderr, flush=True)
+    if not args.only or "mixed" in args.only.split(","):
+        found["mixed"] = mixed(work / "input", work / "mixed")
+        wrong += len(found["mixed"]["wrong"])
     print(json.dumps(found))
     return int(wrong > 0)
 

@@ -108,17 +108,17 @@ def test_ctrl_c_is_one_line_and_130(monkeypatch, capsys):
 
 IMPORTING = """
 import os, runpy, signal, sys
+module, sys.argv[1:] = sys.argv[1], ["doctor", "nowhere"]
 class Interrupting:
     def find_spec(self, name, path=None, target=None):
-        if name == sys.argv[1]:
+        if name == module:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Interrupting())
-sys.argv[2:] = ["doctor", "nowhere"]
 runpy.run_module("gaponet", run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("module", ["gaponet.cli.main", "tyro", "gaponet.cli.data"])
+@pytest.mark.parametrize("module", ["gaponet.cli.main", "tyro", "gaponet.cli.logs"])
 def test_ctrl_c_while_modules_are_imported_is_one_line_and_130(module):
     run = subprocess.run([sys.executable, "-c", IMPORTING, module], capture_output=True, text=True)
     assert (run.returncode, run.stderr) == (130, "interrupted\n")

@@ -69,7 +69,7 @@ def load(command: str) -> Callable[..., Any]:
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
-    """Run a command; returns its exit code. `begin` is called when all options are understood, before the command is."""
+    """Run a command; returns its exit code. `begin` is called once all options are understood, just before it."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal may lack our letters, and a file's name may be no text
             stream.reconfigure(errors="backslashreplace")

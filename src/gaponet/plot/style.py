@@ -72,7 +72,7 @@ def _printable(fig: Figure) -> Figure:
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
         ticks = axis.get_major_formatter()
         if isinstance(ticks, (FixedFormatter, FuncFormatter)):
-            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), LABEL)))  # type: ignore[misc]
+            axis.set_major_formatter(FuncFormatter(lambda at, i, ticks=ticks: lines(ticks(at, i), LABEL)))
     entries = {text for legend in fig.findobj(Legend) for text in legend.get_texts()}
     for text in fig.findobj(Text):
         text.set_text(lines(text.get_text(), LABEL if text in entries else LONGEST))

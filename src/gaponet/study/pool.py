@@ -253,14 +253,15 @@ def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, par
             raise KeyboardInterrupt  # nobody waits for this cell any more
         pipe.send((share, note))
 
+    file = cell.folder.with_name(cell.folder.name + ".error.txt")
     try:
+        file.unlink(missing_ok=True)
         work(cell, tell)
     except KeyboardInterrupt:
         os._exit(130)
-    except GAPONetError as error:
+    except (GAPONetError, OSError) as error:  # a full disk is no bug
         pipe.send(str(error))
     except Exception as error:
-        file = cell.folder.with_name(cell.folder.name + ".error.txt")
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, traceback.format_exc())
         pipe.send(f"{type(error).__name__}: {error} (see {file})")
