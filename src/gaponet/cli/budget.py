@@ -9,7 +9,6 @@ import tyro
 
 from gaponet.api import open_dataset
 from gaponet.cli.gap import mrad
-from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
 from gaponet.progress import bar
 
@@ -17,7 +16,7 @@ from gaponet.progress import bar
 def budget(
     run: tyro.conf.Positional[Path],
     dataset: tyro.conf.Positional[Path],
-    motions: str = "",
+    motions: tuple[str, ...] = (),
     robot: str | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -28,7 +27,7 @@ def budget(
     Args:
         run: Run folder of gaponet train; one trained with --robot of an identified simulator has that step too.
         dataset: The dataset trained on (its test motions are used) or another.
-        motions: Only these, separated by commas.
+        motions: Only these.
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
@@ -40,7 +39,7 @@ def budget(
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
     with bar("budget") as update:
-        found = gap_budget(run, data, spec, names(motions), lambda step, done, total: update(done, total, step))
+        found = gap_budget(run, data, spec, motions, lambda step, done, total: update(done, total, step))
     with writing(run, "run"):
         write_text(run / "budget.json", js.dumps(found, indent=1) + "\n")
         save(waterfall(found), run / "budget")

@@ -12,7 +12,6 @@ import tyro
 from gaponet import api
 from gaponet.cli.gap import mrad
 from gaponet.cli.identify import COLUMNS
-from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
 
 
@@ -20,7 +19,7 @@ def calibrate(
     run: tyro.conf.Positional[Path],
     dataset: tyro.conf.Positional[Path],
     unit: str = "",
-    motions: str = "",
+    motions: tuple[str, ...] = (),
     seconds: float = 30.0,
     payload_mass: Literal["recorded", "unknown"] = "recorded",
     robot: str | None = None,
@@ -35,7 +34,7 @@ def calibrate(
         run: Run folder of gaponet train.
         dataset: Recordings of the unit, perhaps among others.
         unit: Which one, where the dataset holds several.
-        motions: Only these, separated by commas; default: those that the run was trained on, so that its test motions
+        motions: Only these; default: those that the run was trained on, so that its test motions
             stay unseen, or all, where the unit played none of them.
         seconds: How much of the recordings to use, in windows of 8 s.
         payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same.
@@ -47,7 +46,7 @@ def calibrate(
 
     out = Out(json)
     unknown = payload_mass == "unknown"
-    found = api.calibrate(run, dataset, unit, names(motions), seconds, unknown, robot, mixed_gains)
+    found = api.calibrate(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
     out.table(f"Unit {found.unit_id}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
         [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
     ])  # fmt: skip

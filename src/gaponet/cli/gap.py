@@ -8,7 +8,6 @@ from typing import Any
 import tyro
 
 from gaponet import api
-from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
 from gaponet.robot import RobotSpec
 
@@ -35,7 +34,7 @@ def pair(
 def gap(
     dataset: tyro.conf.Positional[Path],
     robot: str | None = None,
-    motions: str = "",
+    motions: tuple[str, ...] = (),
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """How far the nominal simulator is from the robot, per joint, payload, unit, motion and horizon.
@@ -43,12 +42,12 @@ def gap(
     Args:
         dataset: Dataset folder; sequences without a twin are replayed first.
         robot: Robot name or folder, if not the one that the dataset keeps.
-        motions: Only these, separated by commas.
+        motions: Only these.
         json: One JSON object on stdout.
     """
     out = Out(json)
     data, spec = api.open_dataset(dataset, robot)
-    result = api.gap(data, spec, names(motions))
+    result = api.gap(data, spec, motions)
     show_methods(out, result, spec)
     out.result(result)
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.markup import escape
 
 from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
@@ -51,77 +50,65 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class Request:
-    """A robot, a motion and what is between them, as the command line asks for it."""
+class Asked:
+    """What playing a motion may be told of robot and loop, as data: the docstrings are the command-line help."""
 
-    motion: str
     driver: Literal["virtual", "unitree", "so101"] = "virtual"
+    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial)."""
     robot: str | None = None
-    model: Path | None = None
-    payload_mass: float | None = None
+    """Name or folder; default the one that the model's run keeps; without a model h1_2, or so101 with so101."""
     payload_side: str = "both"
+    """both, or one hand."""
     max_payload: float | None = None
-    reach: Reach = field(default_factory=Reach)
-    control: ControlConfig = field(default_factory=ControlConfig)
-    safety: SafetyConfig = field(default_factory=SafetyConfig)
-    yes: bool = False
-    dry_run: bool = False
-    seed: int = 0  # of a virtual robot's noise
-    compensation: CompensatorConfig = field(default_factory=CompensatorConfig)
+    """kg that the motion must be possible with; default 3 for named motions, so that all payloads play the same one,
+    and payload_mass for files."""
+    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach()
+    """How to reach the robot."""
+    control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
+    """Timing."""
+    safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
+    """Limits and watchdogs."""
+    yes: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Do not ask before a robot moves."""
+
+
+@dataclass(frozen=True)
+class Request(Asked):
+    """The same, with a model between targets and commands."""
+
+    payload_mass: float | None = None
+    """kg in each hand; with a model, None estimates it."""
+    model: Path | None = None
+    """Run or artifact folder: compensate with it, so that the robot gets to where the motion says."""
+    compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
+    """With a model: how commands are found."""
     unit_id: str = ""
-    extrapolate: bool = False
+    """With a model: which unit this is; what gaponet calibrate found out about it is used."""
+    extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False
+    """With a model: take payloads and servo gains that its training data do not hold."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Connect, read and compute, send nothing, and say what would be sent."""
 
 
 @writes("recordings")
 def run(
     motion: str,
-    driver: Literal["virtual", "unitree", "so101"] = "virtual",
-    robot: str | None = None,
-    model: Path | None = None,
-    payload_mass: float | None = None,
-    payload_side: str = "both",
-    max_payload: float | None = None,
     out: Path | None = None,
-    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach(),
-    control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig(),  # noqa: B008
-    safety: SafetyConfig = SafetyConfig(),  # noqa: B008
-    compensation: CompensatorConfig = CompensatorConfig(),  # noqa: B008
-    unit_id: str = "",
-    extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False,
-    yes: tyro.conf.FlagCreatePairsOff[bool] = False,
-    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False,
+    asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Play a motion on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
 
     Args:
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz).
-        driver: virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial).
-        robot: Name or folder; default the one that the model's run keeps; without a model h1_2, or so101 with so101.
-        model: Run or artifact folder: compensate with it, so that the robot gets to where the motion says.
-        payload_mass: kg in each hand; with a model, None estimates it.
-        payload_side: both, or one hand.
-        max_payload: kg that the motion must be possible with; default 3 for named motions, so that all payloads play
-            the same one, and payload_mass for files.
         out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npz.
-        reach: How to reach the robot.
-        control: Timing.
-        safety: Limits and watchdogs.
-        compensation: With a model: how commands are found.
-        unit_id: With a model: which unit this is; what gaponet calibrate found out about it is used.
-        extrapolate: With a model: take payloads and servo gains that its training data do not hold.
-        yes: Do not ask before a robot moves.
-        dry_run: Connect, read and compute, send nothing, and say what would be sent.
+        asked: Robot, loop and model.
         json: One JSON object on stdout.
     """
     screen = Out(json)
-    asked = Request(
-        motion, driver, robot, model, payload_mass, payload_side, max_payload, reach, control, safety, yes,
-        dry_run, compensation=compensation, unit_id=unit_id, extrapolate=extrapolate,
-    )  # fmt: skip
-    if dry_run and out:
+    if asked.dry_run and out:
         raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
-    recording, played, _ = perform(screen, asked)
+    recording, played, _ = perform(screen, motion, asked)
     if out:
         screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
     screen.result(recording.summary() | tracking(recording))
@@ -129,8 +116,8 @@ def run(
         sys.exit(3)
 
 
-def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
-    """Make everything, ask, run, and say how it went."""
+def perform(screen: Out, motion_name: str, asked: Request, seed: int = 0) -> tuple[Recording, Motion, RobotSpec]:
+    """Make everything, ask, run, and say how it went; the seed is of a virtual robot's noise."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
     from gaponet.deploy.controller import Controller, play
     from gaponet.deploy.drivers.dry import DryRun
@@ -138,8 +125,8 @@ def perform(screen: Out, asked: Request) -> tuple[Recording, Motion, RobotSpec]:
     spec = asked_robot(asked)
     fast = asked.reach.fast and asked.driver == "virtual"
     clock = SimulatedClock() if fast else MonotonicClock()
-    motion = find_motion(asked, spec)
-    driver, facts = make_driver(asked, spec, clock, motion)
+    motion = find_motion(motion_name, asked, spec)
+    driver, facts = make_driver(asked, spec, clock, seed)
     _require_commanded(motion, spec, driver)
     if asked.dry_run:
         driver = DryRun(driver)
@@ -186,13 +173,13 @@ def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None
         )
 
 
-def find_motion(asked: Request, robot: RobotSpec) -> Motion:
+def find_motion(name: str, asked: Request, robot: RobotSpec) -> Motion:
     """A motion file, fitted to the robot's limits, or a motion of the library."""
     from gaponet.motion.feasible import MAX_PAYLOAD
     from gaponet.motion.files import SUFFIXES, read_motion
     from gaponet.motion.library import Library
 
-    name, payload = asked.motion, asked.payload_mass or 0.0
+    payload = asked.payload_mass or 0.0
     is_file = name.endswith(SUFFIXES)
     heaviest = max(payload, 0.0 if is_file else MAX_PAYLOAD) if asked.max_payload is None else asked.max_payload
     if heaviest < payload:
@@ -205,7 +192,7 @@ def find_motion(asked: Request, robot: RobotSpec) -> Motion:
     return library.make(motion.name)
 
 
-def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) -> tuple[Driver, dict[str, Any]]:
+def make_driver(asked: Request, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
     """The driver, and what is known about the unit behind it."""
     from gaponet.deploy.drivers.open import open_driver
 
@@ -222,7 +209,7 @@ def make_driver(asked: Request, robot: RobotSpec, clock: Any, motion: Motion) ->
     side = asked.payload_side
     physics = load_fleet(reach.fleet, robot).unit(name)
     payload = (asked.payload_mass or 0.0, side)
-    return VirtualDriver(robot, physics, clock, payload, name, seed=asked.seed), {"unit_id": name, "fleet": reach.fleet}
+    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": reach.fleet}
 
 
 def tracking(recording: Recording) -> dict[str, Any]:
@@ -249,9 +236,9 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
     model = GapModel.load(asked.model)
     known = calibration.load(model.path.parent if model.path.name == "model" else model.path, model.weights_hash())
     if unit in known:
-        screen.say(f"commands are found with the calibration of unit {escape(unit)}")
+        screen.say(f"commands are found with the calibration of unit {unit}")
     elif known:
-        units = escape(", ".join(known))
+        units = ", ".join(known)
         screen.say(f"the run holds calibrations of {units}, none of which is used: --unit-id says which unit this is")
     compensator = Compensator(
         robot, model, asked.compensation, 1.0 / asked.control.rate, payload_side=asked.payload_side,

@@ -9,7 +9,6 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.gap import mrad, show_methods
-from gaponet.cli.inputs import names
 from gaponet.cli.out import Out, writes
 from gaponet.model.config import Kind
 from gaponet.progress import bar
@@ -73,7 +72,7 @@ def evaluate(
     run: tyro.conf.Positional[Path],
     dataset: tyro.conf.Positional[Path],
     also: tuple[Path, ...] = (),
-    motions: str = "",
+    motions: tuple[str, ...] = (),
     robot: str | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
@@ -83,13 +82,13 @@ def evaluate(
         run: Run folder of gaponet train.
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
-        motions: Only these, separated by commas.
+        motions: Only these.
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
     out = Out(json)
     data, spec = api.open_dataset(dataset, robot, run)
-    evaluation = api.evaluate(run, data, also, names(motions), spec)
+    evaluation = api.evaluate(run, data, also, motions, spec)
     if not evaluation.result["unseen"]:
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"

@@ -9,7 +9,6 @@ import tyro
 
 from gaponet.api import open_dataset
 from gaponet.cli.gap import mrad
-from gaponet.cli.inputs import names
 from gaponet.cli.out import Out
 from gaponet.progress import bar
 
@@ -24,7 +23,7 @@ def view(
     motion: str = "",
     unit: str = "",
     payload_mass: float | None = None,
-    show: str = "target,nominal,aligned,recorded",
+    show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
     render: Path | None = None,
     web: tyro.conf.FlagCreatePairsOff[bool] = False,
     port: int = 8080,
@@ -88,7 +87,7 @@ def view(
     entry = pick(data, model, motion, unit, payload_mass)
     with bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, lambda method, done, total: update(done, total, method))
-    shown = shown.only(tuple(n for n in names(show) if n != "aligned" or model))
+    shown = shown.only(tuple(n for n in show if n != "aligned" or model))
     clip = Clip.of(shown, start, duration, speed, fps)
     meta = entry.meta
     out.say(
