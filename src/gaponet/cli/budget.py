@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as js
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -50,15 +51,18 @@ def budget(
         f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
         ["", *steps, "floor"],
         [
-            ["all joints", *(mrad(found["left"][s]) for s in steps), mrad(found["floor"]["both"])],
-            *(
-                [j, *(mrad(v["left"][s]) for s in steps), mrad(v["floor"]["both"])]
-                for j, v in found["by_joint"].items()
-            ),
+            ["all joints", *(mrad(found["left"][s]) for s in steps), _floor(found)],
+            *([j, *(mrad(v["left"][s]) for s in steps), _floor(v)] for j, v in found["by_joint"].items()),
             *([f"{p} kg", *(mrad(v[s]) for s in steps), ""] for p, v in found["by_payload"].items()),
         ],
     )
     if found["floor"]["repeatability"] is None:
-        out.say("floor: encoder only; no motion was recorded twice, so repeatability is unknown")
+        rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
+        out.say(f"floor: {rest}; no motion was recorded twice, so repeatability is unknown")
     out.say(f"figure: {run / 'budget.png'}")
     out.result(found)
+
+
+def _floor(panel: dict[str, Any]) -> str:
+    value = panel["floor"]["both"]
+    return "–" if value is None else mrad(value)

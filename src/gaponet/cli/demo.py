@@ -42,6 +42,9 @@ def demo(
         json: One JSON object on stdout.
     """
     from gaponet.data.store import Dataset
+    from gaponet.view.portrait import portrait, prepare
+
+    prepare()
     from gaponet.eval.report import write_report
 
     screen, began = Out(json), time.monotonic()
@@ -55,7 +58,9 @@ def demo(
         api.train(dataset, run, limit, config, robot=robot, holdout_units=holdout, resume=resume)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
-        path = write_report(out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what))
+        path = write_report(
+            out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what), picture=portrait
+        )
     screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
 
 

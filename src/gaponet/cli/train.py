@@ -113,10 +113,13 @@ def report(
         robot: Robot name or folder, if not the one that the dataset keeps.
         json: One JSON object on stdout.
     """
+    from gaponet.view.portrait import portrait, prepare
+
+    prepare()
     from gaponet.eval.report import write_report
 
     out = Out(json)
     with bar("report") as update:
-        path = write_report(run, dataset, also, robot, lambda what, done, total: update(done, total, what))
+        path = write_report(run, dataset, also, robot, lambda what, done, total: update(done, total, what), portrait)
     out.say(f"report: {path}")
     out.result({"report": str(path)})

@@ -46,7 +46,7 @@ def gap_budget(
 
     Returns:
         {"left": {step: rad}, "by_joint": {joint: {"left": {step: rad}, "floor": {…}}}, "by_payload": {kg: {step: rad}},
-        "floor": {"encoder": rad, "repeatability": rad or None, "both": rad}, …}
+        "floor": {"encoder": …, "repeatability": …, "both": …}, …}; a floor that is unknown is None.
     """
     dataset.require_robot(robot)
     simulator = corrected_robot(run, robot)
@@ -90,7 +90,7 @@ def gap_budget(
 
 
 def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
-    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability" (None if unknown), "both"}, rad.
+    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
 
     An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition to
     the next differs from its own mean by √(2/π)·σ on average, encoder included.
@@ -103,9 +103,9 @@ def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, 
     spread = summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
     found: dict[str, dict[str, float | None]] = {}
     for joint, column in zip(robot.operated, robot.operated_index, strict=True):
-        encoder = encoder_step([s.qpos[:, column] for s in sequences]) / 4
+        encoder = encoder_step([s.qpos[:, column] for s in sequences]) / 4 or None
         again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
-        found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder, again or 0.0)}
+        found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
     return found
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from gaponet.plot.methods import colour, title
+from gaponet.plot.methods import colour, shade, title
 from gaponet.plot.style import figure, joint_label, styled
 
 COLUMNS = 4  # at most
+FLOOR = "#1f7a56"
 
 
 @styled
@@ -25,7 +26,7 @@ def waterfall(budget: dict[str, Any]) -> Figure:
     for ax in axes.flat[len(panels) :]:
         ax.set_visible(False)
     for i, (ax, (name, panel)) in enumerate(zip(axes.flat, panels.items(), strict=False)):
-        _panel(ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, 1e3 * panel["floor"]["both"])
+        _panel(ax, steps, {k: 1e3 * v for k, v in panel["left"].items()}, panel["floor"]["both"])
         ax.set_title(joint_label(name, wrapped=False))
         if i % columns == 0:
             ax.set_ylabel("MPJAE, mrad")
@@ -34,13 +35,14 @@ def waterfall(budget: dict[str, Any]) -> Figure:
     who = "VIRTUAL " if budget["virtual"] else "real "
     fig.suptitle(
         f"{who}{budget['robot']}, {budget['sequences']} {'held-out ' if budget['unseen'] else ''}recordings: "
-        "what each step removes (hollow: adds); dashed: encoder and repeatability",
+        "what each step removes (hollow: adds)\n"
+        "dashed: floor, what encoder and repeatability hide (– unknown)",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
     return fig
 
 
-def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float) -> None:
+def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float | None) -> None:
     before = left[steps[0]]
     ax.bar(0, before, color=colour("nominal"))
     for k, step in enumerate(steps[1:], 1):
@@ -49,13 +51,18 @@ def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float) -> N
         ax.bar(k, abs(before - after), bottom=min(before, after), color="white" if adds else colour(step),
                edgecolor=colour(step), lw=1.0)  # fmt: skip
         ax.plot([k - 0.6, k + 0.4], [before, before], color="#555555", lw=0.6)
+        ax.annotate(f"{after - before:+.1f}".replace("-", "−"), (k, max(before, after)), ha="center", va="bottom",
+                    fontsize=6.5, color=shade(colour(step), -0.25))  # fmt: skip
         before = after
     ax.plot([len(steps) - 0.6, len(steps) + 0.4], [before, before], color="#555555", lw=0.6)
     ax.bar(len(steps), before, color="#333333")
     ax.annotate(f"{before:.1f}", (len(steps), before), ha="center", va="bottom", fontsize=7)
     ax.annotate(f"{left[steps[0]]:.1f}", (0, left[steps[0]]), ha="center", va="bottom", fontsize=7)
-    if floor > 0:
-        ax.axhline(floor, ls=(0, (4, 2)), lw=0.8, color="#2a9d6f")
+    known = floor is not None and floor == floor  # absent numbers are read as NaN
+    if floor is not None and known:
+        ax.axhline(1e3 * floor, ls=(0, (4, 2)), lw=0.8, color=FLOOR)
+    ax.set_title(f"floor {1e3 * floor:.1f}" if floor is not None and known else "floor –", loc="right", fontsize=7,
+                 fontweight="normal", color=FLOOR)  # fmt: skip
     ax.grid(axis="x", visible=False)
     ax.margins(y=0.12)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
@@ -28,7 +29,6 @@ RANGE_SEQUENCES, RANGE_ROWS = 400, 40_000  # most read for joint ranges, and row
 GAP_SEQUENCES = 240  # most paired for the gap against payload
 MOTIONS = 60  # most looked at to find the one with the most torque
 COLUMNS = 3  # joints shown beside each other
-MOVED = 0.02  # rad; a joint commanded to move by less is not in a range
 SHOWN_S = 12.0  # s of a long motion
 
 

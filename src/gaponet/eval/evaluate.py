@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 
 from gaponet.data.json_file import write_json
 from gaponet.data.pair import Twin
+from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
@@ -43,11 +46,13 @@ class Evaluation:
         result: methods → method → metrics (mpjae rad, q_dis rad·s, …), and by_joint, by_motion, … the same; unseen says
             whether no recording was used in training.
         runs: Method → free runs, one per sequence.
+        ctrl: Commands, (T, n operated) rad, one array per sequence.
         deltas: Method → corrections applied, (T, n operated) rad, one array per sequence.
     """
 
     result: dict[str, Any]
     runs: dict[str, list[Run]]
+    ctrl: list[Array]
     deltas: dict[str, list[Array]]
 
 
@@ -84,11 +89,13 @@ def evaluate(
         model.require(robots[kind], dt)
     done_runs: dict[str, list[Run]] = {}
     deltas: dict[str, list[Array]] = {}
+    op = robot.operated_index
+    ctrl = [s.ctrl[:, op] for s in sequences]
+    moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
     for name, simulator, corrector in _methods(runs_dirs[0], models, nominal, robots):
         twins = replay(sequences, simulator, corrector, progress=partial(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
-            op = robot.operated_index
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
     calibrated = calibration.load(runs_dirs[0], next(iter(models.values())).weights_hash())
     if any(s.meta.unit_id in calibrated for s in sequences):
@@ -101,6 +108,7 @@ def evaluate(
         "dataset": dataset.path.name,
         "sequences": len(sequences),
         "motions": sorted({s.meta.motion for s in sequences}),
+        "moves": dict(zip(robot.operated, map(int, np.sum(moved, axis=0)), strict=True)),
         "unseen": unseen,
         "virtual": any(s.meta.virtual for s in sequences),
         "robot": robot.name,
@@ -108,8 +116,16 @@ def evaluate(
         "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
         "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
+        "command": _command(runs_dirs, dataset.path, motions),
     }
-    return Evaluation(result, done_runs, deltas)
+    return Evaluation(result, done_runs, ctrl, deltas)
+
+
+def _command(runs_dirs: ListOf[Path], dataset: Path, motions: tuple[str, ...]) -> str:
+    """What a shell needs to repeat an evaluation."""
+    words = ["gaponet", "eval", str(runs_dirs[0]), str(dataset)]
+    words += ["--also", *map(str, runs_dirs[1:])] if len(runs_dirs) > 1 else []
+    return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
 
 
 def choose(runs_dirs: ListOf[Path], dataset: Dataset, motions: tuple[str, ...] = ()) -> tuple[list[Entry], bool]:
@@ -165,19 +181,20 @@ def split_of_run(run: Path) -> dict[str, dict[str, str]]:
 
 def save(evaluation: Evaluation, run: Path) -> None:
     """metrics.json and trajectories.npz in the run folder: the newest evaluation, all that the report needs."""
-
     reals = evaluation.runs["nominal"]
     picked = sorted({round(i) for i in np.linspace(0, len(reals) - 1, min(SHOWN, len(reals)))})
     shown = [reals[i].real.meta for i in picked]
     result = evaluation.result | {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "shown": [
             {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].real.dt}
             for i, m in zip(picked, shown, strict=True)
-        ]
+        ],
     }
     arrays = {}
     for row, i in enumerate(picked):
         arrays[f"{row}/recorded"] = reals[i].qpos_real
+        arrays[f"{row}/command"] = evaluation.ctrl[i]
         for name, part in evaluation.runs.items():
             arrays[f"{row}/{name}"] = part[i].qpos_sim
         for name, delta in evaluation.deltas.items():

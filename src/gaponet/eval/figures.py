@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gaponet.plot.charts import Once, against, bars, lines
+from gaponet.data.repeatability import MOVED
+from gaponet.plot.charts import Course, Once, against, bars, lines
 from gaponet.plot.methods import COLOURS, colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
 
@@ -28,7 +29,7 @@ def by_payload(methods: dict[str, Any]) -> Figure:
 def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[str], str]) -> Figure:
     keys = list(methods["nominal"][group])
     values = {title(n): (colour(n), [Once(1e3 * m[group][k]["mpjae"]) for k in keys]) for n, m in methods.items()}
-    return bars([label(k) for k in keys], values, "mrad", heading)
+    return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
 
 
 def by_horizon(methods: dict[str, Any]) -> Figure:
@@ -44,7 +45,17 @@ def by_horizon(methods: dict[str, Any]) -> Figure:
         )
         for n, m in methods.items()
     }
-    return lines([("MPJAE by horizon of the free run", drawn)], ("", "mrad"), ticks, log=True)
+    return _degrees(lines([("MPJAE by horizon of the free run", drawn)], ("", "mrad"), ticks, log=True))
+
+
+@styled
+def _degrees(fig: Figure) -> Figure:
+    """The same figure with degrees on the right."""
+    mrad = 1e3 * np.pi / 180
+    ways: Any = (lambda y: y / mrad, lambda y: y * mrad)
+    right = fig.axes[0].secondary_yaxis("right", functions=ways)
+    right.set_ylabel("degrees")
+    return fig
 
 
 @styled
@@ -73,17 +84,57 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
 
 
 def trajectories(
-    arrays: dict[str, Array], row: int, joints: list[str], columns: list[int], methods: list[str], dt: float
-) -> Figure:
-    """Recorded against simulated position of a few joints, and the error below, over one motion."""
-    recorded = arrays[f"{row}/recorded"]
-    window = _window(recorded[:, columns], dt)
-    names = {j: joint_label(joints[j], wrapped=False) for j in columns}
-    shown = {names[j]: ({n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j]) for j in columns}
+    arrays: dict[str, Array], shown: list[dict[str, Any]], joints: tuple[str, ...], methods: list[str]
+) -> dict[int, Figure]:
+    """Command, recorded and simulated positions of a few joints over each motion shown, errors on one scale for all.
+
+    Args:
+        arrays: For each row ROW/METHOD, recorded, command, delta/METHOD, (T, n) rad.
+        shown: What is known of each row.
+        joints: Names of the n operated joints.
+        methods: In the order of drawing.
+
+    Returns:
+        By row, those first in which the robot moved most.
+    """
+    looks = {n: (title(n), colour(n)) for n in (*methods, "recorded", "command")}
+    drawn: dict[int, tuple[Array, dict[str, Course]]] = {}
+    for row, facts in enumerate(shown):
+        recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
+        window = _window(recorded, dt)
+        drawn[row] = np.arange(len(recorded))[window] * dt, _courses(arrays, row, joints, methods, window, dt)
+    limit = max(
+        (
+            1e3 * float(np.abs(q - c.base).max())
+            for _, cs in drawn.values()
+            for c in cs.values()
+            for q in c.found.values()
+        ),
+        default=0.0,
+    )
+    travel = {row: np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in drawn}
+    return {
+        row: against(*drawn[row], looks, "recorded", limit=limit) for row in sorted(drawn, key=lambda row: -travel[row])
+    }
+
+
+def _courses(
+    arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], window: slice, dt: float
+) -> dict[str, Course]:
+    """The three joints with the largest nominal error, of those that are commanded to move while there are any."""
+    command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
+    still = np.ptp(command, axis=0) <= MOVED
+    errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
     learned = [n for n in methods if f"{row}/delta/{n}" in arrays]
-    delta = {names[j]: {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned} for j in columns}
-    looks = {n: (title(n), colour(n)) for n in (*methods, "recorded")}
-    return against(np.arange(len(recorded))[window] * dt, shown, looks, "recorded", corrections=delta)
+    courses = {}
+    for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
+        name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
+        asked = command[:, j]
+        courses[name] = Course(
+            {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], asked,
+            {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(asked, dt),
+        )  # fmt: skip
+    return courses
 
 
 def _window(recorded: Array, dt: float, seconds: float = 20.0) -> slice:
@@ -92,6 +143,14 @@ def _window(recorded: Array, dt: float, seconds: float = 20.0) -> slice:
     if len(recorded) <= n:
         return slice(0, len(recorded))
     moved = np.concatenate([[0], np.abs(np.diff(recorded, axis=0)).sum(axis=1).cumsum()])
-    gain = moved[n:] - moved[:-n]
-    start = int(gain.argmax())
+    start = int((moved[n:] - moved[:-n]).argmax())
     return slice(start, start + n)
+
+
+def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:
+    """The stretch in whose middle the command turns, stops or starts."""
+    half = round(seconds / 2 / dt)
+    if len(command) <= 2 * half:
+        return slice(0, len(command))
+    start = int(np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax())
+    return slice(start, start + 2 * half)

@@ -13,28 +13,45 @@ from gaponet.text import plain
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+WIDE = 6.0  # inches; a figure that is wider scrolls on a phone, since its letters could not be read
+
 CSS = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 1080px; margin: 2rem auto; padding: 0 1rem }
-h1 { font-size: 1.7rem; margin-bottom: .2rem }
-h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+:root { color-scheme: light dark; --ink: #1a1a1a; --paper: #fff; --faint: #666; --line: #e3e3e3; --tint: #f5f5f5;
+  --warn: #fff4e0 }
+* { box-sizing: border-box }
+body { font: 15px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 1080px;
+  margin: 2rem auto; padding: 0 1rem; overflow-wrap: break-word }
+h1 { font-size: 1.7rem; line-height: 1.25; margin-bottom: .4rem }
+h2 { font-size: 1.2rem; margin-top: 2.4rem; border-bottom: 1px solid var(--line) }
 table { border-collapse: collapse; margin: .6rem 0 }
-th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid #eee }
-th { background: #fafafa }
+th, td { padding: .25rem .7rem; text-align: right; border-bottom: 1px solid var(--line) }
+th { background: var(--tint) }
 th:first-child, td:first-child, .facts td { text-align: left; vertical-align: top }
 td + td { white-space: nowrap }
-.facts td + td { white-space: normal }
-.facts td:first-child { color: #666; white-space: nowrap }
+.facts td + td { white-space: normal; overflow-wrap: anywhere }
+.facts td:first-child { color: var(--faint); white-space: nowrap }
 tr.best td { font-weight: 600 }
 .tag { display: inline-block; padding: .1rem .6rem; border-radius: 1rem; color: #fff; font: 600 .85rem system-ui }
 .real { background: #1b7f3b }
 .virtual { background: #7b3fa0 }
-.warn { background: #fff4e0; border-left: 4px solid #d99000; padding: .4rem .8rem; margin: .3rem 0 }
-.lead { font-size: 1.1rem }
-.row { display: flex; flex-wrap: wrap; gap: 1rem }
-figure { margin: 1rem 0 }
-figcaption { color: #666; font-size: .88rem }
-svg, img { max-width: 100%; height: auto }
-code { background: #f4f4f4; padding: 0 .25rem }
+.warn { background: var(--warn); border-left: 4px solid #d99000; padding: .4rem .8rem; margin: .3rem 0 }
+.lead { font-size: 1.15rem }
+.faint { color: var(--faint) }
+.row { display: flex; flex-wrap: wrap; gap: 0 1.5rem; align-items: flex-start }
+.row > * { max-width: 100% }
+.scroll { overflow-x: auto }
+figure { margin: 1rem 0; max-width: 100% }
+figcaption, .small { color: var(--faint); font-size: .88rem }
+svg, img { display: block; max-width: 100%; height: auto }
+.wide > svg, .wide > img { min-width: 720px }
+.photo img { border-radius: 6px; max-width: min(100%, 700px) }
+code { background: var(--tint); padding: 0 .25rem; overflow-wrap: anywhere }
+summary { cursor: pointer; color: var(--faint); margin: .6rem 0 }
+@media (prefers-color-scheme: dark) {
+  :root { --ink: #e4e4e4; --paper: #171717; --faint: #9d9d9d; --line: #383838; --tint: #242424; --warn: #3a2c10 }
+  .plot > * { filter: invert(.91) hue-rotate(180deg) }
+}
+@media (max-width: 600px) { body { margin: 1rem auto; font-size: 14px } th, td { padding: .2rem .45rem } }
 """
 
 
@@ -47,7 +64,11 @@ def element(name: str, *content: str, css: str = "") -> Markup:
 
 def page(title: str, body: Markup) -> str:
     """A whole document."""
-    head = Markup('<meta charset="utf-8">') + element("title", title) + element("style", Markup(CSS))
+    head = (
+        Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">')
+        + element("title", title)
+        + element("style", Markup(CSS))
+    )
     inside = element("head", head) + element("body", body)
     return Markup('<!doctype html><html lang="en">{}</html>\n').format(inside)
 
@@ -62,7 +83,8 @@ def table(head: list[str], rows: list[list[str]], best: int | None = None) -> Ma
     body = (
         element("tr", *(element("td", c) for c in row), css="best" if i == best else "") for i, row in enumerate(rows)
     )
-    return element("table", element("tr", *(element("th", h) for h in head)), *body)
+    inside = element("table", element("tr", *(element("th", h) for h in head)), *body)
+    return element("div", inside, css="scroll")
 
 
 def tag(virtual: bool) -> Markup:
@@ -82,7 +104,8 @@ def figure(fig: Figure, *caption: str) -> Markup:
         image = picture(buffer.getvalue(), "image/png")
     else:
         image = Markup(data[data.index("<svg") :])
-    return element("figure", image, element("figcaption", *caption))
+    css = "plot scroll wide" if fig.get_figwidth() > WIDE else "plot"
+    return element("figure", element("div", image, css=css), element("figcaption", *caption))
 
 
 def picture(data: bytes, kind: str) -> Markup:

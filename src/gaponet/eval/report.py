@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+import shlex
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
+from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, ModelError
+from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.eval.page import element, facts_table, figure, page, table, tag
+from gaponet.eval.page import picture as image
 from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel, how_trained
@@ -19,9 +24,12 @@ from gaponet.plot.methods import title
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
+from gaponet.training.config import TrainConfig
 
 Array = np.ndarray
 Tell = Callable[[str, float, float], None]
+Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
+OPEN = 3  # motions shown without a click
 
 
 def write_report(
@@ -30,6 +38,7 @@ def write_report(
     also: tuple[Path, ...] = (),
     robot: str | None = None,
     progress: Tell = lambda what, done, total: None,
+    picture: Picture | None = None,
 ) -> Path:
     """Write RUN/report.html from the run's newest evaluation, evaluating first where there is none.
 
@@ -39,6 +48,7 @@ def write_report(
         also: Further runs to compare (only when evaluating).
         robot: Robot name or folder, if not the one that the run keeps.
         progress: Called with what is being done.
+        picture: Draws the robot (view.portrait); left out where it can draw nothing.
     """
     model = GapModel.load(run)
     asked = None if robot is None else require_kept(run, load_robot(robot), ModelError, "leave --robot out")
@@ -48,9 +58,10 @@ def write_report(
     metrics = read_metrics(run)
     arrays = read_trajectories(run, metrics, len(spec.operated))
     config, curve, budget = read_config(run), read_progress(run), read_budget(run)
-    _require_complete(model, metrics, curve)
+    _require_complete(model, metrics, curve, spec)
     progress("drawing", 0, 1)
-    text = _page(model.card, config, metrics, arrays, curve, spec, budget)
+    photo = () if picture is None else _photo(picture, arrays, metrics, spec, model.config.kind)
+    text = _page(model.card, config, metrics, arrays, curve, spec, budget, photo, _commands(run, config, metrics, spec))
     path = run / "report.html"
     write_text(path, text)
     progress("drawing", 1, 1)
@@ -69,11 +80,15 @@ def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: Ro
     save(evaluate([run, *also], data, robot, progress=progress), run)
 
 
-def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict[str, Any]]) -> None:
+def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict[str, Any]], robot: RobotSpec) -> None:
     """Refuse a run of which something that a report says is not known."""
     told = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad", "motions")
     missing = [name for name in (*told, "versions", "dataset_hash") if name not in model.card]
-    missing += [] if model.config.kind in metrics["methods"] else [f"an evaluation of {model.config.kind}"]
+    methods, parts = metrics["methods"], {"date", "command", "moves", "shown"}
+    whole = parts <= metrics.keys() and set(methods["nominal"]["by_joint"]) == set(metrics["moves"]) == set(
+        robot.operated
+    )
+    missing += [] if model.config.kind in methods and whole else [f"a whole evaluation of {model.config.kind}"]
     missing += [] if curve else ["progress.jsonl"]
     if missing or {"train", "val"} - set(model.card["motions"]):
         raise ModelError(f"{model.path}: {', '.join(missing) or 'motions'} is missing; {MEND}")
@@ -87,6 +102,8 @@ def _page(
     curve: list[dict[str, Any]],
     robot: RobotSpec,
     budget: dict[str, Any] | None,
+    photo: Iterable[Markup],
+    commands: list[str],
 ) -> str:
     from gaponet.eval import budget_figure as draw_budget
     from gaponet.eval import figures as draw
@@ -97,7 +114,7 @@ def _page(
     held_out = "on held-out recordings" if metrics["unseen"] else "(some recordings were used in training)"
     bars = [
         figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
-        figure(draw.by_horizon(methods), "Error of the last half of each horizon, so that one frame does not decide."),
+        figure(draw.by_horizon(methods), "Does it grow? Error in the last half of the time since the common start."),
     ]
     if len(methods["nominal"]["by_payload"]) > 1:
         bars.append(figure(draw.by_payload(methods), "Payload in each hand."))
@@ -106,8 +123,9 @@ def _page(
         element("p", tag(metrics["virtual"]), " ", *_facts_line(card, metrics)),
         element("p", _verdict(kind, methods, ratio), css="lead"),
         *(element("div", text, css="warn") for text in warnings(card, metrics)),
-        element("h2", f"Errors, whole-motion free run {held_out}"),
-        _totals(methods, ratio),
+        *photo,
+        element("h2", f"Errors, whole-motion free run {held_out}"), _totals(methods, ratio), _explained(methods),
+        element("h2", "By joint"), _by_joint(methods, kind, metrics),
         element("div", *bars, css="row"),
         element("h2", "Trajectories"), *_trajectories(arrays, metrics, robot),
     ]  # fmt: skip
@@ -123,6 +141,7 @@ def _page(
         element("h2", "Training"), element("div", curve_figure, _training_table(card, config), css="row"),
         element("h2", "By motion"), _by_motion(methods),
         element("h2", "What exactly"), _facts(card, metrics),
+        element("h2", "Do it again"), *(element("p", element("code", line)) for line in commands),
     ]  # fmt: skip
     return page(f"{robot.name} {name}", Markup("").join(body))
 
@@ -130,15 +149,45 @@ def _page(
 def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[Markup]:
     from gaponet.eval import figures as draw
 
-    caption = (
-        "the 20 s with most motion, the three joints with the largest nominal error; Δa is the learned correction."
+    drawn = draw.trajectories(arrays, metrics["shown"], robot.operated, list(metrics["methods"]))
+    shown = []
+    for row, fig in drawn.items():
+        facts = metrics["shown"][row]
+        shown.append(
+            figure(fig, element("b", facts["motion"]), f" (unit {facts['unit_id']}, {facts['payload_mass']:g} kg)")
+        )
+    yield element(
+        "p", "The 20 s with most motion of each recording, of the joints that move the three with the largest nominal "
+        "error. The zoom (shaded above) is where the command turns or stops: there lag and sag are seen. Errors of "
+        "all motions are on one scale; Δa is the learned correction.", css="small",
+    )  # fmt: skip
+    yield from shown[:OPEN]
+    if shown[OPEN:]:
+        yield element("details", element("summary", f"{len(shown) - OPEN} more motions"), *shown[OPEN:])
+
+
+def _photo(
+    draw: Picture, arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec, kind: str
+) -> Iterator[Markup]:
+    """The robot in the motion with most travel, or a sentence that says why it is not seen."""
+    travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(metrics["shown"]))]
+    if not travel:
+        return
+    row = int(np.argmax(travel))
+    facts = metrics["shown"][row]
+    meta = SequenceMeta(
+        robot.name, facts["unit_id"], facts["motion"], facts["payload_mass"], virtual=metrics["virtual"]
     )
-    for row, shown in enumerate(metrics["shown"]):
-        errors = np.abs(arrays[f"{row}/nominal"] - arrays[f"{row}/recorded"]).mean(axis=0)
-        worst = sorted(np.argsort(-errors)[:3].tolist())
-        fig = draw.trajectories(arrays, row, list(robot.operated), worst, list(metrics["methods"]), shown["dt"])
-        where = f" (unit {shown['unit_id']}, {shown['payload_mass']:g} kg): {caption}"
-        yield figure(fig, element("b", shown["motion"]), where)
+    shown = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", kind, "recorded"))}
+    shown["command"] = np.roll(shown["command"], 1, axis=0)  # a command of row t says where to be at t + 1
+    shown["command"][0] = shown["recorded"][0]
+    try:
+        png = draw(robot, meta, facts["dt"], shown)
+    except UsageError as error:
+        yield element("p", f"No picture of the robot: {error}", css="small")
+        return
+    caption = "When the nominal simulator is furthest from the robot; the shadow is the recording."
+    yield element("figure", element("div", image(png, "image/png"), css="photo"), element("figcaption", caption))
 
 
 def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
@@ -191,28 +240,93 @@ def _verdict(kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str
 def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
     gains = ", ".join(f"{v:g}" for v in sorted(set(card["kp"])))
     return [
-        f"{metrics['sequences']} recordings, {len(metrics['motions'])} motions; trained {card['hours']:.2f} h of logs, "
+        f"{metrics['date']}: {metrics['sequences']} recordings, {len(metrics['motions'])} motions; trained "
+        f"{card['hours']:.2f} h of logs, "
         f"{card['steps']:,} control steps; simulator ", element("code", metrics["simulator_hash"]),
         f", kp {gains} N·m/rad",
     ]  # fmt: skip
 
 
+def _both(value: float) -> str:
+    """rad → mrad and degrees."""
+    return f"{value * 1e3:.2f} ({np.degrees(value):.2f}°)"
+
+
 def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> Markup:
-    head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static, mrad", "dynamic, mrad",
-            "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
+    head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad",
+            "Q_dis, rad·s", "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
     rows = [
-        [title(n), f"{m['mpjae'] * 1e3:.2f}", f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['q_dis']:.3f}",
-         f"{m['static'] * 1e3:.2f}", f"{m['dynamic'] * 1e3:.2f}", f"{m['large_0.05'] * 100:.1f} %",
+        [title(n), _both(m["mpjae"]), f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['static'] * 1e3:.2f}",
+         f"{m['dynamic'] * 1e3:.2f}", f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %",
          f"{m['large_0.1'] * 100:.2f} %", f"{m['correlation']:.4f}"]
         for n, m in methods.items()
     ]  # fmt: skip
     return table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
 
 
+def _explained(methods: dict[str, Any]) -> Markup:
+    text = {
+        "MPJAE": "mean |q_sim − q_robot| over all joints and steps, averaged over motions. The simulator starts where "
+        "the recording starts and is given its commands, nothing else. 10 mrad = 0.57°.",
+        "RMSE": "root of the mean squared error, mrad: large errors count more.",
+        "static": "size of a joint's median error over a motion, mrad: what stays, such as sag and zero offsets.",
+        "dynamic": "mean distance from that median, mrad: what comes and goes, such as lag, friction and backlash.",
+        "Q_dis": "sum of |error| × Δt over a motion, mean of the joints: grows with the motion's length.",
+        "≥ 0.05 rad": "share of steps with an error of 2.9° or more (0.1 rad: 5.7°).",
+        "correlation": "Pearson's r between simulated and recorded angle of joints that moved.",
+    }  # fmt: skip
+    if "calibrated" in methods:
+        text[title("calibrated")] = "the model in the simulator calibrated to the unit (gaponet calibrate)."
+    return element("div", facts_table([[k, v] for k, v in text.items()]), css="small")
+
+
+def _by_joint(methods: dict[str, Any], kind: str, metrics: dict[str, Any]) -> Markup:
+    own = methods[kind]["by_joint"]
+    head = ["MPJAE, mrad", *(title(n) for n in methods), f"{title(kind)} static", f"{title(kind)} dynamic", "moves in"]
+    rows = []
+    for joint, moving in metrics["moves"].items():
+        moves = f"{moving} of {metrics['sequences']}" if moving else "none: stands still"
+        parts = [f"{own[joint][k] * 1e3:.2f}" for k in ("static", "dynamic")]
+        rows.append([joint, *(_both(m["by_joint"][joint]["mpjae"]) for m in methods.values()), *parts, moves])
+    return table(head, rows)
+
+
 def _by_motion(methods: dict[str, Any]) -> Markup:
-    head = ["motion, MPJAE in mrad", *(title(n) for n in methods)]
+    head = ["MPJAE, mrad", *(title(n) for n in methods)]
     keys = methods["nominal"]["by_motion"]
-    return table(head, [[k, *(f"{m['by_motion'][k]['mpjae'] * 1e3:.2f}" for m in methods.values())] for k in keys])
+    return table(head, [[k, *(_both(m["by_motion"][k]["mpjae"]) for m in methods.values())] for k in keys])
+
+
+def _commands(run: Path, config: dict[str, Any], metrics: dict[str, Any], robot: RobotSpec) -> list[str]:
+    """What a shell needs to repeat training, evaluation and report."""
+    budget = config["budget"]
+    limit = f"{budget['seconds']:g}s" if budget["seconds"] is not None else str(budget["steps"])
+    words = ["gaponet", "train", os.path.normpath(run / config["dataset"]), "--out", str(run)]
+    words += ["--model", config["model"]["kind"], "--budget", limit]
+    words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
+    default = asdict(TrainConfig()) | {"holdout_units": ()}
+    default["model"]["kind"] = config["model"]["kind"]
+    return [
+        shlex.join(words + _options(config, default)),
+        metrics["command"],
+        shlex.join(["gaponet", "report", str(run)]),
+    ]
+
+
+def _options(config: dict[str, Any], default: dict[str, Any], prefix: str = "--") -> list[str]:
+    """Options of gaponet train, where they are not the default."""
+    words: list[str] = []
+    for key, value in config.items():
+        name = prefix + key.replace("_", "-")
+        if isinstance(value, dict):
+            words += _options(value, default[key], f"{name}.") if key in default else []
+        elif key not in default or value == (list(default[key]) if isinstance(value, list) else default[key]):
+            continue
+        elif isinstance(value, bool):
+            words.append(name if value else f"{prefix}no-{key.replace('_', '-')}")
+        else:
+            words += [name, *map(str, value if isinstance(value, list) else [value])]
+    return words
 
 
 def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:

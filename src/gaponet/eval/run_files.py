@@ -21,17 +21,25 @@ GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
 
 class Error(TypedDict):
-    """The error of a joint, a payload, a horizon or a motion, rad."""
+    """The error of a payload, a horizon or a motion, rad."""
 
     mpjae: Number
 
 
+class JointError(Error):
+    """The errors of a joint, rad."""
+
+    static: Number
+    dynamic: Number
+
+
+Joints = Annotated[dict[str, JointError], Len(1)]
 Groups = Annotated[dict[str, Error], Len(1)]
 Scores = TypedDict(  # one method's metrics, and those of its parts
     "Scores",
     {
         "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
-        "large_0.1": Number, "correlation": Number, "by_joint": Groups, "by_payload": Groups, "by_horizon": Groups,
+        "large_0.1": Number, "correlation": Number, "by_joint": Joints, "by_payload": Groups, "by_horizon": Groups,
         "by_motion": Groups,
     },
 )  # fmt: skip
@@ -74,6 +82,9 @@ class Metrics(TypedDict):
     delta: dict[Method, Delta]
     artifacts: dict[Method, Artifact]
     shown: NotRequired[Annotated[list[Shown], Len(0, 100)]]
+    moves: NotRequired[dict[str, Count]]
+    date: NotRequired[str]
+    command: NotRequired[str]
 
 
 class PPO(TypedDict):
@@ -90,6 +101,13 @@ class Model(TypedDict):
     kind: Method
 
 
+class Budgeted(TypedDict):
+    """How long a training was to be: one of them."""
+
+    seconds: float | None
+    steps: int | None
+
+
 class Config(TypedDict):
     """config.json."""
 
@@ -99,6 +117,7 @@ class Config(TypedDict):
     robot: str
     dataset: str
     dataset_hash: str
+    budget: Budgeted
 
 
 class Validation(TypedDict):
@@ -140,11 +159,11 @@ def read_metrics(run: Path) -> dict[str, Any]:
 
 
 def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[str, Array]:
-    """trajectories.npz of a run: row/method and row/recorded for each sequence shown, (T, joints) rad."""
+    """trajectories.npz of a run: for each sequence shown row/METHOD, recorded and command, (T, joints) rad."""
     file = run / "trajectories.npz"
     arrays = read_npz(file, ModelError, MEND)
     for row in range(len(metrics.get("shown", []))):
-        names = [f"{row}/{m}" for m in ("recorded", *metrics["methods"])]
+        names = [f"{row}/{m}" for m in ("recorded", "command", *metrics["methods"])]
         shapes = {arrays[name].shape if name in arrays else () for name in names}
         shape = max(shapes, key=len)
         if len(shapes) != 1 or len(shape) != 2 or shape[0] < 2 or shape[1] != joints:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from gaponet.plot.methods import COLOURS
-from gaponet.plot.style import DASHED, figure, legend, styled
+from gaponet.plot.style import DASHED, DOTTED, figure, legend, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,6 +39,7 @@ Array = np.ndarray
 Bars = Mapping[str, tuple[str, ListOf[Interval]]]  # label → colour, value of each group
 Dot = tuple[str, str, Interval, bool]  # group, name, value, whether it is the default
 GAP = 0.7  # between groups, rows
+LEAST = 0.06  # rad, of an axis of positions
 
 
 @styled
@@ -71,45 +72,93 @@ def spreads(values: ListOf[Interval]) -> Array | None:
     return std if std.any() else None
 
 
+@dataclass(frozen=True)
+class Course:
+    """How one joint went: rad, (T,)."""
+
+    found: Mapping[str, Array]
+    """Positions by method."""
+    base: Array
+    """The reference's."""
+    command: Array | None = None
+    corrections: Mapping[str, Array] = field(default_factory=dict)
+    """Δa by method, (up to T,)."""
+    zoom: slice | None = None
+    """Rows shown once more, larger; of all joints or of none."""
+
+
 @styled
 def against(
     time: Array,
-    joints: Mapping[str, tuple[Mapping[str, Array], Array]],
+    joints: Mapping[str, Course],
     looks: Mapping[str, tuple[str, str]],
     reference: str,
     title: str = "",
-    corrections: Mapping[str, Mapping[str, Array]] | None = None,
+    limit: float | None = None,
 ) -> Figure:
-    """Positions by method over time, a column per joint; below them how far each is from the reference.
+    """Positions by method over time, a column per joint; below them how far each is from the reference, on one scale.
 
     Args:
         time: (T,) s.
-        joints: What the column is called → positions by method, (T,) rad, and the reference's, (T,) rad.
-        looks: Label and colour of each method and of the reference.
+        joints: What the column is called → what it shows.
+        looks: Label and colour of each method, of the reference, and of "command".
         reference: Its key in looks.
         title: Above all.
-        corrections: In a third row, Δa by method, (up to T,) rad, for each column.
+        limit: Largest error that has to fit, mrad; default that of this figure.
     """
-    fig = figure(3.6 * len(joints), 4.2 if corrections is None else 4.6)
-    heights = [1.6, 1] if corrections is None else [2, 1.2, 1]
-    axes = fig.subplots(len(heights), len(joints), sharex=True, squeeze=False, height_ratios=heights)
-    for column, (joint, (found, base)) in zip(axes.T, joints.items(), strict=True):
-        for method, values in found.items():
-            label, colour = looks[method]
-            column[0].plot(time, values, color=colour, label=label)
-            column[1].plot(time, (values - base) * 1e3, color=colour, lw=1.0)
-        label, colour = looks[reference]
-        column[0].plot(time, base, color=colour, ls=DASHED, lw=1.0, label=label)
-        column[1].axhline(0, color="#111111", lw=0.6)
-        for method, values in ({} if corrections is None else corrections[joint]).items():
-            column[2].plot(time[: len(values)], values * 1e3, color=looks[method][1], lw=0.9)
+    some = next(iter(joints.values()))
+    rows = {"position, rad": 1.8, "zoom, rad": 1.6 * (some.zoom is not None), "error, mrad": 1.1,
+            "Δa, mrad": 0.9 * bool(some.corrections)}  # fmt: skip
+    rows = {label: height for label, height in rows.items() if height}
+    fig = figure(3.6 * len(joints), 1.0 + 1.1 * sum(rows.values()))
+    axes = fig.subplots(len(rows), len(joints), squeeze=False, height_ratios=list(rows.values()))
+    for column, (joint, course) in zip(axes.T, joints.items(), strict=True):
+        ax = dict(zip(rows, column, strict=True))
+        _positions(ax["position, rad"], time, course, looks, reference)
+        if course.zoom is not None:
+            _positions(ax["zoom, rad"], time, course, looks, reference, course.zoom)
+            ax["position, rad"].axvspan(*time[course.zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+        for method, values in course.found.items():
+            ax["error, mrad"].plot(time, (values - course.base) * 1e3, color=looks[method][1], lw=1.0)
+        ax["error, mrad"].axhline(0, color="#111111", lw=0.6)
+        for method, values in course.corrections.items():
+            ax["Δa, mrad"].plot(time[: len(values)], values * 1e3, color=looks[method][1], lw=0.9)
         column[0].set_title(joint)
         column[-1].set_xlabel("time, s")
-    for ax, label in zip(axes[:, 0], ("position, rad", "error, mrad", "Δa, mrad"), strict=False):
-        ax.set_ylabel(label)
+        for other in column:
+            other.set_xlim(time[0], time[-1]) if other is not ax.get("zoom, rad") else None
+    for row, label in zip(axes, rows, strict=True):
+        row[0].set_ylabel(label)
+        if label in ("error, mrad", "Δa, mrad"):
+            seen = max(abs(v) for ax in row for v in ax.dataLim.intervaly)
+            end = 1.08 * (limit if limit and label == "error, mrad" else seen) or 1.0
+            for ax in row:
+                ax.set_ylim(-end, end)
     fig.align_ylabels(axes[:, 0])
     legend(fig, title)
     return fig
+
+
+def _positions(
+    ax: Any,
+    time: Array,
+    course: Course,
+    looks: Mapping[str, tuple[str, str]],
+    reference: str,
+    rows: slice = slice(None),
+) -> None:
+    """Command, methods and reference; a joint that stands still is not magnified until its encoder's steps fill all."""
+    if course.command is not None:
+        label, colour = looks["command"]
+        ax.step(time[rows], course.command[rows], where="post", color=colour, ls=DOTTED, lw=1.1, label=label)
+    for method, values in course.found.items():
+        label, colour = looks[method]
+        ax.plot(time[rows], values[rows], color=colour, label=label)
+    label, colour = looks[reference]
+    ax.plot(time[rows], course.base[rows], color=colour, ls=DASHED, lw=1.0, label=label)
+    low, high = ax.get_ylim()
+    if high - low < LEAST:
+        ax.set_ylim((low + high - LEAST) / 2, (low + high + LEAST) / 2)
 
 
 @styled

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 
 NAMES = {
     "target": "target",
+    "command": "command",
     "recorded": "recorded",
     "nominal": "nominal simulator",
     "delay_offset": "delay + offset",
@@ -27,6 +28,7 @@ NAMES = {
 }
 COLOURS = {
     "target": "#00838f",
+    "command": "#00838f",
     "recorded": "#111111",
     "nominal": "#8c8c8c",
     "delay_offset": "#d99000",

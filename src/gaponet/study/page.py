@@ -142,4 +142,4 @@ def _section(record: Record, folder: Path) -> Markup:
 def _figure(file: Path) -> Markup:
     if not file.is_file():
         raise DatasetError(f"{file}: is missing; run its experiment again, or delete its .json")
-    return element("figure", picture(file.read_bytes(), "image/svg+xml"))
+    return element("figure", element("div", picture(file.read_bytes(), "image/svg+xml"), css="plot"))

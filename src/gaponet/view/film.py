@@ -83,7 +83,7 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
 def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None]) -> int:
     kind = path.suffix.lower()
     if kind == ".png":
-        camera.picture(_furthest(camera.scene.shown, clip)).save(path)
+        camera.picture(furthest(camera.scene.shown, clip)).save(path)
         return 1
     hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
     times = clip.times(hundredths / 100 if kind == ".gif" else 1 / clip.fps)
@@ -100,7 +100,8 @@ def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int]
     return len(times)
 
 
-def _furthest(shown: SideBySide, clip: Clip) -> float:
+def furthest(shown: SideBySide, clip: Clip) -> float:
+    """When the first simulated copy is worst, s."""
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
     simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
     return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt

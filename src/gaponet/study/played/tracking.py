@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.eval.evaluate import choose
-from gaponet.plot.charts import Once, against, draw_bars
+from gaponet.plot.charts import Course, Once, against, draw_bars
 from gaponet.plot.methods import colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
 from gaponet.robot import RobotSpec
@@ -222,7 +222,9 @@ def draw_example(shown: Example, robot: RobotSpec, tag: str) -> Figure:
     raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
     drawn = {m: qpos for m, qpos in shown.qpos.items() if m not in LEFT_OUT}
     joints = {
-        joint_label(robot.operated[j], wrapped=False): ({m: q[:, j] for m, q in drawn.items()}, shown.target[:, j])
+        joint_label(robot.operated[j], wrapped=False): Course(
+            {m: q[:, j] for m, q in drawn.items()}, shown.target[:, j]
+        )
         for j in sorted(np.argsort(-raw)[:3].tolist())
     }
     looks = {m: (title(m), colour(m)) for m in (*drawn, "target")}
