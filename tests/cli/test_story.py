@@ -93,7 +93,8 @@ def test_the_budget_says_what_each_step_removes(place, capsys):
     assert found["left"]["delay"] < found["left"]["nominal"]
     for step, method in (("nominal", "nominal"), ("offset", "delay_offset"), ("gaponet", "gaponet")):
         assert found["left"][step] == pytest.approx(evaluated["methods"][method]["mpjae"])
-    assert found["floor"]["both"] < found["left"]["gaponet"]
+    assert found["floor"]["both"] is None  # its readings are continuous, and no motion was recorded twice
+    assert "–" in err
     assert "VIRTUAL" in err
     assert (place / "gaponet" / "budget.png").stat().st_size > 10_000
 

@@ -1,12 +1,17 @@
 """The gap budget: steps and floor."""
 
+import json
+
 import numpy as np
 import pytest
 from arm import recordings, write_arm
+from runs import untrained
 
-from gaponet.eval.budget import encoder_step, floor
+from gaponet.data.store import Dataset
+from gaponet.eval.budget import encoder_step, floor, gap_budget
 from gaponet.eval.budget_figure import waterfall
 from gaponet.eval.evaluate import LEARNED
+from gaponet.eval.run_files import read_budget
 
 
 def test_the_encoder_step_is_read_off_the_recordings():
@@ -41,3 +46,27 @@ def test_every_kind_of_model_has_its_bar(kind):
     assert ticks[0] == "nominal"
     assert ticks[-1] == "left"
     assert ax.patches[4].get_height() == pytest.approx(2.0)  # what the model removes, mrad
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_a_run_of_every_kind_has_its_budget_and_its_figure(arm, tmp_path, kind):
+    data = Dataset.create(tmp_path / "data", arm)
+    for sequence in recordings(arm, 3, rows=60, kp=0.5):
+        data.append(sequence)
+    motions = sorted({e.meta.motion for e in data.entries})
+    run = untrained(tmp_path / "run", arm, data, kind, train=motions[:1], val=motions[1:2], test=motions[2:])
+    found = gap_budget(run, data, arm)
+    assert list(found["left"]) == ["nominal", "delay", "offset", kind]
+    assert found["left"][kind] == pytest.approx(found["left"]["nominal"], rel=0.2)  # it corrects nothing yet
+    assert found["floor"] == {"encoder": None, "repeatability": None, "both": None}
+    (run / "budget.json").write_text(json.dumps(found))
+    for budget in (found, read_budget(run)):
+        assert [ax.get_title("right") for ax in waterfall(budget).axes if ax.get_visible()] == ["floor –"] * 3
+
+
+def test_each_bar_says_what_it_removes_and_the_floor_what_it_is():
+    panel = {"left": {"nominal": 0.01, "delay": 0.012, "mlp": 0.002}, "floor": {"both": 0.0005}}
+    found = panel | {"by_joint": {"elbow": panel}, "virtual": True, "robot": "arm", "sequences": 3, "unseen": True}
+    ax = waterfall(found).axes[1]
+    assert [t.get_text() for t in ax.texts] == ["+2.0", "−10.0", "2.0", "10.0"]
+    assert ax.get_title("right") == "floor 0.5"

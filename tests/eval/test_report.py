@@ -1,8 +1,110 @@
-"""What the report says about a card."""
+"""What the report says, and that it is one page that needs nothing else."""
 
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
 import pytest
+from arm import recordings
+from runs import untrained
 
-from gaponet.eval.report import _r2
+from gaponet.data.store import Dataset
+from gaponet.errors import ModelError, UsageError
+from gaponet.eval import figures
+from gaponet.eval.evaluate import evaluate, save
+from gaponet.eval.report import _r2, write_report
+
+FACTS = {
+    "hours": 0.1, "steps": 10, "seconds": 60.0, "excess_delay": 0.0, "parity_rad": 1e-7, "dataset_hash": "0123",
+    "versions": {"gaponet": "0"}, "virtual": True,
+}  # fmt: skip
+LINE = {"stage": "ppo", "steps": 1, "seconds": 0.5, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
+CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "init_std": 0.1}, "seed": 0, "robot": "arm",
+          "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
+
+
+@pytest.fixture
+def run(arm, tmp_path):
+    """A run of an operator that corrects nothing, evaluated on motions in which only the elbow moves."""
+    data = Dataset.create(tmp_path / "data", arm)
+    for sequence in recordings(arm, 4, rows=160, kp=0.5):
+        ctrl = sequence.ctrl * [0.0, 1.0]
+        data.append(replace(sequence, ctrl=ctrl.astype(np.float32)))
+    motions = sorted({e.meta.motion for e in data.entries})
+    folder = untrained(tmp_path / "run", arm, data, train=motions[:1], val=motions[1:2], test=motions[2:])
+    amend(folder, **FACTS, stages={"warm_start_rounds": [3, 10], "ppo_updates": 0})
+    (folder / "config.json").write_text(json.dumps(CONFIG))
+    (folder / "progress.jsonl").write_text(json.dumps(LINE) + "\n")
+    save(evaluate([folder], data, arm), folder)
+    return folder
+
+
+def amend(folder, **facts):
+    card = folder / "model" / "card.json"
+    card.write_text(json.dumps(json.loads(card.read_text()) | facts))
+
+
+def test_the_page_is_one_offline_file_that_says_what_a_visitor_asks(run):
+    page = write_report(run).read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*', page)
+    for text in (
+        "Undertrained: the budget ended after 3 of 10 rounds", "3 of 10 rounds of the supervised start, no PPO",
+        "none: stands still", "elbow</td>", "°)", "Pearson", "median error", "gaponet train data --out run",
+        f"gaponet eval {run} {run.parent / 'data'}", json.loads((run / "metrics.json").read_text())["date"],
+        "prefers-color-scheme: dark", "width=device-width", "command",
+    ):  # fmt: skip
+        assert text in page, text
+
+
+def test_a_trained_run_is_not_called_undertrained(run):
+    amend(run, stages={"warm_start_rounds": [10, 10], "ppo_updates": 40})
+    page = write_report(run).read_text()
+    assert "Undertrained" not in page
+    assert "supervised start (10 rounds), 40 updates of PPO" in page
+
+
+def test_the_robot_is_pictured_or_a_sentence_says_why_not(run):
+    seen = []
+
+    def draw(robot, meta, dt, qpos):
+        seen.append((robot.name, meta.motion, dt, list(qpos)))
+        assert all(q.shape == (160, 2) for q in qpos.values())
+        return b"PNG"
+
+    def blind(*_):
+        raise UsageError("no OpenGL here <b>")
+
+    assert '<img src="data:image/png;base64,UE5H">' in write_report(run, picture=draw).read_text()
+    assert seen[0][3] == ["command", "nominal", "gaponet", "recorded"]
+    assert "No picture of the robot: no OpenGL here &lt;b&gt;" in write_report(run, picture=blind).read_text()
+
+
+@pytest.mark.parametrize("absent", ["date", "command", "moves", "shown"])
+def test_an_evaluation_of_before_is_refused_with_what_to_do(run, absent):
+    metrics = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").write_text(json.dumps({k: v for k, v in metrics.items() if k != absent}))
+    with pytest.raises(ModelError, match=r"evaluation of gaponet is missing; .* or evaluate again"):
+        write_report(run)
+
+
+def test_trajectories_show_the_command_and_errors_on_one_scale_moving_joints_first():
+    n, dt = 1500, 0.02
+    time = np.arange(n) * dt
+    command = np.stack([0.01 * np.sin(time), np.sin(time), np.full(n, 0.3), np.minimum(time / 5, 2.0)], axis=1)
+    arrays = {"0/command": command, "0/recorded": command, "0/nominal": command + np.array([0.9, 0.01, 0.5, 0.02])}
+    arrays |= {f"1/{k[2:]}": v if k != "0/nominal" else command + 0.2 for k, v in arrays.items()}
+    drawn = figures.trajectories(arrays, [{"dt": dt}] * 2, ("a", "b", "c", "d"), ["nominal"])
+    axes = [ax for fig in drawn.values() for ax in fig.axes]
+    titles = [ax.get_title("left") for ax in drawn[0].axes if ax.get_title("left")]
+    assert titles == ["a (stands still)", "b", "d"]
+    errors = axes[6:9] + axes[15:18]
+    assert np.ptp([ax.get_ylim()[1] for ax in errors]) < 1e-6
+    assert errors[0].get_ylim()[1] > 900
+    assert "command" in [line.get_label() for line in axes[1].lines]
+    zoom = axes[5].lines[0].get_xdata()
+    assert zoom[0] < 10.0 < zoom[-1]  # where the command of d stops
+    assert np.ptp(axes[0].get_ylim()) >= 0.06
 
 
 @pytest.mark.parametrize(

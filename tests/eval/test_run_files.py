@@ -9,8 +9,9 @@ from gaponet.errors import ModelError
 from gaponet.eval.run_files import read_budget, read_config, read_metrics, read_progress, read_trajectories
 
 PART = {"mpjae": 0.01}
+JOINT = PART | {"static": 0.01, "dynamic": 0.01}
 SCORES = dict.fromkeys(("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05", "large_0.1"), 0.01) | {
-    "correlation": None, "by_joint": {"elbow": PART}, "by_payload": {"0.5": PART}, "by_motion": {"wave": PART},
+    "correlation": None, "by_joint": {"elbow": JOINT}, "by_payload": {"0.5": PART}, "by_motion": {"wave": PART},
     "by_horizon": {"1": PART, "whole": PART},
 }  # fmt: skip
 METRICS = {
@@ -44,7 +45,10 @@ def test_absent_numbers_are_nan_and_unknown_fields_are_kept(tmp_path):
     [
         (changed("methods", "nominal", "mpjae", value="<b>"), "methods.nominal.mpjae: should be a valid number"),
         (changed("methods", "<script>", value=SCORES), r"methods\.<script>"),
-        (changed("methods", "gaponet", "by_joint", value={"wing": PART}), "methods.gaponet.by_joint: should have what"),
+        (
+            changed("methods", "gaponet", "by_joint", value={"wing": JOINT}),
+            "methods.gaponet.by_joint: should have what",
+        ),
         (changed("methods", value={"gaponet": SCORES}), "methods: nominal is missing"),
         (
             changed("methods", "gaponet", "by_joint", value={"elbow": {}}),
@@ -65,7 +69,7 @@ def test_damaged_metrics_are_refused(tmp_path, metrics, said):
 @pytest.mark.parametrize("bad", [np.zeros((5, 3)), np.zeros(5), np.full((5, 2), np.nan), np.zeros((4, 2))])
 def test_trajectories_of_other_sizes_are_refused(tmp_path, bad):
     good = np.zeros((5, 2), np.float32)
-    np.savez(tmp_path / "trajectories.npz", **{f"0/{m}": good for m in ("recorded", "nominal")}, **{
+    np.savez(tmp_path / "trajectories.npz", **{f"0/{m}": good for m in ("recorded", "command", "nominal")}, **{
         "0/gaponet": bad.astype(np.float32)
     })  # fmt: skip
     with pytest.raises(ModelError, match=r"trajectories\.npz: "):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,6 @@ from gaponet.plot.methods import title
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
-from gaponet.training.config import TrainConfig
 
 Array = np.ndarray
 Tell = Callable[[str, float, float], None]
@@ -60,8 +57,9 @@ def write_report(
     config, curve, budget = read_config(run), read_progress(run), read_budget(run)
     _require_complete(model, metrics, curve, spec)
     progress("drawing", 0, 1)
+    commands = [config.get("command", ""), metrics["command"], shlex.join(["gaponet", "report", str(run)])]
     photo = () if picture is None else _photo(picture, arrays, metrics, spec, model.config.kind)
-    text = _page(model.card, config, metrics, arrays, curve, spec, budget, photo, _commands(run, config, metrics, spec))
+    text = _page(model.card, config, metrics, arrays, curve, spec, budget, photo, commands)
     path = run / "report.html"
     write_text(path, text)
     progress("drawing", 1, 1)
@@ -141,7 +139,7 @@ def _page(
         element("h2", "Training"), element("div", curve_figure, _training_table(card, config), css="row"),
         element("h2", "By motion"), _by_motion(methods),
         element("h2", "What exactly"), _facts(card, metrics),
-        element("h2", "Do it again"), *(element("p", element("code", line)) for line in commands),
+        element("h2", "Do it again"), *(element("p", element("code", line)) for line in commands if line),
     ]  # fmt: skip
     return page(f"{robot.name} {name}", Markup("").join(body))
 
@@ -295,38 +293,6 @@ def _by_motion(methods: dict[str, Any]) -> Markup:
     head = ["MPJAE, mrad", *(title(n) for n in methods)]
     keys = methods["nominal"]["by_motion"]
     return table(head, [[k, *(_both(m["by_motion"][k]["mpjae"]) for m in methods.values())] for k in keys])
-
-
-def _commands(run: Path, config: dict[str, Any], metrics: dict[str, Any], robot: RobotSpec) -> list[str]:
-    """What a shell needs to repeat training, evaluation and report."""
-    budget = config["budget"]
-    limit = f"{budget['seconds']:g}s" if budget["seconds"] is not None else str(budget["steps"])
-    words = ["gaponet", "train", os.path.normpath(run / config["dataset"]), "--out", str(run)]
-    words += ["--model", config["model"]["kind"], "--budget", limit]
-    words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
-    default = asdict(TrainConfig()) | {"holdout_units": ()}
-    default["model"]["kind"] = config["model"]["kind"]
-    return [
-        shlex.join(words + _options(config, default)),
-        metrics["command"],
-        shlex.join(["gaponet", "report", str(run)]),
-    ]
-
-
-def _options(config: dict[str, Any], default: dict[str, Any], prefix: str = "--") -> list[str]:
-    """Options of gaponet train, where they are not the default."""
-    words: list[str] = []
-    for key, value in config.items():
-        name = prefix + key.replace("_", "-")
-        if isinstance(value, dict):
-            words += _options(value, default[key], f"{name}.") if key in default else []
-        elif key not in default or value == (list(default[key]) if isinstance(value, list) else default[key]):
-            continue
-        elif isinstance(value, bool):
-            words.append(name if value else f"{prefix}no-{key.replace('_', '-')}")
-        else:
-            words += [name, *map(str, value if isinstance(value, list) else [value])]
-    return words
 
 
 def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:

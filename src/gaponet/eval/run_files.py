@@ -101,13 +101,6 @@ class Model(TypedDict):
     kind: Method
 
 
-class Budgeted(TypedDict):
-    """How long a training was to be: one of them."""
-
-    seconds: float | None
-    steps: int | None
-
-
 class Config(TypedDict):
     """config.json."""
 
@@ -117,7 +110,7 @@ class Config(TypedDict):
     robot: str
     dataset: str
     dataset_hash: str
-    budget: Budgeted
+    command: NotRequired[str]
 
 
 class Validation(TypedDict):

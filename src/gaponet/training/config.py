@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Any
 
 from annotated_types import Interval
 
@@ -119,3 +119,18 @@ class TrainConfig:
 def fast(config: TrainConfig) -> TrainConfig:
     """The fast preset: PPO with one pass over each batch and a smaller critic; gaponet bench train shows the gain."""
     return replace(config, ppo=replace(config.ppo, epochs=1, critic_hidden=(128,)))
+
+
+def options(config: dict[str, Any], default: dict[str, Any] | None = None, prefix: str = "--") -> list[str]:
+    """The options of gaponet train that say a configuration (asdict of a TrainConfig)."""
+    words: list[str] = []
+    for key, usual in (default or asdict(TrainConfig())).items():
+        value, name = config[key], key.replace("_", "-")
+        if isinstance(usual, dict):
+            words += options(value, usual, f"{prefix}{name}.")
+        elif isinstance(value, bool):
+            words += [] if value == usual else [prefix + ("" if value else "no-") + name]
+        elif value != usual:
+            option = "--model" if prefix + name == "--model.kind" else prefix + name
+            words += [option, *map(str, value if isinstance(value, tuple) else [value])]
+    return words

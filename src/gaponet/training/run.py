@@ -14,6 +14,7 @@ import copy
 import json
 import os
 import platform
+import shlex
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -51,7 +52,7 @@ from gaponet.training.checkpoint import (
     round_state,
     warm_state,
 )
-from gaponet.training.config import TrainConfig
+from gaponet.training.config import TrainConfig, options
 from gaponet.training.env import DeltaEnv
 from gaponet.training.gain import choose_gain
 from gaponet.training.inverse import inverse_labels
@@ -304,6 +305,7 @@ class Trainer:
     def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
         config = asdict(self.config) | {
             "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
+            "command": self._command(holdout_units),
             "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
@@ -313,6 +315,14 @@ class Trainer:
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
         self.kept.write_progress(self.out)
+
+    def _command(self, holdout_units: tuple[str, ...]) -> str:
+        """What a shell needs to train the same again."""
+        limit = str(self.budget.steps) if self.budget.seconds is None else f"{self.budget.seconds:g}s"
+        words = ["gaponet", "train", str(self.dataset.path), "--out", str(self.out), "--budget", limit]
+        words += ["--robot", str(self.robot.folder)] if self.robot.nominal is not None else []
+        words += ["--holdout-units", *holdout_units] if holdout_units else []
+        return shlex.join(words + options(asdict(self.config)))
 
     def _conditions(self) -> set[tuple[float, str, float]]:
         return {(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.train_set}

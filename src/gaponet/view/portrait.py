@@ -38,14 +38,14 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     from gaponet.view.film import Clip, furthest
     from gaponet.view.picture import Camera
     from gaponet.view.scene import Scene
-    from gaponet.view.side_by_side import Motion, SideBySide
+    from gaponet.view.side_by_side import Played, SideBySide
 
     whole = {}
     for method, q in qpos.items():
         whole[method] = np.tile(robot.qpos_home, (len(q), 1))
         whole[method][:, robot.operated_index] = q
     base = whole["recorded"]
-    motions = tuple(Motion(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
+    motions = tuple(Played(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
     shown = SideBySide(Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None)
     clip = Clip.of(shown, None, 8.0)
     moment = furthest(shown, clip)
