@@ -172,7 +172,7 @@ def _ppo(
 
 
 def _spaces(config: ModelConfig, n: int) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Of [o_t | a_t] and of Δa."""
+    """Spaces of [o_t | a_t] and of Δa."""
     return (
         gymnasium.spaces.Box(-np.inf, np.inf, (config.observation_dim(n) + n,), np.float32),
         gymnasium.spaces.Box(-config.delta_max, config.delta_max, (n,), np.float32),

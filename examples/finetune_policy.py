@@ -142,7 +142,7 @@ class TrackingEnv(VecEnv):
         self.episode_length_buf[torch.from_numpy(ids)] = 0
 
     def get_observations(self) -> TensorDict:
-        """Of a noisy state."""
+        """Observation of a noisy state."""
         shape = (self.num_envs, self.task.n)
         q, v = (x[:, self.task.op] + s * self.rng.standard_normal(shape) for x, s in zip(
             (self.sim.qpos, self.sim.qvel), NOISE, strict=True))  # fmt: skip

@@ -76,7 +76,7 @@ def collect(
         fleet: Virtual units of that type.
         recipe: What to play.
         out: Dataset folder; made if missing.
-        seed: Of motions and of everything random in a take.
+        seed: Seed of motions and of everything random in a take.
         nproc: Processes; 0 for one per core, 1 for none beside this one. More than one starts fresh interpreters: a
             script that calls this needs `if __name__ == "__main__":`.
         progress: Called after each sequence.

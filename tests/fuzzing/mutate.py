@@ -87,7 +87,7 @@ def _bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def _text(content: bytes, rng: random.Random) -> bytes:
-    """Of numbers, words and lines."""
+    """The content with a number, a word or a line changed."""
     text = content.decode("utf-8", errors="surrogateescape")
     kind = rng.randrange(9)
     if kind <= 2:

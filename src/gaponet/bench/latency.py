@@ -42,8 +42,8 @@ def measure(run: Path, calls: int = 3000, threads: int = 1) -> dict[str, Any]:
 
     Args:
         run: Run or artifact folder.
-        calls: Of each; they take turns of a tenth, so that a machine that slows down slows all.
-        threads: Of onnxruntime for the batch; 0 for all cores. Single steps have one.
+        calls: How often each is called; they take turns of a tenth, so that a machine that slows down slows all.
+        threads: Threads of onnxruntime for the batch; 0 for all cores. Single steps have one.
     """
     models = {name: GapModel.load(run, name) for name in _backends(run)}
     n = len(models["onnxruntime"].card["joint_names"])

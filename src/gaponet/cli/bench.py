@@ -29,7 +29,7 @@ def bench(
     Args:
         what: sim: replay and environment. train: inference, collection, update, and PPO as a whole. latency: one
             correction of a trained model, on each runtime. aligned: the aligned simulator against the nominal one.
-        run: Of gaponet train, for latency and aligned.
+        run: Run folder of gaponet train, for latency and aligned.
         robot: Robot name or folder.
         model: Network that is trained.
         num_envs: Simulations side by side; default 512, 1024 with train.

@@ -33,7 +33,7 @@ def collect(
         recipe: demo (under a minute), small (about two), simlifter (an hour), arm (any robot), or a .toml file.
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.
-        seed: Of motions, noise and start states.
+        seed: Seed of motions, noise and start states.
         nproc: Processes; 0 for one per core.
         json: Print one JSON object on stdout.
     """

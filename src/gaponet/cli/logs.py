@@ -51,7 +51,7 @@ def import_logs(
         payload_mass: kg in each hand; 0 when empty. Needed unless the format states it.
         payload_side: Which hand carries it: both (default), or the side of one payload mount.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Of the logs; default by looking.
+        format: Format of the logs; default by looking.
         columns: Tables: TOML file that names columns and units.
         position_unit: Tables and LeRobot: unit of positions; velocities are that per second. signed_percent: LeRobot's
             older −100..100.

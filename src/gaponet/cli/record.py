@@ -30,7 +30,7 @@ def record(
         out: Dataset folder; made, or appended to. Every run's full recording goes to OUT/recordings.
         unit_id: Which of its kind was recorded; the virtual driver knows it and sets it.
         payload_mass: kg in each hand named by payload_side; 0 when empty.
-        repetitions: Of each motion.
+        repetitions: How often each motion is played.
         seed: virtual: of the first recording's noise; later ones count on.
         asked: Robot and loop.
         json: One JSON object on stdout.

@@ -54,15 +54,15 @@ def view(
         show: Copies from left to right; aligned stands for every --model.
         render: Write a .gif, .mp4 or .png instead (the .png shows the moment of the largest nominal error).
         web: Serve the scene to a browser instead; needs gaponet[view].
-        port: Of --web.
+        port: Port of --web.
         start: s into the recording; default: where most happens.
         duration: s of the recording.
         speed: Below 1 is slow motion.
         magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
         ghost: Draw the recording, translucent, into each other copy.
         closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
-        fps: Of a film.
-        width: Of a picture, pixels; the height follows from the robots.
+        fps: Pictures a second of a film.
+        width: Width of a picture, pixels; the height follows from the robots.
         course: Draw the error against time below a picture.
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.

@@ -50,7 +50,7 @@ def virtual(
     Args:
         action: serve.
         robot: h1_2 (DDS) or so101 (a serial bus on a pseudo-terminal).
-        unit: Of the fleet: its number or its name.
+        unit: Unit of the fleet: its number or its name.
         payload_mass: kg in each hand named by payload_side.
         payload_side: both, or one hand.
         transport: dds for h1_2, serial for so101; default the robot's.

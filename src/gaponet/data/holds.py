@@ -93,7 +93,7 @@ def static_error(holds: Holds, joint: int, offset: Array | None = None) -> Stati
     """Static error of a joint over its fresh rests, both approaches weighed alike.
 
     Args:
-        holds: Of one unit, any number of sequences.
+        holds: Holds of one unit, any number of sequences.
         joint: Index.
         offset: (k,) rad, expected error to take off, such as the sag of the nominal model; default none.
     """

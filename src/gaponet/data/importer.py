@@ -91,7 +91,7 @@ def import_logs(
         progress: Called after each recording.
         kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some of the joints;
             default what the format states, else the robot's.
-        options: Of data.formats.read_logs: joint_map, columns, position_unit, time_unit.
+        options: Options of data.formats.read_logs: joint_map, columns, position_unit, time_unit.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.

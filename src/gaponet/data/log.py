@@ -32,7 +32,7 @@ class Log:
     Attributes:
         robot: Robot name.
         joint_names: The robot's own names, (n).
-        channels: Of CHANNELS and DERIVED, at least ctrl and qpos.
+        channels: Channels among CHANNELS and DERIVED, at least ctrl and qpos.
         source: File or folder it was read from, for errors and for the manifest.
         meta: Whatever the format also says (events, gains, firmware). Two entries are acted on: dt, the exact period
             of regular rows, s; stated, fields of SequenceMeta that the format itself holds.

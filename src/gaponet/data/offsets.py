@@ -117,7 +117,7 @@ def fit_offsets(holds: dict[Condition, Holds], robot: RobotSpec, gravity: Gravit
     Args:
         holds: Rests under each payload.
         robot: Whose gains carry the load.
-        gravity: Of the nominal model.
+        gravity: Gravity of the nominal model.
     """
     n = len(robot.joint_names)
     every = join(list(holds.values()), n)

@@ -20,7 +20,7 @@ class Twin:
     """What the nominal simulator did under the same commands from the same start.
 
     Attributes:
-        model_hash: Of the simulator (sim.model.model_hash).
+        model_hash: Hash of the simulator (sim.model.model_hash).
         qpos, qvel, tau: (T, n) rad, rad/s, N·m; row t is the state at t·dt, tau the actuator torque at the end of
             [t-1, t).
         ctrl: (T, n) rad, targets applied over [t, t+1), where a corrector altered them; not stored.

@@ -62,7 +62,7 @@ def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str
     """Root-mean-square standard deviation over repetitions, by channel and joint.
 
     Args:
-        groups: Of 2 repetitions or more each.
+        groups: Groups of 2 repetitions or more each.
         joint_names: (n).
 
     Returns:

@@ -158,8 +158,8 @@ def require_same_gains(metas: Iterable[SequenceMeta], joint_names: tuple[str, ..
     """Refuse recordings made with different gains: what one robot does with two stiffnesses is not one gap.
 
     Args:
-        metas: Of the recordings that are taken together; one that does not say its gains (an old journal) may be any.
-        joint_names: Of their gains, (n).
+        metas: Metadata of the recordings taken together; one that does not say its gains (an old journal) may be any.
+        joint_names: Joints that their gains belong to, (n).
         joints: Those that matter.
 
     Raises:

@@ -63,7 +63,8 @@ def split_entries(
         holdout_units: Appear in the test part only, with its motions.
         holdout_payloads: The same, kg.
         rates: Only recordings at these, Hz; all by default.
-        train_share: Of the training motions, in the order of the hash of their names: a smaller share lies in a larger.
+        train_share: Share of the training motions to use, in the order of the hash of their names: a smaller one lies
+            in a larger.
     """
     units = {e.meta.unit_id for e in dataset.entries}
     payloads = {e.meta.payload_mass for e in dataset.entries}

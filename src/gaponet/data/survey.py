@@ -47,7 +47,7 @@ class Survey:
     Attributes:
         entry: Which sequence.
         samples: Hash of command and state alone, whatever unit or payload they are filed under.
-        rate_hz, jitter_ms, longest_gap_ms: Of the state's own timestamps; jitter is the largest deviation from median.
+        rate_hz, jitter_ms, longest_gap_ms: By the state's own timestamps; jitter is the largest deviation from median.
         ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.
         speed: signals.fast_speed of the command, (n), rad/s.
         delay: (n) s, NaN where the motion does not say.

@@ -33,7 +33,7 @@ class State:
         time: When it was measured, on this machine's monotonic clock, s.
         qpos, qvel, tau, temperature: rad, rad/s, N·m, °C; temperature NaN where a robot does not measure it.
         refused: Messages refused so far because their checksum was wrong.
-        tilt: Of the trunk against the vertical, rad; 0 where a robot does not measure it.
+        tilt: Angle of the trunk against the vertical, rad; 0 where a robot does not measure it.
         fault: What the robot itself says is wrong, or that its operator pressed stop; the driver remembers it.
     """
 

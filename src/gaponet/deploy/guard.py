@@ -31,7 +31,7 @@ class Guard:
     def __init__(self, spec: dict[str, object], lock: int, hang: float, damp: float) -> None:
         """
         Args:
-            spec: Of the driver (Driver.guard).
+            spec: What the driver says of itself (Driver.guard).
             lock: Descriptor of the controller's lock.
             hang: s without a sign of life after which it damps.
             damp: s for which it damps.

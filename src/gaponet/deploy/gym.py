@@ -35,7 +35,7 @@ class TrackingEnv(gymnasium.Env):
             references: Joint motions to follow, (T, n) rad each, in the order of sim.joint_names, one row per period.
             reach: What an action of 1 adds, rad.
             preview: Rows of the reference that are seen.
-            seed: Of the choice of motion and start.
+            seed: Seed of the choice of motion and start.
         """
         if not sim.single or not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"TrackingEnv needs one simulation and motions (T, {sim.n}) of at least 3 rows")

@@ -112,7 +112,7 @@ class Limits:
             joints: Names.
             config: The rest.
             gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
-            qpos_range: Of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
+            qpos_range: Ranges of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
         """
         kp, kd = gains or ((robot.nominal or robot).kp, (robot.nominal or robot).kd)
         at = robot.index(joints)
@@ -156,8 +156,8 @@ def limit_command(
         previous: The last command, (..., n) rad; one outside the range counts as at its end.
         qpos, qvel: Measured, (..., n) rad and rad/s.
         dt: Control period, s.
-        limits: Of these joints.
-        age: Of the state when the command leaves, s, or (..., n).
+        limits: Limits of these joints.
+        age: Age of the state when the command leaves, s, or (..., n).
     """
     before = np.clip(previous, limits.low, limits.high)
     step = limits.speed * dt * (1 - ROUNDING)
@@ -208,7 +208,7 @@ class Watch:
     ) -> None:
         """
         Args:
-            joint_names: Of all joints, (n).
+            joint_names: Names of all joints, (n).
             commanded: Index of the commanded ones.
             dt: Control period, s.
             config: Thresholds.

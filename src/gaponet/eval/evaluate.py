@@ -210,7 +210,7 @@ def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
 
     Args:
         run: Run folder.
-        robot: Of the data, or asked for.
+        robot: The robot of the data, or the one asked for.
 
     Raises:
         ModelError: They differ before identification: errors would be told against another baseline.

@@ -32,7 +32,7 @@ class Recipe:
         motions: Names of motion.library, or patterns of them (`*-left_*`).
         files: Motion files (motion.files) to play too; in a recipe file relative to it.
         rates: Control rates, Hz.
-        repetitions: Of everything; they differ in temperature, noise and exact start, as on a robot.
+        repetitions: How often all is played; repetitions differ in temperature, noise and exact start, as on a robot.
         variants: How many of each kind of coordinated motion patterns choose among.
         payload_side: both, or one hand.
     """

@@ -48,7 +48,7 @@ def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: flo
         model: Nominal simulator with the recording's payload (sim.model.build_model).
         qpos: Recorded, (T, n) rad.
         dt: s.
-        cutoff: Of the zero-phase filter before differentiating, Hz.
+        cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
 
     Returns:
         Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.

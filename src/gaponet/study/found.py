@@ -44,7 +44,7 @@ class Found:
 
     Attributes:
         runs: What each finished seed gave, as its cell.json holds it.
-        baselines: Of the same test motions: {"nominal", "delay_offset", maybe "identified"}.
+        baselines: Errors of the baselines on the same test motions: {"nominal", "delay_offset", maybe "identified"}.
         cells: The finished cells themselves.
     """
 

@@ -80,8 +80,8 @@ def learn_inverse(
         robot: The simulator that the model corrects.
         model: What is inverted.
         motions: Targets at the control period, (T, n) rad each.
-        steps: Of the fit.
-        seed: Of the network, the payloads and which motions judge.
+        steps: Gradient steps of the fit.
+        seed: Seed of the network, of the payloads and which motions judge.
 
     Returns:
         rms, rad: of u − a′ itself and of what the network misses of it, on motions that were held out.

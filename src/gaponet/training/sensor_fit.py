@@ -78,7 +78,7 @@ def sensor_labels(
         qpos, qvel: All joints that are not locked, (k, n_free).
         conditions: Payload and period of each state.
         locked: Joints clamped in the simulator.
-        seed: Of the perturbations.
+        seed: Seed of the perturbations.
         nthread: Threads of the simulator, 0 for all cores.
         move: False leaves all states as they are.
     """

@@ -177,7 +177,7 @@ def fit_inputs(
         env: Whose simulator is asked.
         x: Samples of the inputs.
         states: How many the simulator is asked at.
-        seed: Of the choice of states.
+        seed: Seed of the choice of states.
         nthread: Threads of the simulator, 0 for all cores.
 
     Returns:

@@ -63,7 +63,7 @@ class Camera:
 
         Args:
             scene: What to render.
-            width: Of the picture, pixels, even; the height follows from the robots.
+            width: Width of the picture, pixels, even; the height follows from the robots.
             speed, magnify: Said on the picture.
             course: Draw the error against time below.
             span: Time on that axis, s.

@@ -51,11 +51,11 @@ class Scene:
     """The copies of a SideBySide, and where they are.
 
     Attributes:
-        model, data: Of all copies together; copy i's bodies and joints are called METHOD/NAME.
+        model, data: MuJoCo model and data of all copies together; copy i's bodies and joints are called METHOD/NAME.
         spacing: Between neighbours along the picture, m.
         extent: Half the size of it all, m.
-        box: Of one robot on the picture over all frames, relative to its base: (left, right, bottom, top), m.
-        base: Of each copy, (k, 3), m.
+        box: Outline of one robot on the picture over all frames, relative to its base: (left, right, bottom, top), m.
+        base: Base of each copy, (k, 3), m.
     """
 
     def __init__(

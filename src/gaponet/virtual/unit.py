@@ -107,7 +107,7 @@ class VirtualRobot:
 
         Args:
             ctrl: Targets, (N, n) rad.
-            seeds: Of each row's noise, jitter and of where in its friction band it came to rest.
+            seeds: Seeds of each row's noise and jitter, and of where in its friction band it came to rest.
             warmth: Motor temperature above ambient, (N,) K.
             start: True joint positions to start from instead of the rest position, (N, n) rad.
         """

@@ -91,7 +91,7 @@ def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: li
         name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
         values: (k, n), columns in the order of joint_names.
         joint_names: The robot's own names, (n).
-        units: Of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
+        units: Unit of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
         robot: Whose joint ranges give a fraction its meaning.
     """
     if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:

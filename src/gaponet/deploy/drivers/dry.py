@@ -72,7 +72,7 @@ def would_send(recording: Recording, limits: Any) -> dict[str, dict[str, float]]
     """By joint: the lowest and highest command (rad), the fastest (rad/s), and the largest torque asked for (N·m).
 
     Args:
-        recording: Of a dry run.
+        recording: Recording of a dry run.
         limits: safety.Limits of its commanded joints.
     """
     rows = [row for row in recording.rows if row.ctrl is not None]

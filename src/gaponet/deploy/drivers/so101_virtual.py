@@ -39,7 +39,7 @@ class VirtualSO101:
         """
         Args:
             robot: so101.
-            physics: Of the unit.
+            physics: Hidden physics of the unit.
             payload: kg, and mount.
             link: Another name for the port, a symbolic link; replaced if it is one.
         """

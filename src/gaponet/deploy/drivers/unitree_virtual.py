@@ -71,13 +71,13 @@ class VirtualH12:
         """
         Args:
             robot: H1-2.
-            physics: Of the unit.
+            physics: Hidden physics of the unit.
             payload: kg per hand, and side.
             domain, interface: As UnitreeDriver.
             rate: States per second.
             fault: What goes wrong.
             fault_at: s after the first command.
-            seed: Of its noise.
+            seed: Seed of its noise.
         """
         from gaponet.deploy.drivers import dds
 

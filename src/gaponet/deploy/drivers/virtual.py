@@ -36,10 +36,10 @@ class LiveUnit:
         """
         Args:
             robot: The type.
-            physics: Of this unit.
+            physics: Hidden physics of this unit.
             payload: kg per hand, and side.
             start: Where it stands, (n) rad; home by default.
-            seed: Of its noise.
+            seed: Seed of its noise.
             period: Between two states, s.
         """
         self.robot, self.period = robot, period
@@ -94,9 +94,9 @@ class VirtualDriver:
             physics: Hidden parameters (virtual.fleet).
             clock: The controller's.
             payload: kg per hand, and side.
-            name: Of the unit.
+            name: Name of the unit.
             start: Where it stands at first, (n) rad.
-            seed: Of its noise.
+            seed: Seed of its noise.
             period: Between two states, s.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified

@@ -91,7 +91,7 @@ class Planner:
         Args:
             robot: The nominal robot.
             max_payload: What must be held everywhere, kg per hand.
-            seed: Of everything drawn.
+            seed: Seed of everything drawn.
             hold: At each goal, s.
             front: Goals lie at least so far in front of the base, m.
         """

@@ -40,7 +40,7 @@ class Driven:
     Attributes:
         model: What the compensator asks; None to send targets as they are.
         robot: The simulator that the model corrects.
-        config: Of the compensator; iterations 0 leaves the model out.
+        config: Settings of the compensator; iterations 0 leaves the model out.
     """
 
     model: GapModel
@@ -119,7 +119,7 @@ def play(
         unit: Its hidden physics.
         targets: (T, N, n) rad at the robot's control period.
         mass: Payload in each hand, (N,) kg, told to the compensator.
-        seeds: Of each row's noise and rest position, (N,).
+        seeds: Seeds of each row's noise and rest position, (N,).
         driven: By what; None for the targets as they are.
         lengths: Rows of each that count, (N,), falling; those that are through stand still.
         progress: Called after each period with the share of all control steps that is done.

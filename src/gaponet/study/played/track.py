@@ -33,11 +33,11 @@ class Score:
 
     Attributes:
         part: alignment or compensation.
-        method, seed: Of the model; seed None where nothing was trained.
+        method, seed: Seed of the model; seed None where nothing was trained.
         source: generated or files, of the motion.
         motion: Name.
         payload: kg per hand.
-        q_dis: Of each operated joint, (n) rad·s.
+        q_dis: Q_dis of each operated joint, (n) rad·s.
         seconds: The motion's length.
     """
 
@@ -129,7 +129,7 @@ def align(
 
     Args:
         recorded: What the robot did; asked for when there is something to do.
-        sources: Of each motion.
+        sources: Source of each motion.
         robot: The nominal simulator.
         trained: Models; the identified simulator comes from those that correct it.
         tell: Called with each method and the share of it that is done.

@@ -21,7 +21,7 @@ class Trained:
 
     Attributes:
         method: Kind of model, with identified+ in front where it corrects an identified simulator.
-        seed: Of its training.
+        seed: Seed of its training.
         run: Its folder.
         model: What ships.
         robot: The simulator that it corrects.

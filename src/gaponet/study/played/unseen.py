@@ -31,7 +31,7 @@ class Unseen:
     """A motion at the robot's control period.
 
     Attributes:
-        name: Of it.
+        name: Name of the motion.
         source: generated, or files.
         ctrl: Targets, (T, n) rad; limbs without an operated joint at home, since with a fixed base they share no
             dynamics with the others.
@@ -90,7 +90,7 @@ def require_unseen(
     """The motions, each with its nearest motion of training or validation, over the time that both last.
 
     Args:
-        motions: Of the experiment.
+        motions: Motions of the experiment.
         dataset: That the models were trained on.
         robot: Nominal.
         trained: Models.
