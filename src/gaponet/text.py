@@ -6,7 +6,7 @@ import re
 
 
 def plain(text: str) -> str:
-    """One line that changes nothing where it is shown: controls, halves of pairs and the like as escapes."""
+    """The text as one line that changes nothing where it is shown: controls and halves of pairs as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

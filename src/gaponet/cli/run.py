@@ -81,11 +81,11 @@ class Request(Asked):
     model: Path | None = None
     """Run or artifact folder: compensate with it, so that the robot gets to where the motion says."""
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
-    """With a model: how commands are found."""
+    """How commands are found, with a model."""
     unit_id: str = ""
-    """With a model: which unit this is; what gaponet calibrate found out about it is used."""
+    """Which unit this is, with a model; what gaponet calibrate found out about it is used."""
     extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False
-    """With a model: take payloads and servo gains that its training data do not hold."""
+    """Take payloads, with a model, and servo gains that its training data do not hold."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Connect, read and compute, send nothing, and say what would be sent."""
 

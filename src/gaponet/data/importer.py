@@ -219,7 +219,7 @@ def _given_gains(name: str, words: tuple[str, ...], robot: RobotSpec) -> tuple[f
 
 
 def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:
-    """By joint: delay_s, command-to-state lag (None where the motion does not say), and fast_speed of the command."""
+    """Measure by joint: delay_s, command-to-state lag (None where the motion shows none); fast_speed of the command."""
     lag = estimate_delay(sequence.ctrl, sequence.qpos, sequence.dt)
     by_joint = lambda x: {  # noqa: E731
         j: round(float(v), 4) if np.isfinite(v) else None for j, v in zip(sequence.joint_names, x, strict=True)

@@ -48,8 +48,8 @@ class CompensatorConfig:
     """How u + G(u) = a′ is solved. learned: by one answer of a network that was fitted to the fixed point (gaponet
     export RUN --to inverse)."""
     dynamics: bool = False
-    """With aim target: feed forward what moving asks for, not only what holding does. For smooth targets: planned
-    motions halve their error with it, but 5 mrad of noise on targets becomes 0.2 rad on commands."""
+    """Whether, with aim target, what moving asks for is fed forward, not only what holding does. For smooth targets:
+    planned motions halve their error with it, but 5 mrad of noise on targets becomes 0.2 rad on commands."""
     acceleration_time: float = 0.02
     """Low-pass of the targets' acceleration, s."""
     gain: float = 0.5

@@ -48,7 +48,7 @@ class State:
 
 
 class Driver(Protocol):
-    """One robot.
+    """The way to one robot: connect, read states, write targets, damp.
 
     Attributes:
         address: What is driven ("unitree domain 0 arm_sdk", "/dev/ttyUSB0"); one controller at a time per address.

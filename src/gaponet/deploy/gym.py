@@ -55,7 +55,7 @@ class TrackingEnv(gymnasium.Env):
         return self._observe(), {"motion": self.motion}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """One control period; a motion's end truncates, nothing terminates."""
+        """Step one control period; a motion's end truncates, nothing terminates."""
         op = self.sim.op
         target = self._row(1).copy()
         target[op] += self.reach * np.clip(action, -1.0, 1.0)

@@ -43,7 +43,7 @@ class PayloadEstimate:
         self.mass, self.top, self.weight = np.zeros(num), np.zeros(num), np.zeros(num)
 
     def update(self, qpos: Array, qvel: Array, sent: Array, tau: Array | None, seen: Array) -> Array:
-        """One control period; all (num, n operated). Returns kg per robot, (num,).
+        """Take in one control period; all (num, n operated). Returns kg per robot, (num,).
 
         Args:
             qpos, qvel: Measured, rad, rad/s.

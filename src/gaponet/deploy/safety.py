@@ -303,7 +303,7 @@ class Watch:
         return Fault("frozen", f"{self._equal + 1} states in a row read exactly the same")
 
     def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
-        """One encoder that stands still while its command moves on or its velocity says that the joint does."""
+        """Fault where one encoder stands still while its command moves on or its velocity says that the joint moves."""
         qpos, last = state.qpos[self.commanded], self._last
         if last is not None and state.time <= last.time:
             return None  # the same state again

@@ -22,7 +22,7 @@ RAIN = 250  # points under each cloud
 
 
 def payload_colours(payloads: list[float]) -> dict[float, Any]:
-    """From light to heavy; dark enough for paper."""
+    """Colours of the payloads from light to heavy, dark enough for paper."""
     steps = np.linspace(0.85, 0.05, len(payloads)) if len(payloads) > 1 else [0.4]
     return dict(zip(payloads, mpl.colormaps["plasma"](steps), strict=True))
 
@@ -220,7 +220,7 @@ def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) ->
 
 
 def _same_scale(rows: Any) -> None:
-    """One scale for each row of axes: torques and gaps of joints are to be compared, positions are not."""
+    """Give each row of axes one scale: torques and gaps of joints are to be compared, positions are not."""
     for row in rows:
         for ax in row[1:]:
             ax.sharey(row[0])

@@ -56,7 +56,7 @@ summary { cursor: pointer; color: var(--faint); margin: .6rem 0 }
 
 
 def element(name: str, *content: str, css: str = "") -> Markup:
-    """One element of a page. Content that is not Markup is text, whatever it holds: this is where it is escaped."""
+    """Make one element of a page. Content that is not Markup is text, whatever it holds, and is escaped here."""
     inside = Markup("").join(c if isinstance(c, Markup) else escape(plain(c)) for c in content)
     kind = Markup(' class="{}"').format(css) if css else ""
     return Markup("<{0}{1}>{2}</{0}>").format(name, kind, inside)

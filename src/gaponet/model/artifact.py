@@ -70,7 +70,7 @@ def recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, lis
 
 
 def how_trained(card: dict[str, Any]) -> str:
-    """In words: what the budget bought; a model that saw no update of PPO is a supervised start and is called so."""
+    """What the budget bought, in words; a model that saw no update of PPO is a supervised start and is called so."""
     if "stages" not in card:
         return "by an older gaponet, which did not keep what training got to"
     (done, planned), updates = card["stages"]["warm_start_rounds"], card["stages"]["ppo_updates"]

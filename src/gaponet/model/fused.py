@@ -114,7 +114,7 @@ class FusedForward:
         return x
 
     def _elu(self, x: Array) -> None:
-        """In place: max(x, e^min(x,0) − 1), since e^x − 1 ≥ x everywhere."""
+        """ELU in place: max(x, e^min(x,0) − 1), since e^x − 1 ≥ x everywhere."""
         low = np.empty_like(x)
         self._do(np.minimum, x, np.float32(0), out=low)
         self._do(np.exp, low, out=low)

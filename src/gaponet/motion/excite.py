@@ -79,7 +79,7 @@ def _line(levels: Array | list[float], moves: Array | list[float], rests: list[f
 
 
 def _ramps(levels: Array | list[float], speeds: Array | list[float], dt: float) -> Array:
-    """From level to level at constant speeds (rad/s), corners rounded over 0.3 s."""
+    """Go from level to level at constant speeds (rad/s), corners rounded over 0.3 s."""
     kernel = np.hanning(max(3, round(0.3 / dt)))
     out = [np.full(round(0.5 / dt), levels[0])]
     for a, b, speed in zip(levels[:-1], levels[1:], speeds, strict=True):

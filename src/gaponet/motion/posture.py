@@ -1,4 +1,4 @@
-"""From which posture a joint can be moved over how much of its range."""
+"""The posture from which a joint can be moved, and over how much of its range."""
 
 from __future__ import annotations
 

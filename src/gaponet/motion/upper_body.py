@@ -78,7 +78,7 @@ def pick_and_place(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
 
 
 def lift(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
-    """From the waist to the shoulder and down again, twice, to random heights."""
+    """Lift from the waist to the shoulder and down again, twice, to random heights."""
     stops = [kit.ready]
     x, y = rng.uniform(0.3, 0.4), rng.uniform(0.15, 0.3)
     for z in rng.uniform([0.9, 1.3, 0.9, 1.35], [1.0, 1.5, 1.05, 1.55]):
@@ -157,7 +157,7 @@ def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
 
 
 def wander(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
-    """All joints of the arms at once, slow sines with random phases: states that no task passes through."""
+    """Move all joints of the arms at once, on slow sines with random phases: states that no task passes through."""
     steps = round(8.0 / GRID)
     time = np.arange(steps) * GRID
     ctrl = np.repeat(kit.ready[None], steps, axis=0)
@@ -176,7 +176,7 @@ BUILDERS: dict[str, Callable[[Kit, Sides, np.random.Generator], Array]] = {
 
 
 def _stops(stops: list[Array], move: float, hold: float) -> Array:
-    """All joints to each posture in turn: `move` s for the way, `hold` s of rest at each."""
+    """Move all joints to each posture in turn: `move` s for the way, `hold` s of rest at each."""
     count = len(stops)
     return through(np.array(stops), np.full(count - 1, move), np.full(count, hold), GRID)
 

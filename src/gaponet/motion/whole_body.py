@@ -51,7 +51,7 @@ def march(kit: Kit, rng: np.random.Generator) -> Array:
 
 
 def sway(kit: Kit, rng: np.random.Generator) -> Array:
-    """From side to side with hip and ankle roll while the torso turns and the arms open."""
+    """Sway from side to side with hip and ankle roll while the torso turns and the arms open."""
     time, ctrl, window = _start(kit)
     phase = 2 * np.pi * rng.uniform(0.25, 0.4) * time
     wave, opening = np.sin(phase) * window, 0.5 * (1 - np.cos(2 * phase)) * window
@@ -66,14 +66,14 @@ def sway(kit: Kit, rng: np.random.Generator) -> Array:
 
 
 def tour(kit: Kit, rng: np.random.Generator) -> Array:
-    """All joints at once from one random posture to the next, a third of the range around the ready posture."""
+    """Move all joints at once from one random posture to the next, a third of the range around the ready posture."""
     low, high = _box(kit, 0.3)
     stops = np.array([kit.ready, *rng.uniform(low, high, (4, len(low))), kit.ready])
     return through(stops, rng.uniform(1.0, 1.4, 5), np.full(6, 0.3), GRID)
 
 
 def limber(kit: Kit, rng: np.random.Generator) -> Array:
-    """All joints at once on slow sines with random phases."""
+    """Move all joints at once on slow sines with random phases."""
     time, ctrl, window = _start(kit)
     low, high = _box(kit, 0.3)
     for j in range(ctrl.shape[1]):

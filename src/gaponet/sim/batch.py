@@ -26,7 +26,7 @@ class BatchSim:
     def __init__(
         self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = ()
     ) -> None:
-        """One simulation per entry of `conditions`; nthread 0 uses all cores; n counts joints that are not locked."""
+        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked."""
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         self.models = {c: build_model(robot, c[0], c[1], c[2], locked, bare=True) for c in dict.fromkeys(conditions)}

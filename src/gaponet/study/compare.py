@@ -149,7 +149,7 @@ def _lines(runs: Runs) -> Iterator[tuple[Any, ...]]:
 
 
 def _figure(runs: Runs, who: str) -> Any:
-    """By payload, or by joint where there is one payload; units never trained on at the right."""
+    """Bars by payload, or by joint where there is one payload; units never trained on at the right."""
     group = "by_payload" if len(keys(runs, "known", "by_payload")) > 1 else "by_joint"
     places = {(f"{k} kg" if group == "by_payload" else joint_label(k)): ("known", group, k)
               for k in keys(runs, "known", group)}  # fmt: skip

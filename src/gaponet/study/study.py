@@ -65,7 +65,7 @@ class Study:
         cls, data: Dataset, robot: RobotSpec, out: Path, options: Options, holdout_units: tuple[str, ...] = (),
         one_rate: bool = True,
     ) -> Study:  # fmt: skip
-        """As told.
+        """The study that the options ask for.
 
         With one_rate at the slowest rate where the dataset holds several and none was asked for, so that rates are
         compared where they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal; of the units

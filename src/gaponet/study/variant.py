@@ -57,7 +57,7 @@ def parse_variant(text: str, base: TrainConfig) -> Variant:
 
 
 def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
-    """One FIELD=VALUE."""
+    """Set one FIELD=VALUE."""
     field, equals, value = setting.partition("=")
     places = dict(_places(config))
     if not equals or field not in places:

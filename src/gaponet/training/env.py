@@ -158,7 +158,7 @@ class DeltaEnv(VecEnv):
         return self.row > self.last - self.config.delta_hold
 
     def advance(self, delta: Array) -> None:
-        """One control period of all simulations, without reward or reset; delta (num_envs, n_operated)."""
+        """Step all simulations by one control period, without reward or reset; delta (num_envs, n_operated)."""
         op, n = self.op, self.sim
         target = self.ctrl.take(self.row, axis=0).astype(float)
         target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])

@@ -22,7 +22,7 @@ class Loggers:
         self.writers = [{"tensorboard": _tensorboard, "wandb": _wandb}[kind](out, config) for kind in kinds]
 
     def write(self, line: dict[str, Any]) -> None:
-        """One line of progress.jsonl."""
+        """Log one line of progress.jsonl."""
         numbers = {k: float(v) for k, v in line.items() if isinstance(v, (int, float)) and v == v and k != "steps"}
         for write, _ in self.writers:
             write(numbers, line["steps"])

@@ -37,7 +37,7 @@ class PreparedEnv(VecEnv):
         return self._prepared(self.env.get_observations())
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """As the environment's."""
+        """Step the environment."""
         obs, reward, done, extras = self.env.step(actions)
         return self._prepared(obs), reward, done, extras
 
@@ -98,7 +98,7 @@ def trained_by(runner: OnPolicyRunner) -> DeltaNet:
 
 
 def update(runner: OnPolicyRunner) -> None:
-    """One PPO iteration: num_steps control periods in every environment, then the update."""
+    """Run one PPO iteration: num_steps control periods in every environment, then the update."""
     runner.learn(1)
 
 

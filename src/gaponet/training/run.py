@@ -359,7 +359,7 @@ class Trainer:
 
 
 def _parts(dataset: Dataset, config: TrainConfig, holdout_units: tuple[str, ...]) -> Parts:
-    """By the split file, where one is given, else by the fixed rule."""
+    """The parts by the split file, where one is given, else by the fixed rule."""
     if not config.split:
         return split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
     if holdout_units or config.holdout_payloads or config.rates or config.train_share != 1:

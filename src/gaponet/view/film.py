@@ -101,14 +101,14 @@ def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int]
 
 
 def furthest(shown: SideBySide, clip: Clip) -> float:
-    """When the first simulated copy is worst, s."""
+    """The time at which the first simulated copy is worst, s."""
     first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
     simulated = [m for m in shown.motions if m.method not in ("target", "recorded")] or list(shown.motions)
     return (first + int(simulated[0].error[first : last + 1].argmax())) * shown.real.dt
 
 
 def _write_gif(pictures: list[Any], path: Path, milliseconds: int) -> None:
-    """One palette for all frames, no dithering: still pixels stay still, and the file small."""
+    """Write with one palette for all frames and no dithering: still pixels stay still, and the file small."""
     from PIL import Image
 
     some = pictures[:: max(len(pictures) // 4, 1)]

@@ -131,7 +131,7 @@ class CommandLink:
         self.slots = int(np.ceil((physics.delay + physics.jitter).max() / dt)) + 2
 
     def reset(self, ctrl: Array) -> None:
-        """All packets so far asked for ctrl, (N, n) rad."""
+        """Begin as if all packets so far had asked for ctrl, (N, n) rad."""
         count = len(ctrl)
         self.packets = np.repeat(ctrl[:, None], self.slots, axis=1)
         self.arrival = np.full((count, self.slots), -np.inf)

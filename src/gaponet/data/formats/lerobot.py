@@ -80,7 +80,7 @@ def _unit(part: Set, given: str | None) -> str:
 
 
 class _Frames:
-    """One data file, read once, cut into episodes."""
+    """Reads a data file once and cuts it into episodes."""
 
     def __init__(self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str) -> None:
         self.part, self.file, self.robot = part, file, robot

@@ -137,7 +137,7 @@ class _Set:
         self.episodes = self.frames = self.chunk = self.file = 0
 
     def write(self, entries: list[Entry], tell: Callable[[str], None]) -> int:
-        """All episodes and the metadata; returns the number of frames."""
+        """Write all episodes and the metadata; returns the number of frames."""
         writer, size = None, 0
         try:
             for entry in entries:

@@ -47,7 +47,7 @@ class Info(TypedDict):
 
 
 class Feature(TypedDict):
-    """One of its features; names are a list, or a list in a dictionary, often with .pos behind each."""
+    """One feature of a set; names are a list, or a list in a dictionary, often with .pos behind each."""
 
     shape: Annotated[list[Annotated[int, Interval(ge=1, le=1000)]], Len(1, 2)]
     names: list[Name] | dict[str, Any] | None

@@ -69,7 +69,7 @@ class DryRun:
 
 
 def would_send(recording: Recording, limits: Any) -> dict[str, dict[str, float]]:
-    """By joint: the lowest and highest command (rad), the fastest (rad/s), and the largest torque asked for (N·m).
+    """What would be sent, by joint: least and greatest command (rad), the fastest (rad/s), the largest torque (N·m).
 
     Args:
         recording: Recording of a dry run.

@@ -81,7 +81,7 @@ class Message:
         self._gather = self._bytes(wire, packed)
 
     def _bytes(self, wire: list[tuple[str, str, int, int]], packed: list[tuple[str, str, int, int]]) -> Array:
-        """For every byte of the padded struct, its place on the wire; padding points behind the message, at a zero."""
+        """The place on the wire of every byte of the padded struct; padding points behind the message, at a zero."""
         source = np.full(self.packed_size, self.wire_size)
         for (_, kind, count, at), (_, _, _, to) in zip(wire, packed, strict=True):
             size = np.dtype(kind).itemsize * count

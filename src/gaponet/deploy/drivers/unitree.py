@@ -272,7 +272,7 @@ class TickClock:
             self.time(tick, arrival)
 
     def time(self, tick: int, arrival: float) -> float:
-        """When the state with this tick was measured, s, at most its arrival; the same again for the same tick."""
+        """The time when the state with this tick was measured, s, at most its arrival; one tick always has one time."""
         if tick == self._last_tick and np.isfinite(self._offset):
             return self._time
         if tick < self._last_tick - 2**31:

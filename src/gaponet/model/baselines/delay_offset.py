@@ -41,7 +41,7 @@ class DelayOffset:
         return read_json(cls, run / "delay_offset.json", ModelError, hint)
 
     def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
-        """For sim.replay."""
+        """The corrector for sim.replay."""
         return DelayOffsetCorrector(self, robot)
 
     def to_json(self) -> dict[str, Any]:
@@ -62,7 +62,7 @@ class DelayOffsetCorrector:
         self.offset = np.array([values.offset[j] for j in robot.operated])
 
     def reset(self, start: ListOf[Sequence]) -> None:
-        """One simulation per sequence."""
+        """Begin with one simulation per sequence."""
         self.steps = np.round(self.delay[None, :] / np.array([s.dt for s in start])[:, None]).astype(int)  # (k, n)
         self.past: list[Array] = []
 

@@ -65,7 +65,7 @@ def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], On
 
 
 def cut(value: float, base: float) -> float:
-    """By how many per cent value is below base."""
+    """How many per cent value is below base."""
     return 100 * (1 - value / base) if base else float("nan")
 
 

@@ -17,7 +17,7 @@ SAME = ("mlp_match=on",)  # changes that make no other method of it
 
 @dataclass(frozen=True)
 class Trained:
-    """One run.
+    """A trained model and the run that it comes from.
 
     Attributes:
         method: Kind of model, with identified+ in front where it corrects an identified simulator.
