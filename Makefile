@@ -7,7 +7,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers adversary fuzz kills check site clean
+.PHONY: setup demo test faults peers browser adversary fuzz kills check site clean
 
 setup: $(VENV)/.done
 
@@ -35,6 +35,11 @@ faults: setup
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup
 	$(BIN)/python -m pytest -m peers -s
+
+# Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
+browser: setup
+	$(BIN)/pip install -q -e ".[dev,view]"
+	$(BIN)/python -m pytest -m browser -s tests/view
 
 # A million random and adversarial states through controller and limits, in simulated time: minutes; counts as JSON.
 adversary: setup

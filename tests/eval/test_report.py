@@ -2,47 +2,20 @@
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import recordings
-from runs import untrained
+from reports import amend, evaluated_run
 
 from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.eval import figures
-from gaponet.eval.evaluate import evaluate, save
 from gaponet.eval.report import _r2, write_report
-
-FACTS = {
-    "hours": 0.1, "steps": 10, "seconds": 60.0, "excess_delay": 0.0, "parity_rad": 1e-7, "dataset_hash": "0123",
-    "versions": {"gaponet": "0"}, "virtual": True,
-}  # fmt: skip
-LINE = {"stage": "ppo", "steps": 1, "seconds": 0.5, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
-CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "init_std": 0.1}, "seed": 0, "robot": "arm",
-          "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
 
 
 @pytest.fixture
 def run(arm, tmp_path):
-    """A run of an operator that corrects nothing, evaluated on motions in which only the elbow moves."""
-    data = Dataset.create(tmp_path / "data", arm)
-    for sequence in recordings(arm, 4, rows=160, kp=0.5):
-        ctrl = sequence.ctrl * [0.0, 1.0]
-        data.append(replace(sequence, ctrl=ctrl.astype(np.float32)))
-    motions = sorted({e.meta.motion for e in data.entries})
-    folder = untrained(tmp_path / "run", arm, data, train=motions[:1], val=motions[1:2], test=motions[2:])
-    amend(folder, **FACTS, stages={"warm_start_rounds": [3, 10], "ppo_updates": 0})
-    (folder / "config.json").write_text(json.dumps(CONFIG))
-    (folder / "progress.jsonl").write_text(json.dumps(LINE) + "\n")
-    save(evaluate([folder], data, arm), folder)
-    return folder
-
-
-def amend(folder, **facts):
-    card = folder / "model" / "card.json"
-    card.write_text(json.dumps(json.loads(card.read_text()) | facts))
+    return evaluated_run(arm, Dataset.create(tmp_path / "data", arm), tmp_path / "run")
 
 
 def test_the_page_is_one_offline_file_that_says_what_a_visitor_asks(run):
