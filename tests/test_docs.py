@@ -98,6 +98,13 @@ def test_every_link_of_the_readme_is_absolute_and_leads_to_a_file_that_is_there(
         assert (ROOT / link.removeprefix(home)).is_file(), link
 
 
+@pytest.mark.parametrize("page", [*PAGES, *sorted((ROOT / "docs/results").glob("*.md"))], ids=lambda page: page.stem)
+def test_every_picture_of_a_page_is_there(page):
+    """The strict build of the site looks at links alone."""
+    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / picture).is_file(), f"{page.name}: {picture}"
+
+
 def test_the_navigation_of_the_site_has_every_page():
     site = (ROOT / "zensical.toml").read_text(encoding="utf-8")
     for page in PAGES:
