@@ -1,6 +1,7 @@
 """Splits: parts share no recording, whatever it is filed under."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -125,6 +126,29 @@ def test_what_is_no_split_file_is_refused(dataset, tmp_path):
     for path in (tmp_path / "x.json", tmp_path / "nowhere.json"):
         with pytest.raises(DatasetError, match=r": .*; make one with gaponet data split"):
             read_split(path, dataset)
+
+
+# Mutants of make fuzz --only samples (seed 0) that once ended in a traceback; the number is the mutant's.
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(lambda text: re.sub(rb'"train": .', b'"train": [], "was": {', text), id="244"),
+        pytest.param(lambda text: re.sub(rb'"val": .', b'"val": [], "was": {', text), id="542"),
+        pytest.param(lambda text: re.sub(rb'("train": \{\s*"[^"]*": )"[^"]*"', rb'\1["x"]', text), id="301"),
+        pytest.param(lambda text: re.sub(rb'("val": \{\s*"[^"]*": )"[^"]*"', rb"\1[[]]", text), id="516"),
+        pytest.param(lambda text: text[:126] + b"\xff" + text[126:], id="518"),
+        pytest.param(lambda text: text[:36] + b"\xfb" + text[36:], id="607"),
+        pytest.param(lambda text: text[:7] + b"\x80" + text[7:], id="675"),
+        pytest.param(lambda text: text[:253] + b"\xf0" + text[253:], id="803"),
+    ],
+)
+def test_a_split_file_that_was_changed_at_random_is_refused_in_one_line(dataset, change):
+    path = write_split(dataset, make_split(dataset, "motion"), "motion")
+    whole = path.read_bytes()
+    path.write_bytes(change(whole))
+    assert path.read_bytes() != whole
+    with pytest.raises(DatasetError, match=r"motion\.json: .*; make one with gaponet data split"):
+        read_split(path, dataset)
 
 
 def test_a_rate_keeps_the_split_by_motion_and_a_smaller_share_lies_in_a_larger(arm, tmp_path):

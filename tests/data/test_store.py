@@ -1,6 +1,7 @@
 """The dataset folder: what is listed is complete, what is not listed does not exist."""
 
 import json
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -251,3 +252,17 @@ def test_a_name_that_is_not_text_is_written_and_read_with_its_bytes_escaped(data
     odd = replace(sequence.meta, motion="\udcff\n[red]", source="/logs/\udcff.csv", payload_mass=2.0)
     dataset.append(replace(sequence, meta=odd))
     assert Dataset(dataset.path).entries[1].meta.motion == "\\udcff\n[red]"
+
+
+def test_where_a_recording_came_from_is_words_and_is_never_opened(dataset, monkeypatch):
+    """Mutant 410 of make fuzz --only journal (seed 0): a source outside the folder."""
+    journal = dataset.path / "sequences.jsonl"
+    line = json.loads(journal.read_text())
+    line["meta"]["source"] = "../../secret.csv#3"
+    journal.write_text(json.dumps(line) + "\n")
+    opened = []
+    sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == "open" else None)
+    data = Dataset(dataset.path)
+    data.sequences()
+    assert [name for name in opened if "secret" in name] == []
+    assert any("sequences.jsonl" in name for name in opened)

@@ -25,13 +25,17 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}
 def in_own_process(run: Path, calls: int, threads: int) -> str:
     """The JSON of `measure` from a fresh interpreter: how many threads numpy has is fixed when it is loaded."""
     code = (
-        "import json, sys; from pathlib import Path; from gaponet.bench.latency import measure; "
-        "print(json.dumps(measure(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))))"
+        "import json, sys; from pathlib import Path; from gaponet.bench.latency import measure\n"
+        "from gaponet.errors import GAPONetError\n"
+        "try: print(json.dumps(measure(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))))\n"
+        "except GAPONetError as error: print(error); sys.exit(2)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(run), str(calls), str(threads)],
         env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, text=True, check=False,
     )  # fmt: skip
+    if done.returncode == 2:
+        raise ModelError(done.stdout.strip().splitlines()[-1])
     if done.returncode:
         raise ModelError(f"{run}: the measurement ended with code {done.returncode}; its message is above")
     return done.stdout.strip().splitlines()[-1]

@@ -8,13 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence as ListOf
 from typing import Any
 
-import gymnasium
 import numpy as np
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
-from gaponet.errors import UsageError
+from gaponet.errors import UsageError, missing_extra
 from gaponet.model.artifact import GapModel
+
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(missing_extra(error) or str(error), name=error.name) from None
 
 Array = np.ndarray
 

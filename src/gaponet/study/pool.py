@@ -24,7 +24,7 @@ from typing import Any, NoReturn
 
 from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.errors import GAPONetError, UsageError
+from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.files import write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
@@ -262,6 +262,10 @@ def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, par
     except (GAPONetError, OSError) as error:  # a full disk is no bug
         pipe.send(str(error))
     except Exception as error:
+        missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None:
+            pipe.send(missing)
+            return
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, traceback.format_exc())
         pipe.send(f"{type(error).__name__}: {error} (see {file})")
