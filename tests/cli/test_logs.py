@@ -231,3 +231,14 @@ def test_doctor_refuses_another_robot_and_a_damaged_file(logs, tmp_path, capsys)
     shutil.rmtree(tmp_path / "data")
     assert main(["doctor", str(tmp_path / "data")]) == 2
     assert "not a dataset" in capsys.readouterr().err
+
+
+def test_logs_are_found_again_in_a_dataset_whose_journal_holds_no_lags(arm, tmp_path, capsys):
+    """A collected dataset is one."""
+    (tmp_path / "wave.csv").write_text(table_text(arm_columns(60)))
+    assert import_arm(tmp_path / "wave.csv", arm, tmp_path / "set", *SI) == 0
+    journal = tmp_path / "set" / "sequences.jsonl"
+    journal.write_text(json.dumps(json.loads(journal.read_text()) | {"findings": {}}) + "\n")
+    capsys.readouterr()
+    assert import_arm(tmp_path / "wave.csv", arm, tmp_path / "set", *SI, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["imported"] == []

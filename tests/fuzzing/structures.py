@@ -142,7 +142,7 @@ def _evaluation(folder: Path) -> None:
                           ("split", {"train": {"a": "0"}, "val": {"b": "1"}, "test": {"c": "2"}})):  # fmt: skip
         (folder / f"{name}.json").write_text(json.dumps(content, indent=1))
     (folder / "progress.jsonl").write_text(2 * (json.dumps(line) + "\n"))
-    arrays = {f"0/{m}": np.zeros((5, 2), np.float32) for m in ("recorded", "nominal", "gaponet")}
+    arrays = {f"0/{m}": np.zeros((5, 2), np.float32) for m in ("recorded", "command", "nominal", "gaponet")}
     np.savez(folder / "trajectories.npz", **arrays)
 
 

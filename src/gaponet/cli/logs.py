@@ -121,7 +121,7 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     out.result({
         "dataset": str(data.path), "imported": [e.id for e in report.entries],
         "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
-        "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings["delay_s"] for e in entries},
+        "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings.get("delay_s", {}) for e in entries},
         "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
     })  # fmt: skip
 
@@ -172,7 +172,11 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
 
 def fast_lags(entries: list[Entry], joint: str) -> list[float]:
     """Lags of a joint in the sequences that command it fast, s."""
-    found = [e.findings["delay_s"][joint] for e in entries if (e.findings["fast_speed"][joint] or 0) >= FAST]
+
+    def of(entry: Entry, name: str) -> float | None:
+        return entry.findings.get(name, {}).get(joint)  # a collected recording has none
+
+    found = [of(e, "delay_s") for e in entries if (of(e, "fast_speed") or 0) >= FAST]
     return [lag for lag in found if lag is not None]
 
 

@@ -36,7 +36,7 @@ from gaponet.errors import DatasetError
 from gaponet.files import require_ours, sync, whole, write_text, writing
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import KEPT, keeps_robot, save_robot
-from gaponet.structure import Json, Name, parse_json, read_format
+from gaponet.structure import Name, parse_json, read_format
 
 FORMAT = 1
 MEND = "restore the file or import the log again"
@@ -67,7 +67,7 @@ class Entry:
     rows: Annotated[int, Interval(ge=1, le=10**8)]
     channels: tuple[str, ...]
     meta: SequenceMeta
-    findings: dict[str, Json]
+    findings: dict[str, dict[str, float | None]]
 
     def __post_init__(self) -> None:
         if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
