@@ -37,3 +37,12 @@ def test_the_users_choice_stands(headless):
     headless.setenv("MUJOCO_GL", "osmesa")
     gl.choose_gl()
     assert os.environ["MUJOCO_GL"] == "osmesa"
+
+
+def test_a_choice_that_mujoco_cannot_use_is_taken_back(headless):
+    """Who only wanted a picture goes on without one: mujoco is not imported with it again."""
+    headless.setattr(gl, "find_library", lambda name: f"lib{name}.so")
+    headless.setitem(sys.modules, "mujoco", None)  # its import fails
+    with pytest.raises(UsageError, match="MUJOCO_GL=egl: "):
+        gl.choose_gl()
+    assert "MUJOCO_GL" not in os.environ

@@ -25,7 +25,8 @@ def choose_gl() -> None:
     Raises:
         UsageError: With what to install.
     """
-    if not has_display() and not os.environ.get("MUJOCO_GL"):
+    ours = not has_display() and not os.environ.get("MUJOCO_GL")
+    if ours:
         found = [name for name, library in (("egl", "EGL"), ("osmesa", "OSMesa")) if find_library(library)]
         if not found:
             raise UsageError(f"no display and no OpenGL library for rendering off screen. {CURE}")
@@ -33,4 +34,5 @@ def choose_gl() -> None:
     try:
         import mujoco  # noqa: F401
     except Exception as error:  # a chosen backend that is not installed fails in ways of its own
-        raise UsageError(f"MUJOCO_GL={os.environ.get('MUJOCO_GL')}: {error}. {CURE}") from None
+        chosen = os.environ.pop("MUJOCO_GL") if ours else os.environ.get("MUJOCO_GL")
+        raise UsageError(f"MUJOCO_GL={chosen}: {error}. {CURE}") from None
