@@ -103,14 +103,15 @@ def test_compare_puts_models_and_seeds_into_one_table_and_keeps_what_is_there(pl
     words = ["compare", str(place / "data"), "--out", str(place / "compared"), "--seeds", "2", "--models", "mlp"]
     words += [*TRAIN, "--budget", "900", "--warm-start.rounds", "1", "--identify"]
     result, err = run(place, capsys, *words)
-    assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "mlp"]
-    assert [r["seed"] for r in result["methods"]["mlp"]["runs"]] == [0, 1]
-    assert result["unseen"] is True
-    assert result["methods"]["identified"]["mpjae"][0] < result["methods"]["nominal"]["mpjae"][0]
+    totals = {row[0]: row[2] for row in result["tables"]["totals"]["rows"]}
+    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP"]
+    assert totals["MLP"]["count"] == 2
+    assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
+    assert result["facts"]["unseen"] is True
     assert "VIRTUAL" in err
     again, err = run(place, capsys, *words)
-    assert "2 of 2 runs are there already" in err
-    assert again == result
+    assert "2 trainings (1 settings), 2 there already" in err
+    assert again["tables"] == result["tables"]
     assert main([*words, "--budget", "901", "--robot", str(place / "arm")]) == 2
     assert "another budget" in capsys.readouterr().err
 

@@ -12,12 +12,12 @@ from gaponet.cli.gap import mrad
 from gaponet.cli.out import Out, writes
 
 COLUMNS = {  # field → heading, factor from SI
-    "kp": ("kp\nN·m/rad", 1.0),
-    "damping": ("damping\nN·m·s/rad", 1.0),
-    "frictionloss": ("friction\nN·m", 1.0),
-    "armature": ("armature\ng·m²", 1e3),
-    "offset": ("offset\nmrad", 1e3),
-    "delay": ("delay\nms", 1e3),
+    "kp": ("kp, N·m/rad", 1.0),
+    "damping": ("damping, N·m·s/rad", 1.0),
+    "frictionloss": ("friction, N·m", 1.0),
+    "armature": ("armature, g·m²", 1e3),
+    "offset": ("offset, mrad", 1e3),
+    "delay": ("delay, ms", 1e3),
 }
 
 
