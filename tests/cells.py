@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 
@@ -10,13 +11,18 @@ from gaponet.study.pool import Cell, Tell
 
 
 def note_threads(cell: Cell, tell: Tell) -> None:
-    """Leave a file that says how many threads this process was given; seed 1 fails, seed 2 is a bug, seed 3 dies."""
+    """Leave a file that says how many threads this process was given; seed 1 fails, seed 2 is a bug, seed 3
+    dies, seed 4 meets a full disk, seed 5 lacks a package."""
     if cell.seed == 1:
         raise ModelError("no such thing")
     if cell.seed == 2:
         raise ZeroDivisionError("a bug")
     if cell.seed == 3:
         os._exit(9)
+    if cell.seed == 4:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
+    if cell.seed == 5:
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
     tell(0.5, "half")
     cell.folder.mkdir(parents=True)
     (cell.folder / "threads").write_text(os.environ["OMP_NUM_THREADS"])

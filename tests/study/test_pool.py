@@ -52,6 +52,19 @@ def test_a_cell_that_fails_leaves_the_others_alone(data, arm, tmp_path, monkeypa
     assert os.environ["OMP_NUM_THREADS"] == "5"
 
 
+def test_a_full_disk_and_a_missing_package_are_said_and_leave_no_file(data, arm, tmp_path):
+    made = cells(data, arm, tmp_path / "out", seeds=(4, 5, 0))
+    left = made[2].folder.with_name(made[2].folder.name + ".error.txt")
+    left.parent.mkdir(parents=True)
+    left.write_text("of an earlier attempt")
+    failed = run_cells(made, note_threads, 1, lambda running, done: None)
+    assert failed == {
+        "mlp seed 4": "[Errno 28] No space left on device: 'checkpoint.pt'",
+        "mlp seed 5": "torch is not installed; run: pip install 'gaponet[train]'",
+    }
+    assert list((tmp_path / "out").rglob("*.error.txt")) == []
+
+
 def test_ctrl_c_lets_every_running_cell_keep_what_it_reached(data, arm, tmp_path):
     made = cells(data, arm, tmp_path / "out", seeds=(0, 1, 2))
 
