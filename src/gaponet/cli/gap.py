@@ -9,6 +9,7 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.out import Out
+from gaponet.plot.methods import title
 from gaponet.robot import RobotSpec
 
 
@@ -63,16 +64,16 @@ def show_methods(out: Out, result: dict[str, Any], robot: RobotSpec) -> None:
     base = methods["nominal"]["mpjae"]
     columns = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static", "dynamic", "≥ 0.05 rad"]
     out.table("Totals", columns, [
-        [name, mrad(m["mpjae"]), f"{m['mpjae'] / base:.2f}" if base else "–", mrad(m["rmse"]), f"{m['q_dis']:.3f}",
-         mrad(m["static"]), mrad(m["dynamic"]), f"{m['large_0.05'] * 100:.1f} %"]
+        [title(name), mrad(m["mpjae"]), f"{m['mpjae'] / base:.2f}" if base else "–", mrad(m["rmse"]),
+         f"{m['q_dis']:.3f}", mrad(m["static"]), mrad(m["dynamic"]), f"{m['large_0.05'] * 100:.1f} %"]
         for name, m in methods.items()
     ])  # fmt: skip
-    for group, title in (("joint", "joint"), ("payload", "payload, kg"), ("unit", "unit"), ("horizon", "horizon, s"),
+    for group, heading in (("joint", "joint"), ("payload", "payload, kg"), ("unit", "unit"), ("horizon", "horizon, s"),
                          ("motion", "motion")):  # fmt: skip
         keys = list(methods["nominal"][f"by_{group}"])
         if group in ("payload", "unit") and len(keys) < 2:
             continue
-        out.table(f"MPJAE, mrad by {group}", [title, *methods], [
+        out.table(f"MPJAE, mrad by {group}", [heading, *map(title, methods)], [
             [key, *(mrad(m[f"by_{group}"][key]["mpjae"]) for m in methods.values())] for key in keys
         ])  # fmt: skip
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
+WIDTH = 120  # letters of a line in a file or a pipe
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
 
@@ -38,6 +39,8 @@ class Out:
     def __init__(self, as_json: bool = False) -> None:
         self.as_json = as_json
         self.console = _Console(stderr=as_json, highlight=False)
+        if not self.console.is_terminal:
+            self.console.width = max(self.console.width, WIDTH)
 
     def say(self, text: str, start: str = "", style: str = "bold") -> None:
         """A line for people; `start` stands before the text, in this style. Neither is markup, whatever it holds."""
