@@ -5,23 +5,21 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.progress import bar
 from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import MOVE_KEPT, keeps_robot, kept_robot
+from gaponet.robot_folder import MOVE_KEPT
 
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
     from gaponet.data.importer import ImportReport
-    from gaponet.data.store import Dataset
     from gaponet.eval.evaluate import Evaluation
     from gaponet.model.artifact import GapModel
     from gaponet.model.calibration import Calibration
@@ -29,28 +27,6 @@ if TYPE_CHECKING:
     from gaponet.training.config import TrainConfig
 
 Place = str | Path
-
-
-def open_dataset(
-    dataset: Dataset | Place, robot: RobotSpec | Place | None = None, run: Place | None = None
-) -> tuple[Dataset, RobotSpec]:
-    """A dataset and its robot: the one asked for, else the one that the dataset keeps.
-
-    A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
-    is said.
-    """
-    from gaponet.data.store import Dataset
-
-    data = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
-    if robot is not None:
-        return data, _robot(robot)
-    if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
-        return data, kept_robot(Path(run), data.robot_name)
-    spec = kept_robot(data.path, data.robot_name)
-    if not keeps_robot(data.path):
-        note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
-        print(note, file=sys.stderr)
-    return data, spec
 
 
 def import_logs(
@@ -78,7 +54,7 @@ def import_logs(
         LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
     """
     from gaponet.data.importer import import_logs as run
-    from gaponet.data.store import Dataset
+    from gaponet.sim.dynamics import gravity_of
     from gaponet.sim.kept import require_kept
     from gaponet.sim.model import model_hash
 
@@ -88,7 +64,7 @@ def import_logs(
     with bar("importing") as update:
         return run(
             src, spec, unit_id, payload_mass, out,
-            gravity=_gravity(spec), simulator=model_hash(spec), progress=update, **options,
+            gravity=gravity_of(spec), simulator=model_hash(spec), progress=update, **options,
         )  # fmt: skip
 
 
@@ -106,10 +82,11 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import diagnose
+    from gaponet.sim.dynamics import gravity_of
 
     data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
-        return diagnose(data, spec, update, _gravity(spec))
+        return diagnose(data, spec, update, gravity_of(spec))
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:
@@ -379,19 +356,3 @@ def _run(run: GapModel | Place) -> Path:
     if isinstance(run, (str, Path)):
         return Path(run)
     return run.path.parent if run.path.name == "model" else run.path
-
-
-def _gravity(robot: RobotSpec) -> Callable[[np.ndarray, float, str], np.ndarray]:
-    """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
-    from gaponet.sim.dynamics import static_torque
-    from gaponet.sim.model import build_model
-
-    models: dict[tuple[float, str], Any] = {}
-
-    def gravity(qpos: np.ndarray, payload_mass: float, payload_side: str) -> np.ndarray:
-        key = (payload_mass, payload_side)
-        if key not in models:
-            models[key] = build_model(robot, *key)
-        return static_torque(models[key], qpos)
-
-    return gravity

@@ -8,9 +8,8 @@ import pytest
 from arm import TOML, commands, record, write_arm
 from runs import untrained
 
-from gaponet.api import open_dataset
 from gaponet.cli.main import main
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import DatasetError, ModelError
 from gaponet.eval.budget import gap_budget
 from gaponet.eval.evaluate import choose, evaluate

@@ -8,9 +8,9 @@ from typing import Any
 
 import tyro
 
-from gaponet.api import open_dataset
 from gaponet.cli.gap import mrad
 from gaponet.cli.out import Out
+from gaponet.data.store import open_dataset
 from gaponet.progress import bar
 
 

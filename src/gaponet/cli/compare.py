@@ -8,9 +8,9 @@ from typing import Annotated
 
 import tyro
 
-from gaponet.api import open_dataset
 from gaponet.cli.experiment import Shared, carry_out
 from gaponet.cli.out import writes
+from gaponet.data.store import open_dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar
 from gaponet.study.compare import Compare, identified

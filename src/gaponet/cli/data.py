@@ -7,9 +7,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.api import open_dataset
 from gaponet.cli.out import Out
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, open_dataset
 from gaponet.progress import bar
 
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from gaponet.api import open_dataset
 from gaponet.cli.out import Out, show_result, writes
+from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
 from gaponet.progress import bar, bars
 from gaponet.study.ablation import Ablation

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from gaponet.api import open_dataset
 from gaponet.cli.gap import mrad
 from gaponet.cli.out import Out
+from gaponet.data.store import open_dataset
 from gaponet.progress import bar
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ import hashlib
 import json
 import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -34,8 +35,8 @@ from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
 from gaponet.files import require_ours, sync, whole, write_text, writing
-from gaponet.robot import RobotSpec
-from gaponet.robot_folder import KEPT, keeps_robot, save_robot
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.structure import Name, parse_json, read_format
 
 FORMAT = 1
@@ -318,3 +319,23 @@ def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
         if len(values) != rows * n or not np.isfinite(values).all():
             raise DatasetError(f"{path}: {column} lacks values or holds NaN; {MEND}")
     return {c: values.reshape(rows, n) for c, values in arrays.items()}
+
+
+def open_dataset(
+    dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
+) -> tuple[Dataset, RobotSpec]:
+    """A dataset and its robot: the one asked for, else the one that the dataset keeps.
+
+    A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
+    is said on stderr.
+    """
+    data = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    if robot is not None:
+        return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
+        return data, kept_robot(Path(run), data.robot_name)
+    spec = kept_robot(data.path, data.robot_name)
+    if not keeps_robot(data.path):
+        note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
+        print(note, file=sys.stderr)
+    return data, spec

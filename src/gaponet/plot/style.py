@@ -36,7 +36,7 @@ STYLE: dict[Any, Any] = {
 DASHED = (0, (4, 1.5))
 DOTTED = (0, (1, 1))
 ENTRY = 1.9  # inches that a legend's entry takes
-LONGEST, LABEL = 120, 32  # letters of a line, and of one beside an axis or in a legend
+LONGEST, LABEL = 120, 40  # letters of a line, and of one beside an axis or in a legend
 
 
 def figure(width: float, height: float) -> Figure:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 
 from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot import RobotSpec
+from gaponet.sim.model import build_model
 
 Array = np.ndarray
 
@@ -57,3 +61,16 @@ def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: flo
     qvel = differentiate(smooth, dt)
     qacc = differentiate(qvel, dt)
     return inverse_dynamics(model, smooth, qvel, qacc), qacc
+
+
+def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
+    """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
+    models: dict[tuple[float, str], mujoco.MjModel] = {}
+
+    def gravity(qpos: Array, payload_mass: float, payload_side: str) -> Array:
+        key = (payload_mass, payload_side)
+        if key not in models:
+            models[key] = build_model(robot, *key)
+        return static_torque(models[key], qpos)
+
+    return gravity
