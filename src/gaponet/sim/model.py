@@ -13,10 +13,14 @@ from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
 from gaponet.robot import IDENTIFIED, RobotSpec
 
-# Joint friction loss is a soft constraint in MuJoCo: with the default parameters a joint that should stick creeps.
-# These values hold it (tests/sim/test_model.py holds a loaded joint for 60 s), at no cost in speed.
+# Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
+# torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
+# is the stiffest that the solver still meets at this tolerance, whatever the armature, at no cost in speed; it makes
+# joint stops as much harder. noslip_iterations halve the speed of a humanoid and converge slowly in a light limb.
 STIFF_SOLREF = (0.004, 1.0)
-STIFF_SOLIMP = (0.999, 0.9999, 0.001, 0.5, 2.0)
+STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+STIFF_MOBILITY = 0.1
+TOLERANCE = 1e-10
 
 PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
 
@@ -58,7 +62,13 @@ def build_model(
         )
     if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
         raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
+    stiffen_friction(model)
     return model
+
+
+def stiffen_friction(model: mujoco.MjModel) -> None:
+    """Make friction hold; once after each compilation or mj_setConst, which undo it."""
+    model.dof_invweight0 *= STIFF_MOBILITY
 
 
 def build_spec(
@@ -74,6 +84,7 @@ def build_spec(
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else _positive(dt)
     spec.option.timestep = period / robot.steps_per(period)
+    spec.option.tolerance = TOLERANCE
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
