@@ -9,13 +9,13 @@ import numpy as np
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.files import write_text, writing
-from gaponet.robot import BUILTIN, IDENTIFIED, RobotSpec, available, load_robot
+from gaponet.robot import BUILTIN, IDENTIFIED, LAW, RobotSpec, available, load_robot
 
 KEPT = "robot"  # folder of a run or a dataset
 MOVE_KEPT = "move that folder away to keep the other robot from now on"
 BESIDE = ("collision.toml", "look.toml")
 IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
-IDENTIFIED_TABLES = re.compile(r"^\[identified\..*?(?=^\[(?!identified\.)|\Z)", re.MULTILINE | re.DOTALL)
+IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
 FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
@@ -73,5 +73,6 @@ def keeps_robot(holder: Path) -> bool:
 def _table(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in ("kp", *IDENTIFIED)}
-    lines = [f"{name} = {value!r}\n" for name, value in values.items() if np.isfinite(value)]
+    told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in LAW)}
+    lines = [f"{name} = {value!r}\n" for name, value in told.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)

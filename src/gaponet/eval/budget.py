@@ -13,6 +13,7 @@ import numpy as np
 
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import Sequence
+from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
 from gaponet.metrics import metrics, runs
@@ -107,18 +108,6 @@ def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, 
         again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
         found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
     return found
-
-
-def encoder_step(recordings: ListOf[Array]) -> float:
-    """The smallest step between distinct readings of one joint, rad; 0 where readings are continuous."""
-    values = np.unique(np.concatenate(recordings).astype(np.float64))
-    steps = np.diff(values)
-    steps = steps[steps > 2e-6]  # below: rounding of the stored float32
-    if steps.size < 10:
-        return 0.0
-    step = float(np.percentile(steps, 5))
-    off = np.abs(steps / step - np.round(steps / step))
-    return step if np.median(off) < 0.1 else 0.0
 
 
 def _mean(values: ListOf[float | None]) -> float | None:

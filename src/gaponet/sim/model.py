@@ -11,7 +11,8 @@ import numpy as np
 from gaponet.errors import RobotError, UsageError
 from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
-from gaponet.robot import IDENTIFIED, RobotSpec
+from gaponet.robot import IDENTIFIED, LAW, RobotSpec
+from gaponet.sim.table import add_table, soften_table
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
@@ -63,6 +64,7 @@ def build_model(
     if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
         raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
     stiffen_friction(model)
+    soften_table(model, robot)
     return model
 
 
@@ -89,6 +91,7 @@ def build_spec(
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
     _set_joints(spec, robot)
+    add_table(spec, robot)
     _lock(spec, robot, locked)
     _add_actuators(spec, robot, locked)
     if bare:
@@ -148,7 +151,10 @@ def text_hash(robot: RobotSpec) -> str:
     servos = [np.ascontiguousarray(getattr(robot, field), np.float64) for field in IDENTIFIED]
     if any(np.nan_to_num(s).any() for s in servos):
         digest.update(b"".join(s.tobytes() for s in servos))
-    digest.update(repr((robot.joint_names, robot.decimation, STIFF_SOLREF, STIFF_SOLIMP)).encode())
+    if robot.table is not None:
+        digest.update(repr((robot.tips, robot.table)).encode())
+    stiff = (STIFF_SOLREF, STIFF_SOLIMP, STIFF_MOBILITY, TOLERANCE)
+    digest.update(repr((robot.joint_names, robot.decimation, *stiff)).encode())
     return digest.hexdigest()[:12]
 
 
@@ -171,6 +177,11 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             value = getattr(robot, field)[i]
             if np.isfinite(value):
                 setattr(joint, field, value)
+        joint.ref -= robot.zero[i]
+        stops = robot.stop_low[i], robot.stop_high[i]
+        if np.isfinite(stops).any():
+            joint.range = [a if np.isnan(b) else b for a, b in zip(joint.range, stops, strict=True)]
+            joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
 
@@ -178,7 +189,7 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for name in locked:
         joint = spec.joint(name)
-        angle = robot.qpos_home[robot.joint_names.index(name)]
+        angle = robot.qpos_home[robot.joint_names.index(name)] - joint.ref
         turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
         mujoco.mju_axisAngle2Quat(turn, np.array(joint.axis), angle)
         mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
@@ -201,6 +212,7 @@ def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
+    spec.nuser_actuator = len(LAW) if robot.has_law else 0
     # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
     samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
@@ -213,6 +225,8 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...
         actuator.biasprm[0] = kp * robot.offset[i]
         actuator.forcelimited = True
         actuator.forcerange = (-limit, limit)
+        if robot.has_law:
+            actuator.userdata = [getattr(robot, term)[i] for term in LAW]
         if samples:
             actuator.nsample, actuator.interp, actuator.delay = samples, 1, robot.delay[i]
 
