@@ -23,7 +23,7 @@ FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "of
 def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
     robot = write_arm(tmp_path / "arm")
     servos = FIRST | changed
-    acting = robot.with_servos({j: servos for j in robot.joint_names})
+    acting = robot.with_servos(dict.fromkeys(robot.joint_names, servos))
     real = recordings(robot, 1, rows=200, kp=0.7)
     whole = [t.qpos for t in replay(real, acting)]
     runs = JointRuns(real, robot)

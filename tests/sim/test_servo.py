@@ -10,7 +10,7 @@ from gaponet.sim.model import build_model
 
 
 def law(robot, **values):
-    return robot.with_servos({j: values for j in robot.joint_names})
+    return robot.with_servos(dict.fromkeys(robot.joint_names, values))
 
 
 def pull(robot, torque, seconds=0.3):

@@ -105,8 +105,8 @@ class BatchSim:
 
         Args:
             joints: k names.
-            values: kp, damping, frictionloss, armature, offset, and any of zero, delay (up to the robot's) and LAW, each
-                (num_envs, k).
+            values: kp, damping, frictionloss, armature, offset, and any of zero, delay (up to the robot's) and LAW,
+                each (num_envs, k).
         """
         model, batch = next(iter(self.models.values())), self.batch
         dof = np.array([model.joint(j).dofadr[0] for j in joints])

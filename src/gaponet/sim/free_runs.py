@@ -181,7 +181,7 @@ class FreeRuns:
         return self.corrector.correct(t, *full)[:, self.free]
 
     def jacobian(self, x: Array, base: Array) -> Array:
-        """Forward differences towards the inside of the bounds, (m, P): of parameters (P,), the errors there being base.
+        """Forward differences towards the inside of the bounds, (m, P), from parameters (P,) whose errors are base.
 
         One simulation moves a field of all joints, and each joint answers for itself.
         """

@@ -1,13 +1,14 @@
 """System identification: the servo parameters with which the simulator, running free, follows the recordings best.
 
-Per operated joint: gain, damping, dry friction, armature, zero offset, command delay; then, each only where it lowers the
-error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). Fitted on windows of 8 s, every
-joint on its own beside the recording (sim/joint_runs.py), by separable CMA-ES; then what the robot touches, in the
-simulator of the whole robot (sim/touching.py).
+Per operated joint: gain, damping, dry friction, armature, zero offset, command delay; then, each only where it lowers
+the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). Fitted on windows of 8 s,
+every joint on its own beside the recording (sim/joint_runs.py), by separable CMA-ES; then what the robot touches, in
+the simulator of the whole robot (sim/touching.py).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
@@ -16,11 +17,13 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
+from gaponet.gap import standard_error
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.evolve import evolve
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.model import build_model
 from gaponet.sim.refit import cut
+from gaponet.sim.touching import GENERATIONS as TABLE_GENERATIONS
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 
 Array = np.ndarray
@@ -42,7 +45,7 @@ TERMS: dict[str, tuple[str, ...]] = {
 }
 DEFAULT_TERMS = ("stribeck", "load")
 
-Progress = Callable[[str, float], None]  # what is fitted, mean |error| there, rad
+Progress = Callable[[float, float, str], None]  # generations done, in all, what is fitted and its error
 
 
 @dataclass(frozen=True)
@@ -57,7 +60,7 @@ class Tried:
     def gain(self) -> tuple[float, float]:
         """By how much the mean fell, and its standard error over motions (paired), rad."""
         less = self.before - self.after
-        return float(less.mean()), float(less.std(ddof=1) / np.sqrt(len(less))) if len(less) > 1 else float("nan")
+        return float(less.mean()), standard_error(less)
 
     @property
     def kept(self) -> bool:
@@ -96,7 +99,7 @@ def identify(
     terms: tuple[str, ...] = DEFAULT_TERMS,
     table: bool = True,
     nthread: int = 0,
-    progress: Progress = lambda what, error: None,
+    progress: Progress = lambda done, total, note: None,
 ) -> Identified:
     """Fit the parameters of all operated joints.
 
@@ -108,8 +111,14 @@ def identify(
         terms: Of the servo's law, from TERMS, in the order in which they are tried.
         table: Look for a table under the robot's tips.
         nthread: Threads for the table, 0 for all cores.
-        progress: Called after each generation.
+        progress: Called in each generation.
     """
+    total = GENERATIONS + MORE * len(terms) + TABLE_GENERATIONS * bool(table and robot.tips)
+    done = itertools.count(1)
+
+    def tell(what: str) -> Callable[[float], None]:
+        return lambda error: progress(min(next(done), total), total, f"{what} {error * 1e3:.2f} mrad")
+
     robot = with_stops(robot, sequences)
     heights = tip_heights(sequences, robot)
     below = touching_below(robot, heights)
@@ -117,14 +126,12 @@ def identify(
     fit = Fit(JointRuns(parts, robot, below), robot, sequences)
     start = fit.start()
     before = fit.mean_error(start)
-    values = fit.descend(CLASSIC, start, GENERATIONS, lambda error: progress("servos", error))
+    values = fit.descend(CLASSIC, start, GENERATIONS, tell("servos"))
     judge = JointRuns(list(validation), robot, below) if validation else None
     tried = []
     for term in terms:
-        richer = fit.descend(
-            tuple(fit.fields_of(values)) + TERMS[term], fit.with_term(values, term), MORE,
-            lambda error, term=term: progress(term, error),
-        )  # fmt: skip
+        fields = tuple(fit.fields_of(values)) + TERMS[term]
+        richer = fit.descend(fields, fit.with_term(values, term), MORE, tell(term))
         if judge is None:
             values = richer
             continue
@@ -135,7 +142,7 @@ def identify(
     touch = None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
-        touch = fit_table(low, found, lowest, nthread, lambda error: progress("table", error))
+        touch = fit_table(low, found, lowest, nthread, tell("table"))
         found = touch.robot
     std = fit.uncertainty(values)
     return Identified(found, before, fit.mean_error(values), fit.doubts(values, std), std, tuple(tried), touch)
@@ -188,7 +195,9 @@ class Fit:
         """Values with a first guess at a term's fields."""
         return values | {f: self.guess[f] for f in TERMS[term]}
 
-    def descend(self, fields: tuple[str, ...], start: Values, generations: int, tell: Callable[[float], None]) -> Values:
+    def descend(
+        self, fields: tuple[str, ...], start: Values, generations: int, tell: Callable[[float], None]
+    ) -> Values:
         """Fit these fields from a start; those of `start` that are not among them stay."""
         names = list(dict.fromkeys(fields))
         low, high, unit = (np.stack([self.limits[f][i] for f in names], axis=1) for i in range(3))

@@ -1,4 +1,4 @@
-"""Free runs of every joint on its own beside recordings, the others moving as recorded: many candidates at once, quickly.
+"""Free runs of every joint on its own beside recordings, the others moving as recorded: many candidates at once.
 
 A servo's parameters act on its own joint first; what they do to the others is a few milliradians of their path. So
 inertia, gravity and the pull of the others are taken from the recording once, and a joint is one equation, stepped as

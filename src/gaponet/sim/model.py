@@ -136,7 +136,10 @@ def model_hash(robot: RobotSpec) -> str:
     of 50 in gain.
     """
     if "_model_hash" not in vars(robot):
-        text = [f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g}", *lines(build_model(robot))]
+        text = [
+            f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
+            *lines(build_model(robot)),
+        ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
         object.__setattr__(robot, "_model_hash", digest)
     return str(vars(robot)["_model_hash"])
@@ -151,8 +154,6 @@ def text_hash(robot: RobotSpec) -> str:
     servos = [np.ascontiguousarray(getattr(robot, field), np.float64) for field in IDENTIFIED]
     if any(np.nan_to_num(s).any() for s in servos):
         digest.update(b"".join(s.tobytes() for s in servos))
-    if robot.table is not None:
-        digest.update(repr((robot.tips, robot.table)).encode())
     stiff = (STIFF_SOLREF, STIFF_SOLIMP, STIFF_MOBILITY, TOLERANCE)
     digest.update(repr((robot.joint_names, robot.decimation, *stiff)).encode())
     return digest.hexdigest()[:12]

@@ -1,7 +1,7 @@
 """Where a robot's tips touch a table: heights by forward kinematics, and the table that explains the recordings best.
 
-A zero of every joint's encoder is fitted with it, near none: zeros, the tip's place and the table's height trade against
-each other, so give a measured height ([table] in robot.toml) where there is one.
+A zero of every joint's encoder is fitted with it, near none: zeros, the tip's place and the table's height trade
+against each other, so give a measured height ([table] in robot.toml) where there is one.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from gaponet.data.sequence import Sequence
+from gaponet.gap import standard_error
 from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.evolve import evolve
@@ -80,16 +81,23 @@ def touching_below(robot: RobotSpec, heights: ListOf[Array]) -> float:
 
 
 def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
-    """The windows with most rows below a height, at most PER_MOTION of a motion and WINDOWS in all, longest first."""
-    found: dict[str, list[tuple[int, Sequence]]] = {}
+    """The windows in which a tip comes below a height, longest first."""
+    found = []
     for s, height in zip(sequences, heights, strict=True):
         rows = min(round(WINDOW / s.dt), len(s))
-        for a in range(0, len(s) - rows + 1, rows):
-            count = int((height[a : a + rows] < below).sum())
-            found.setdefault(s.meta.motion, []).append((count, s.rows(slice(a, a + rows))))
-    best = [sorted(windows, key=lambda w: -w[0])[:PER_MOTION] for windows in found.values()]
-    most = sorted((w for windows in best for w in windows if w[0]), key=lambda w: -w[0])[:WINDOWS]
-    return sorted((s for _, s in most), key=lambda s: -len(s))
+        starts = range(0, len(s) - rows + 1, rows)
+        found += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
+    return sorted(found, key=lambda s: -len(s))
+
+
+def most_wrong(scene: Scene, away: Array) -> list[Sequence]:
+    """At most WINDOWS, PER_MOTION of a motion, whose free runs without a table (1, 3 + n) are worst."""
+    order = np.argsort(-scene.mean(scene.errors(away))[0])
+    taken: dict[str, list[int]] = {}
+    for i in order.tolist():
+        taken.setdefault(scene.parts[i].meta.motion, []).append(i)
+    best = {i for mine in taken.values() for i in mine[:PER_MOTION]}
+    return [scene.parts[i] for i in sorted([i for i in order.tolist() if i in best][:WINDOWS])]
 
 
 def fit_table(
@@ -98,18 +106,20 @@ def fit_table(
     """Fit height, friction and stiffness of the table, and the zeros.
 
     Args:
-        parts: Windows in which a tip is low.
+        parts: Windows in which a tip is low; those that fit worst without a table are fitted.
         robot: Servos and all; with a table its height is taken as measured.
         lowest: Tip height in them, m.
         nthread: Threads, 0 for all cores.
         progress: Called with the least error of each generation, rad.
     """
-    motions = tuple(dict.fromkeys(s.meta.motion for s in parts))
     if not parts:
-        return Touch(robot, False, np.zeros(0), np.zeros(0), motions)
+        return Touch(robot, False, np.zeros(0), np.zeros(0), ())
     n, measured = len(robot.operated), robot.table
-    scene = Scene(parts, replace(robot, table=measured or Table(lowest, FRICTION[3], np.exp(STIFFNESS[3]))), nthread)
-    away = np.zeros((1, 3 + n)) + [lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]
+    with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
+    away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
+    scene = Scene(parts, with_table, nthread)
+    scene = Scene(most_wrong(scene, away), with_table, nthread)
+    motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
     before = scene.errors(away)
     guesses = np.repeat(away, HEIGHTS, axis=0)
     guesses[:, 0] = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else measured.height
@@ -126,16 +136,15 @@ def fit_table(
         return (scene.cost(errors) + PRICE * np.square(x[:, 3:] / ZERO).sum(axis=1))[:, None]
 
     best = evolve((start / unit)[None], low / unit, high / unit, cost, GENERATIONS)[0] * unit
-    errors = [scene.mean(e)[0] for e in (before, scene.errors(best[None]))]
-    less = errors[0] - errors[1]
-    kept = bool(less.mean() > less.std(ddof=1) / np.sqrt(len(less))) if len(less) > 1 else less.mean() > 0
-    if not kept:
-        return Touch(robot, False, errors[0], errors[1], motions)
-    zeros = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, best[3:], strict=True)}
-    height, friction, stiffness = (float(f"{x:.4g}") for x in (best[0], best[1], np.exp(best[2])))
-    return Touch(
-        replace(robot.with_servos(zeros), table=Table(height, friction, stiffness)), True, *errors, motions
-    )  # fmt: skip
+    without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
+    kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
+    found = robot
+    if kept:
+        zeros = robot.zero[robot.operated_index] + best[3:]
+        servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
+        height, friction, stiffness = (float(f"{x:.4g}") for x in (best[0], best[1], np.exp(best[2])))
+        found = replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
+    return Touch(found, kept, without, within, motions)
 
 
 class Scene:
@@ -165,7 +174,9 @@ class Scene:
         dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
         sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
         ctrl = np.tile(self.ctrl, (1, k, 1))
-        q0, v0 = (np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel"))
+        q0, v0 = (
+            np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel")
+        )
         sim.reset(slice(None), q0, v0, past=ctrl[0][:, None])
         out = np.empty((len(ctrl) - 1, k, m, len(self.op)), np.float32)
         for t in range(len(out)):
