@@ -106,10 +106,12 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import diagnose
+    from gaponet.sim.touching import tip_heights
 
     data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
-        return diagnose(data, spec, update, _gravity(spec))
+        heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
+        return diagnose(data, spec, update, _gravity(spec), heights)
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:

@@ -11,7 +11,7 @@ import tyro
 from gaponet import api
 from gaponet.cli.gap import mrad
 from gaponet.cli.out import Out, writes
-from gaponet.gap import standard_error
+from gaponet.metrics import standard_error
 
 if TYPE_CHECKING:
     from gaponet.sim.identify import Identified

@@ -17,7 +17,7 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
-from gaponet.gap import standard_error
+from gaponet.metrics import standard_error
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.evolve import evolve
 from gaponet.sim.joint_runs import JointRuns

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from gaponet.data.sequence import Sequence
-from gaponet.gap import standard_error
+from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.evolve import evolve
