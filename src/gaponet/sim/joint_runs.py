@@ -14,7 +14,6 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import LAW, RobotSpec
-from gaponet.sim.dynamics import CUTOFF
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, servo_torque
 
@@ -22,6 +21,7 @@ Array = np.ndarray
 
 SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
 SETTLE = 0.1  # s: velocities at a window's start are measured ones
+CUTOFF = 10.0  # Hz, of the other joints' accelerations: above the arms' bandwidth
 TURN = 0.02  # rad: for the derivative of gravity's torque
 
 
@@ -50,8 +50,11 @@ class JointRuns:
         self.ctrl = stack([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
         self.qpos = stack([p.qpos[:, self.op].astype(float) for p in parts])
         self.qvel = stack([p.qvel[:, self.op].astype(float) for p in parts])
-        self.inertia, self.load, self.slope = (stack([a[i] for a in along]) for i in range(3))
-        self.touch = stack([a[3] for a in along]) < below  # (rows, windows)
+        # In the middle of each period.
+        middle = lambda x: 0.5 * (x + np.concatenate([x[1:], x[-1:]]))  # noqa: E731
+        self.inertia, self.weight, self.pull, self.slope = (middle(stack([a[i] for a in along])) for i in range(4))
+        self.at = middle(self.qpos)
+        self.touch = stack([a[4] for a in along]) < below  # (rows, windows)
         lengths = np.array([len(p) for p in parts])
         after = round(SETTLE / self.dt)
         near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
@@ -78,9 +81,9 @@ class JointRuns:
             for part in range(self.count):
                 aim = self._target(t, part, values["delay"]) + v["offset"]
                 torque = np.clip(servo_torque(law, kp, aim, q), -limit, limit)
-                load = self.load[t] + self.slope[t] * (q - self.qpos[t])
+                load = self.weight[t] + self.slope[t] * (q - self.at[t])
                 most = friction_limit(law, v["frictionloss"], w, torque, load)
-                net = torque - load - v["damping"] * w
+                net = torque - load - self.pull[t] - v["damping"] * w
                 w = w + turn * (net + np.clip(-stop * w - net, -most, most))
                 q = q + h * w
             touch = self.touch[t + 1]
@@ -118,21 +121,22 @@ class Along:
         # Forces at a posture, without what a servo does and what a table does.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
-    def follow(self, part: Sequence) -> tuple[Array, Array, Array, Array]:
-        """Inertia of each operated joint without armature, kg·m², the torque that gravity and the other joints'
-        motion ask of it, N·m, and its slope over the joint's angle, N·m/rad, (rows, n) each; lowest tip, (rows,) m."""
+    def follow(self, part: Sequence) -> tuple[Array, ...]:
+        """Inertia of each operated joint without armature, kg·m², the torques that gravity and Coriolis forces and that
+        the other joints' accelerations ask of it, N·m, the slope of the former over the joint's angle, N·m/rad, (rows,
+        n) each; lowest tip, (rows,) m."""
         model, data, op = self.model, self.data, self.op
         smooth = lowpass(part.qpos.astype(float), part.dt, CUTOFF)
         qvel = differentiate(smooth, part.dt)
         qacc = differentiate(qvel, part.dt)
-        inertia, load, slope = (np.empty((len(part), len(op))) for _ in range(3))
+        inertia, weight, pull, slope = (np.empty((len(part), len(op))) for _ in range(4))
         tip, full = np.full(len(part), np.inf), np.empty((model.nv, model.nv))
         for t in range(len(part)):
             here = self._bias(part.qpos[t], qvel[t])
             mujoco.mj_fullM(model, data, full)
             own = full.diagonal().copy()
             inertia[t] = (own - model.dof_armature)[op]
-            load[t] = (here + full @ qacc[t] - own * qacc[t])[op]
+            weight[t], pull[t] = here[op], (full @ qacc[t] - own * qacc[t])[op]
             for body, place, radius in self.tips:
                 z = data.xpos[body, 2] + data.xmat[body].reshape(3, 3)[2] @ place - radius
                 tip[t] = min(tip[t], z)
@@ -141,7 +145,7 @@ class Along:
                     turned = part.qpos[t].astype(float)
                     turned[j] += TURN
                     slope[t : t + SPARSE, k] = (self._bias(turned, qvel[t])[j] - here[j]) / TURN
-        return inertia, load, slope, tip
+        return inertia, weight, pull, slope, tip
 
     def _bias(self, qpos: Array, qvel: Array) -> Array:
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
