@@ -91,7 +91,7 @@ def rows(simulators: dict[str, RobotSpec], sequences: list[Sequence]) -> list[di
 def recover(train: list[Sequence], held: list[Sequence]) -> None:
     """Play the recorded commands on a simulated arm of known servos on a known table; identify it from that."""
     nominal = load_robot("so101")
-    arm = replace(nominal.with_servos({j: KNOWN for j in nominal.operated}), table=Table(-0.0405, 0.2, 2000.0))
+    arm = replace(nominal.with_servos(dict.fromkeys(nominal.operated, KNOWN)), table=Table(-0.0405, 0.2, 2000.0))
     played = []
     for part in (train, held):
         twins = replay(part, arm)

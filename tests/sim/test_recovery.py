@@ -33,7 +33,7 @@ def played(robot, acting, count, rows):
 )
 def test_a_term_of_the_law_comes_back(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
-    parts = played(robot, robot.with_servos({j: SERVO | law for j in robot.joint_names}), 3, 120)
+    parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
     fit = Fit(JointRuns(parts, robot), robot, parts)
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.guess[f] for f in LAW if f in law}
     found = fit.descend(tuple(law), start, 35, lambda error: None)
