@@ -20,7 +20,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.gap import horizon, runs, standard_error
+from gaponet.metrics import horizon, runs, standard_error
 from gaponet.robot import IDENTIFIED, RobotSpec, Table, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import Identified, identify

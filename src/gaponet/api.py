@@ -6,6 +6,7 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
