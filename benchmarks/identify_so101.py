@@ -2,6 +2,7 @@
 
     python benchmarks/identify_so101.py DATASET WORK            # fits (minutes), then validation motions
     python benchmarks/identify_so101.py DATASET WORK --test     # the test motions, looked at once
+    python benchmarks/identify_so101.py DATASET WORK --page     # tables of both
     python benchmarks/identify_so101.py DATASET WORK --recover  # a simulated arm with known servos: what comes back
 
 DATASET: gaponet import of the public logs. Whole motions in free run, 5 arm joints, ± standard error over motions.
@@ -74,10 +75,10 @@ def rows(simulators: dict[str, RobotSpec], sequences: list[Sequence]) -> list[di
     out = []
     for name, simulator in simulators.items():
         done = runs(sequences, [t.qpos for t in replay(sequences, simulator, lock_idle=True)], robot)
-        size = [1e3 * np.abs(r.error) for r in done]
-        motions = np.array([x.mean() for x in size])
+        size = [1e3 * np.abs(r.error.astype(float)) for r in done]
+        motions = np.array([x.mean(dtype=float) for x in size])
         out.append({
-            "simulator": name, "mrad": motions.mean(), "standard_error": standard_error(motions),
+            "simulator": name, "mrad": float(motions.mean()), "standard_error": standard_error(motions),
             "low": float(np.concatenate([x[m] for x, m in zip(size, low, strict=True)]).mean()),
             "free": float(np.concatenate([x[~m] for x, m in zip(size, low, strict=True)]).mean()),
             "joints": dict(zip(robot.operated, np.mean([x.mean(axis=0) for x in size], axis=0).tolist(), strict=True)),
@@ -86,6 +87,28 @@ def rows(simulators: dict[str, RobotSpec], sequences: list[Sequence]) -> list[di
         })  # fmt: skip
         print(json.dumps(out[-1]), flush=True)
     return out
+
+
+def page(work: Path) -> None:
+    """The tables of docs/results/identify_so101.md, from what was measured."""
+    found = {part: json.loads((work / f"{part}.json").read_text()) for part in ("val", "test")}
+    lines = [
+        "| simulator | validation, mrad | tip low | free | test, mrad | of nominal | tip low | free |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    nominal = found["test"][0]["mrad"]
+    for val, test in zip(found["val"], found["test"], strict=True):
+        cells = [f"{x['mrad']:.2f} ± {x['standard_error']:.2f}" for x in (val, test)]
+        low = [[f"{x['low']:.2f}", f"{x['free']:.2f}"] for x in (val, test)]
+        row = [test["simulator"], cells[0], *low[0], cells[1], f"{test['mrad'] / nominal:.2f}", *low[1]]
+        lines.append(f"| {' | '.join(row)} |")
+    for title, key in (("joint", "joints"), ("after, s", "horizon"), ("motion", "motions")):
+        names = list(found["test"][0][key])
+        lines += ["", f"Test, mrad, by {title.split(',')[0]}:", ""]
+        lines += [f"| {title} | {' | '.join(x['simulator'] for x in found['test'])} |"]
+        lines += ["| --- |" + " ---: |" * len(found["test"])]
+        lines += [f"| {n} | {' | '.join(f'{x[key][n]:.2f}' for x in found['test'])} |" for n in names]
+    print("\n".join(lines))
 
 
 def recover(train: list[Sequence], held: list[Sequence]) -> None:
@@ -111,7 +134,11 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--test", action="store_true")
     parser.add_argument("--recover", action="store_true")
+    parser.add_argument("--page", action="store_true", help="print the tables of what was measured")
     args = parser.parse_args()
+    if args.page:
+        page(args.work)
+        return
     args.work.mkdir(parents=True, exist_ok=True)
     data = Dataset(args.dataset)
     parts = {name: data.sequences(entries) for name, entries in split_entries(data).items()}
