@@ -51,7 +51,8 @@ def gap_budget(
 
     Returns:
         {"left": {step: rad}, "removed": {step: [rad, standard error]}, "by_joint": {joint: the same and "floor"},
-        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; a floor that is unknown is None.
+        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …};
+        a floor that is unknown is None.
     """
     dataset.require_robot(robot)
     simulator = corrected_robot(run, robot)
