@@ -34,7 +34,7 @@ COLUMNS = {  # field → heading, factor from SI
     "stop_high": ("high stop, rad", 1.0),
 }
 
-WIDE = 6  # columns of a table
+WIDE = 4  # columns of a table
 
 
 @writes("robot")
@@ -96,10 +96,11 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
     """The servos as a table, what was tried and what it gave."""
     values = _values(found)
     shown = [f for f in COLUMNS if any(v.get(f) for v in values.values())]
-    for title, part in (("Identified servos", shown[:WIDE]), ("Their law and place", shown[WIDE:])):
+    for start in range(0, len(shown), WIDE):
+        part = shown[start : start + WIDE]
         rows = [[j, *(_cell(v.get(f), found.std[j].get(f), COLUMNS[f][1]) for f in part)] for j, v in values.items()]
-        if part:
-            screen.table(f"{title}, ± standard error", ["joint", *(COLUMNS[f][0] for f in part)], rows)
+        title = "Identified servos" if start == 0 else "The same"
+        screen.table(f"{title}, ± standard error", ["joint", *(COLUMNS[f][0] for f in part)], rows)
     for term in found.tried:
         fell, error = (mrad(x) for x in term.gain)
         kept = "kept" if term.kept else "not kept"
