@@ -213,7 +213,8 @@ def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    spec.nuser_actuator = len(LAW) if robot.has_law else 0
+    if robot.has_law:
+        spec.nuser_actuator = len(LAW)
     # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
     samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
