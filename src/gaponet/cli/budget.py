@@ -75,4 +75,4 @@ def _left(panel: dict[str, Any], step: str) -> str:
     if step not in panel["removed"]:
         return mrad(panel["left"][step])
     less, error = panel["removed"][step]
-    return f"{mrad(panel['left'][step])}\n({mrad(less)} ± {mrad(error)})"
+    return f"{mrad(panel['left'][step])} ({mrad(less)} ± {mrad(error)})"

@@ -129,4 +129,4 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
 def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
-    return f"{value * factor:.3g}" + ("" if std is None else f"\n± {std * factor:.2g}")
+    return f"{value * factor:.3g}" + ("" if std is None else f" ± {std * factor:.2g}")
