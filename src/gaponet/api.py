@@ -5,6 +5,7 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,10 +84,12 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
     """
     from gaponet.data.doctor import diagnose
     from gaponet.sim.dynamics import gravity_of
+    from gaponet.sim.touching import tip_heights
 
     data, spec = open_dataset(dataset, robot)
     with bar("examining") as update:
-        return diagnose(data, spec, update, gravity_of(spec))
+        heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
+        return diagnose(data, spec, update, gravity_of(spec), heights)
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:
@@ -148,11 +151,18 @@ class Identification:
 
     Attributes:
         found: Robot with identified servos, window RMS before and after [rad], warnings.
-        val_mpjae: Whole validation motions, rad: nominal, identified.
+        val: Mean |error| of each whole validation motion, (motions,) rad: nominal, identified.
+        seconds: What the fit took.
     """
 
     found: Identified
-    val_mpjae: dict[str, float]
+    val: dict[str, np.ndarray]
+    seconds: float
+
+    @property
+    def val_mpjae(self) -> dict[str, float]:
+        """Means over the validation motions, rad."""
+        return {name: float(errors.mean()) for name, errors in self.val.items()}
 
 
 def identify(
@@ -163,8 +173,11 @@ def identify(
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
     mixed_gains: bool = False,
+    terms: tuple[str, ...] = ("stribeck", "load"),
+    table: bool = True,
+    threads: int = 0,
 ) -> Identification:
-    """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
+    """Fit the servos of the simulator, and what the robot touches, to the training motions.
 
     Args:
         dataset: Recordings.
@@ -174,6 +187,9 @@ def identify(
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
         mixed_gains: Take recordings made with different kp or kd together.
+        terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
+        table: Look for a table under the robot's tips; kept in the same way.
+        threads: For the table, 0 for all cores.
 
     Raises:
         DatasetError, UsageError: A unit is not there, or gains differ.
@@ -193,19 +209,18 @@ def identify(
     parts = split_entries(data, tuple(sorted((held - set(units) if units else set()) | set(holdout_units))))
     if not mixed_gains:
         require_same_gains((e.meta for e in parts["train"]), data.joint_names, spec.operated)
+    began, val = time.monotonic(), data.sequences(parts["val"])
     with writing(Path(out), "robot"), bar("identifying") as update:
-        found = fit(
-            data.sequences(parts["train"]), spec, windows,
-            progress=lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
-        )  # fmt: skip
+        found = fit(data.sequences(parts["train"]), spec, val, windows, terms, table, threads, update)
         save_robot(found.robot, Path(out))
-    val, op = data.sequences(parts["val"]), spec.operated_index
+    seconds, op = time.monotonic() - began, spec.operated_index
 
-    def error(simulator: RobotSpec) -> float:
-        twins = replay(val, simulator, lock_idle=True)
-        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)]))
+    def errors(simulator: RobotSpec) -> np.ndarray:
+        twins = replay(val, simulator, nthread=threads, lock_idle=True)
+        return np.array([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)])
 
-    return Identification(found, {"nominal": error(spec.nominal or spec), "identified": error(found.robot)})
+    both = {"nominal": errors(spec.nominal or spec), "identified": errors(found.robot)}
+    return Identification(found, both, seconds)
 
 
 def train(

@@ -21,7 +21,7 @@ JOINT = ("solref", "solimp", "margin", "actgravcomp")
 DOF = ("armature", "frictionloss", "solref", "solimp")
 ACTUATOR = (
     "trntype", "gear", "gaintype", "gainprm", "biastype", "biasprm", "dyntype", "dynprm", "armature", "damping",
-    "dampingpoly", "delay", "history",
+    "dampingpoly", "delay", "history", "user",
 )  # fmt: skip
 OPTION = (
     "integrator", "cone", "solver", "gravity", "wind", "density", "viscosity", "impratio", "iterations", "tolerance",

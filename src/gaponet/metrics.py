@@ -22,6 +22,13 @@ THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
 
 
+def standard_error(values: Array) -> float:
+    """Of the mean of values that belong to motions; nan for a single one. For a difference of methods give their
+    differences motion by motion (paired)."""
+    values = np.asarray(values)
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+
+
 @dataclass(frozen=True)
 class Run:
     """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""

@@ -25,8 +25,11 @@ Array = np.ndarray
 
 BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
-MJCF_FIELDS = ("damping", "armature", "frictionloss")  # NaN where the MJCF's value stands
-IDENTIFIED = (*MJCF_FIELDS, "delay", "offset")
+STOPS = ("stop_low", "stop_high")
+MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
+LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
+IDENTIFIED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
+SIGNED = ("qpos_home", "offset", "zero", *STOPS)
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,24 @@ class PayloadMount:
     side: str
     body: str
     pos: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Tip:
+    """Part of a robot that may touch the table: a sphere of `radius` (m) at `pos` (m) in the frame of MJCF `body`."""
+
+    body: str
+    pos: tuple[float, float, float]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Table:
+    """A level surface at `height` (m, MJCF world): its friction coefficient, and its stiffness under a tip, N/m."""
+
+    height: float
+    friction: float
+    stiffness: float
 
 
 @dataclass(frozen=True)
@@ -60,6 +81,14 @@ class RobotSpec:
             where the MJCF's stands.
         delay: From command to servo, (n), s.
         offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
+        zero: Of the encoder: the MJCF's angle is reading + zero, (n), rad.
+        stop_low, stop_high: Joint stops that replace the MJCF's range, (n), rad; NaN where the MJCF's stands.
+        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
+            is left, rad/s.
+        friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
+        min_torque: Least torque of a motor that turns at all, (n), N·m.
+        encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
+        tips, table: What may touch, and the table, without which nothing does.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
     """
 
@@ -81,8 +110,19 @@ class RobotSpec:
     damping: Array = field(default_factory=lambda: np.array(np.nan))
     armature: Array = field(default_factory=lambda: np.array(np.nan))
     frictionloss: Array = field(default_factory=lambda: np.array(np.nan))
+    stop_low: Array = field(default_factory=lambda: np.array(np.nan))
+    stop_high: Array = field(default_factory=lambda: np.array(np.nan))
     delay: Array = field(default_factory=lambda: np.array(0.0))
     offset: Array = field(default_factory=lambda: np.array(0.0))
+    zero: Array = field(default_factory=lambda: np.array(0.0))
+    stribeck: Array = field(default_factory=lambda: np.array(0.0))
+    stribeck_speed: Array = field(default_factory=lambda: np.array(0.0))
+    friction_motor: Array = field(default_factory=lambda: np.array(0.0))
+    friction_external: Array = field(default_factory=lambda: np.array(0.0))
+    min_torque: Array = field(default_factory=lambda: np.array(0.0))
+    encoder_step: Array = field(default_factory=lambda: np.array(0.0))
+    tips: tuple[Tip, ...] = ()
+    table: Table | None = None
     nominal: RobotSpec | None = None
 
     def __post_init__(self) -> None:
@@ -95,7 +135,7 @@ class RobotSpec:
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
             if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
-            if name not in ("qpos_home", "offset") and (value < 0).any():
+            if name not in SIGNED and (value < 0).any():
                 raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
@@ -119,8 +159,13 @@ class RobotSpec:
         """Physics steps per control period of another length, s: as many as keep a step close to `timestep`."""
         return max(1, round(dt / self.timestep))
 
+    @property
+    def has_law(self) -> bool:
+        """Whether a servo does more than MuJoCo's position actuator (sim/servo.py)."""
+        return any(getattr(self, name).any() for name in LAW)
+
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
-        """The same robot with identified values: joint → any of kp, damping, armature, frictionloss, delay, offset."""
+        """The same robot with identified values: joint → kp or any of IDENTIFIED."""
         changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in ("kp", *IDENTIFIED)}
         for joint, values in servos.items():
             for name, value in values.items():
@@ -138,7 +183,12 @@ class RobotSpec:
         except KeyError as error:
             raise RobotError(f"{self.mjcf}: lacks a joint of robot.toml: {error.args[0]}") from None
         limited = np.array([model.jnt_limited[j.id] for j in joints], bool)[:, None]
-        return np.where(limited, [j.range for j in joints], [-np.inf, np.inf])
+        return self.stopped(np.where(limited, [j.range for j in joints], [-np.inf, np.inf]))
+
+    def stopped(self, ranges: Array) -> Array:
+        """Joint ranges (n, 2) of the MJCF, rad, with the identified stops instead where there are such."""
+        stops = np.stack([self.stop_low, self.stop_high], axis=1)
+        return np.where(np.isnan(stops), ranges, stops)
 
     @property
     def operated_index(self) -> Array:
@@ -241,7 +291,12 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         payload_mounts=tuple(PayloadMount(m.side, m.body, m.pos) for m in table.payload_mount),
         dt=table.dt,
         timestep=table.timestep,
+        tips=tuple(Tip(t.body, t.pos, t.radius) for t in table.tip),
+        table=None if table.table is None else Table(**vars(table.table)),
     )
+    found = table.identified_table
+    if (robot.table or found) and not robot.tips:
+        raise RobotError("[table] is touched by nothing; name what may touch it in a [[tip]] with body, pos and radius")
     for joint in table.identified:
         if joint not in robot.joint_names:
             raise RobotError(f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
@@ -249,4 +304,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         joint: {name: value for name, value in vars(servo).items() if value is not None}
         for joint, servo in table.identified.items()
     }
-    return robot.with_servos(servos) if servos else robot
+    identified = robot.with_servos(servos) if servos else robot
+    if found is not None:
+        identified = dataclasses.replace(identified, table=Table(**vars(found)), nominal=robot)
+    return identified

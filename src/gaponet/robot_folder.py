@@ -9,13 +9,13 @@ import numpy as np
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.files import write_text, writing
-from gaponet.robot import BUILTIN, IDENTIFIED, RobotSpec, available, load_robot
+from gaponet.robot import BUILTIN, IDENTIFIED, LAW, RobotSpec, available, load_robot
 
 KEPT = "robot"  # folder of a run or a dataset
 MOVE_KEPT = "move that folder away to keep the other robot from now on"
 BESIDE = ("collision.toml", "look.toml")
 IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
-IDENTIFIED_TABLES = re.compile(r"^\[identified\..*?(?=^\[(?!identified\.)|\Z)", re.MULTILINE | re.DOTALL)
+IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
 FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
 
 
@@ -38,7 +38,10 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_MARK)[0]
     text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
     if robot.nominal is not None:
-        text += f"\n{IDENTIFIED_MARK}\n" + "".join(_table(robot, joint) for joint in robot.operated)
+        text += f"\n{IDENTIFIED_MARK}\n" + "".join(_servo(robot, joint) for joint in robot.operated)
+        if robot.table is not None and robot.table != robot.nominal.table:
+            lines = [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
+            text += "[identified_table]\n" + "".join(lines)
     xml = robot.mjcf.read_text(encoding="utf-8")
     xml = bare_mjcf(robot.mjcf) if FILES.search(xml) else xml
     beside = {name: robot.folder / name for name in BESIDE if (robot.folder / name).is_file()}
@@ -70,8 +73,9 @@ def keeps_robot(holder: Path) -> bool:
     return (holder / KEPT / "robot.toml").is_file()
 
 
-def _table(robot: RobotSpec, joint: str) -> str:
+def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in ("kp", *IDENTIFIED)}
-    lines = [f"{name} = {value!r}\n" for name, value in values.items() if np.isfinite(value)]
+    told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in LAW)}
+    lines = [f"{name} = {value!r}\n" for name, value in told.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)

@@ -10,6 +10,7 @@ from annotated_types import Interval, Len
 from gaponet.structure import Angle, Name
 
 Gain = Annotated[float, Interval(ge=0, le=1e6)]
+Share = Annotated[float, Interval(ge=0, le=1)]
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 
 
@@ -46,6 +47,33 @@ class Servo:
     frictionloss: Gain | None = None
     delay: Annotated[float, Interval(ge=0, le=1)] | None = None  # s
     offset: Angle | None = None  # rad
+    zero: Angle | None = None
+    stop_low: Angle | None = None
+    stop_high: Angle | None = None
+    stribeck: Gain | None = None  # N·m
+    stribeck_speed: Gain | None = None  # rad/s
+    friction_motor: Share | None = None
+    friction_external: Share | None = None
+    min_torque: Gain | None = None  # N·m
+    encoder_step: Share | None = None  # rad
+
+
+@dataclass(frozen=True)
+class Tip:
+    """One [[tip]]: a sphere that may touch the table; pos in the frame of the body."""
+
+    body: str
+    pos: tuple[Metres, Metres, Metres]
+    radius: Annotated[float, Interval(ge=1e-4, le=1)] = 1e-3  # m
+
+
+@dataclass(frozen=True)
+class Table:
+    """[table]: a level surface that the tips may touch."""
+
+    height: Metres
+    friction: Annotated[float, Interval(ge=0, le=10)] = 0.3
+    stiffness: Annotated[float, Interval(ge=1, le=1e7)] = 2000.0  # N/m
 
 
 @dataclass(frozen=True)
@@ -57,7 +85,10 @@ class RobotTable:
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
     joint: Annotated[tuple[Joint, ...], Len(1, 500)]
     payload_mount: Annotated[tuple[Mount, ...], Len(0, 20)] = ()
+    tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
+    table: Table | None = None
     identified: dict[str, Servo] = field(default_factory=dict)
+    identified_table: Table | None = None
     description: str = ""
     license: str = ""
     mjcf: str = "robot.xml"

@@ -7,11 +7,14 @@ import pytest
 from arm import recordings, write_arm
 from runs import untrained
 
+from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.eval.budget import encoder_step, floor, gap_budget
+from gaponet.eval.budget import causes, floor, gap_budget, removed
 from gaponet.eval.budget_figure import waterfall
 from gaponet.eval.evaluate import LEARNED
 from gaponet.eval.run_files import read_budget
+from gaponet.metrics import Run
+from gaponet.sim.model import model_hash
 
 
 def test_the_encoder_step_is_read_off_the_recordings():
@@ -70,3 +73,22 @@ def test_each_bar_says_what_it_removes_and_the_floor_what_it_is():
     ax = waterfall(found).axes[1]
     assert [t.get_text() for t in ax.texts] == ["+2.0", "−10.0", "2.0", "10.0"]
     assert ax.get_title("right") == "floor 0.5"
+
+
+def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    found = robot.with_servos({"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}})
+    steps = causes(found)
+    assert [name for name, _ in steps] == ["gain", "friction", "stribeck"]
+    assert model_hash(steps[-1][1]) == model_hash(found)
+    assert steps[0][1].frictionloss[1] != 0.1
+    assert causes(robot) == []
+
+
+def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
+    sequences = recordings(write_arm(tmp_path / "arm"), 3, rows=50)
+    off = lambda sizes: [Run(s, s.qpos, s.qpos + x) for s, x in zip(sequences, sizes, strict=True)]  # noqa: E731
+    done = {"nominal": off([0.03, 0.02, 0.01]), "gain": off([0.02, 0.01, 0.0])}
+    assert removed(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
+    less, error = removed({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})["gain"]
+    assert (less, error) == pytest.approx((0.02, 0.01 / np.sqrt(3)), abs=1e-6)

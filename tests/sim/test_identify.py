@@ -7,7 +7,8 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.errors import UsageError
-from gaponet.sim.identify import cut, identify
+from gaponet.sim.identify import identify
+from gaponet.sim.refit import cut
 
 
 @pytest.fixture(scope="module")

@@ -51,11 +51,14 @@ def budget(
         f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
         ["", *steps, "floor"],
         [
-            ["all joints", *(mrad(found["left"][s]) for s in steps), _floor(found)],
-            *([j, *(mrad(v["left"][s]) for s in steps), _floor(v)] for j, v in found["by_joint"].items()),
+            *(
+                [j, *(_left(v, s) for s in steps), _floor(v)]
+                for j, v in ({"all joints": found} | found["by_joint"]).items()
+            ),
             *([f"{p} kg", *(mrad(v[s]) for s in steps), ""] for p, v in found["by_payload"].items()),
         ],
     )
+    out.say("in brackets: what the step removes ± its standard error over motions")
     if found["floor"]["repeatability"] is None:
         rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
         out.say(f"floor: {rest}; no motion was recorded twice, so repeatability is unknown")
@@ -66,3 +69,10 @@ def budget(
 def _floor(panel: dict[str, Any]) -> str:
     value = panel["floor"]["both"]
     return "–" if value is None else mrad(value)
+
+
+def _left(panel: dict[str, Any], step: str) -> str:
+    if step not in panel["removed"]:
+        return mrad(panel["left"][step])
+    less, error = panel["removed"][step]
+    return f"{mrad(panel['left'][step])} ({mrad(less)} ± {mrad(error)})"

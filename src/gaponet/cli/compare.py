@@ -49,8 +49,7 @@ def compare(
             study.variant(word)  # refused before anything takes time
     if identify:
         with bar("identifying") as update:
-            tell = lambda done, total, rms: update(done, total, f"{rms * 1e3:.2f} mrad")  # noqa: E731
-            study = replace(study, identified=identified(study, tell))
+            study = replace(study, identified=identified(study, update))
     failed = carry_out(question, study, options.json)
     if failed:
         raise ModelError(f"{failed} trainings failed; the table is of the others. Run it again to retry")

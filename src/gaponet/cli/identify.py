@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import tyro
 
 from gaponet import api
 from gaponet.cli.gap import mrad
 from gaponet.cli.out import Out, writes
+from gaponet.metrics import standard_error
+
+if TYPE_CHECKING:
+    from gaponet.sim.identify import Identified
 
 COLUMNS = {  # field → heading, factor from SI
     "kp": ("kp, N·m/rad", 1.0),
@@ -18,7 +23,18 @@ COLUMNS = {  # field → heading, factor from SI
     "armature": ("armature, g·m²", 1e3),
     "offset": ("offset, mrad", 1e3),
     "delay": ("delay, ms", 1e3),
+    "stribeck": ("more at rest, N·m", 1.0),
+    "stribeck_speed": ("until, mrad/s", 1e3),
+    "friction_motor": ("friction, % of motor", 1e2),
+    "friction_external": ("friction, % of load", 1e2),
+    "min_torque": ("least torque, N·m", 1.0),
+    "encoder_step": ("encoder, mrad", 1e3),
+    "zero": ("zero, mrad", 1e3),
+    "stop_low": ("low stop, rad", 1.0),
+    "stop_high": ("high stop, rad", 1.0),
 }
+
+WIDE = 4  # columns of a table
 
 
 @writes("robot")
@@ -26,6 +42,9 @@ def identify(
     dataset: tyro.conf.Positional[Path],
     out: Path,
     windows: int = 40,
+    terms: tuple[Literal["stribeck", "load", "external", "min_torque", "encoder"], ...] = ("stribeck", "load"),
+    table: bool = True,
+    threads: int = 0,
     robot: str | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
@@ -40,29 +59,74 @@ def identify(
         dataset: Dataset folder.
         out: Robot folder to write.
         windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
+        terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
+        table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
+        threads: For the table; 0 for all cores.
         robot: Robot name or folder to start from, if not the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in gaponet train.
         mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
-    from gaponet.sim.free_runs import BOUNDS
-
     screen = Out(json)
-    made = api.identify(dataset, out, windows, robot, units, holdout_units, mixed_gains)
-    found, error, spec = made.found, made.val_mpjae, made.found.robot
-    values: dict[str, Any] = {
-        j: {f: float(getattr(found.robot, f)[spec.joint_names.index(j)]) for f in BOUNDS} for j in spec.operated
+    made = api.identify(dataset, out, windows, robot, units, holdout_units, mixed_gains, terms, table, threads)
+    found = made.found
+    _tell(screen, found, made.val)
+    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")
+    screen.result({
+        "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
+        "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
+        "terms": {t.name: {"gain": t.gain[0], "standard_error": t.gain[1], "kept": t.kept} for t in found.tried},
+        "table": vars(found.robot.table) if found.robot.table else None,
+        "touching": list(found.touch.motions) if found.touch else [],
+        "warnings": list(found.warnings), "seconds": made.seconds, "robot": str(out),
+    })  # fmt: skip
+
+
+def _values(found: Identified) -> dict[str, dict[str, float]]:
+    """Joint → field → value of the fields that say something."""
+    robot = found.robot
+    return {
+        joint: {f: float(getattr(robot, f)[i]) for f in COLUMNS if np.isfinite(getattr(robot, f)[i])}
+        for joint, i in zip(robot.operated, robot.operated_index, strict=True)
     }
-    screen.table("Identified servos", ["joint", *(COLUMNS[f][0] for f in BOUNDS)], [
-        [j, *(f"{v * COLUMNS[f][1]:.3g}" for f, v in values[j].items())] for j in spec.operated
-    ])  # fmt: skip
+
+
+def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None:
+    """The servos as a table, what was tried and what it gave."""
+    values = _values(found)
+    shown = [f for f in COLUMNS if any(v.get(f) for v in values.values())]
+    for start in range(0, len(shown), WIDE):
+        part = shown[start : start + WIDE]
+        rows = [[j, *(_cell(v.get(f), found.std[j].get(f), COLUMNS[f][1]) for f in part)] for j, v in values.items()]
+        title = "Identified servos" if start == 0 else "The same"
+        screen.table(f"{title}, ± standard error", ["joint", *(COLUMNS[f][0] for f in part)], rows)
+    for term in found.tried:
+        fell, error = (mrad(x) for x in term.gain)
+        kept = "kept" if term.kept else "not kept"
+        screen.say(
+            f"{term.name}: validation error falls by {fell} ± {error} mrad over {len(term.before)} motions; {kept}"
+        )
+    if found.touch is not None and found.touch.motions:
+        touch, table = found.touch, found.robot.table
+        what = "none that explains them"
+        if touch.kept and table is not None:
+            what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
+        screen.say(
+            f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
+            f"{', '.join(touch.motions)}"
+        )
     for warning in found.warnings:
         screen.say(f"  {warning}", "warning", "yellow")
+    nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
     screen.say(
-        f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions: nominal "
-        f"{mrad(error['nominal'])}, identified {mrad(error['identified'])} mrad "
-        f"({error['identified'] / error['nominal']:.2f})"
+        f"windows {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions (± over "
+        f"{len(errors['nominal'])} motions): nominal {nominal}, identified {left} mrad "
+        f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
     )
-    screen.say(f"robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")
-    screen.result({"joints": values, "val_mpjae": error, "warnings": list(found.warnings), "robot": str(out)})
+
+
+def _cell(value: float | None, std: float | None, factor: float) -> str:
+    if value is None:
+        return ""
+    return f"{value * factor:.3g}" + ("" if std is None else f" ± {std * factor:.2g}")

@@ -13,6 +13,7 @@ from gaponet.data.checks import CHECKS
 from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
+from gaponet.data.checks.touching import Heights, Standing, standing, touching
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey, survey
@@ -62,6 +63,7 @@ def diagnose(
     robot: RobotSpec,
     progress: Callable[[float, float, str], None] | None = None,
     model: Gravity | None = None,
+    heights: Heights | None = None,
 ) -> Diagnosis:
     """Survey every sequence, one in memory at a time, and judge them together.
 
@@ -70,18 +72,24 @@ def diagnose(
         robot: The dataset's robot.
         progress: Called with done, total and the motion.
         model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
+        heights: Lowest tip of a sequence in every row, m, to tell motions that press on something; needs `model`.
     """
     dataset.require_robot(robot)
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     surveys: list[Survey] = []
+    stands: list[Standing] = []
     for entry in dataset.entries:
-        surveys.append(survey(entry, dataset.read(entry), robot))
+        sequence = dataset.read(entry)
+        surveys.append(survey(entry, sequence, robot))
+        if model is not None and heights is not None:
+            stands.append(standing(sequence, robot, heights, model))
         if progress:
             progress(len(surveys), len(dataset), entry.meta.motion)
     findings = [f for check in CHECKS for f in check(surveys, robot)]
     if model is not None:
         findings += gravity(surveys, robot, model)
+    findings += touching(stands)
     findings.sort(key=lambda f: -LEVELS.index(f.level))
     return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 

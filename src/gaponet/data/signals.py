@@ -97,3 +97,15 @@ def _correlation(a: Array, b: Array) -> Array:
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     power = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     return (a * b).sum(axis=0) / np.where(power > 0, power, np.inf)
+
+
+def encoder_step(recordings: list[Array]) -> float:
+    """The smallest step between distinct readings of one joint, rad; 0 where readings are continuous."""
+    values = np.unique(np.concatenate(recordings).astype(np.float64))
+    steps = np.diff(values)
+    steps = steps[steps > 2e-6]  # below: rounding of the stored float32
+    if steps.size < 10:
+        return 0.0
+    step = float(np.percentile(steps, 5))
+    off = np.abs(steps / step - np.round(steps / step))
+    return step if np.median(off) < 0.1 else 0.0

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
+from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,15 @@ import numpy as np
 
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import Sequence
+from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import choose, corrected_robot
-from gaponet.metrics import metrics, runs
+from gaponet.metrics import Run, metrics, runs, standard_error
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
+from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
 Array = np.ndarray
@@ -34,8 +38,9 @@ def gap_budget(
 ) -> dict[str, Any]:
     """Mean |error| left after each step, in free run over whole motions that the run never saw.
 
-    Steps: nominal; delay (fitted on the training motions); offset (delay and offset); identified (where the run starts
-    from an identified simulator); the run's model.
+    Steps: nominal; delay (fitted on the training motions); offset (delay and offset); where the run starts from an
+    identified simulator its CAUSES, one after the other; the run's model. Standard errors are over motions, of what a
+    step removes motion by motion (paired); what causes remove depends on their order.
 
     Args:
         run: Run folder; its split, baseline, simulator and model apply.
@@ -45,8 +50,9 @@ def gap_budget(
         progress: Called with step, control steps done, total.
 
     Returns:
-        {"left": {step: rad}, "by_joint": {joint: {"left": {step: rad}, "floor": {…}}}, "by_payload": {kg: {step: rad}},
-        "floor": {"encoder": …, "repeatability": …, "both": …}, …}; a floor that is unknown is None.
+        {"left": {step: rad}, "removed": {step: [rad, standard error]}, "by_joint": {joint: the same and "floor"},
+        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …};
+        a floor that is unknown is None.
     """
     dataset.require_robot(robot)
     simulator = corrected_robot(run, robot)
@@ -58,8 +64,7 @@ def gap_budget(
     fitted = DelayOffset.read(run)
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
     steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
-    if simulator.nominal is not None:
-        steps.append(("identified", simulator, None))
+    steps += [(cause, physics, None) for cause, physics in causes(simulator)]
     steps.append((model.config.kind, simulator, model.corrector(simulator)))
     done = {}
     for name, physics, corrector in steps:
@@ -70,8 +75,13 @@ def gap_budget(
     floors = floor(sequences, robot)
     return {
         "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
+        "removed": removed(done),
         "by_joint": {
-            j: {"left": {n: metrics(part, c)["mpjae"] for n, part in done.items()}, "floor": floors[j]}
+            j: {
+                "left": {n: metrics(part, c)["mpjae"] for n, part in done.items()},
+                "removed": removed(done, c),
+                "floor": floors[j],
+            }
             for j, c in columns.items()
         },
         "by_payload": {
@@ -87,6 +97,44 @@ def gap_budget(
         "dataset": dataset.path.name,
         "robot": robot.name,
     }  # fmt: skip
+
+
+# What an identified simulator differs in from the nominal one, in the order in which the budget adopts it.
+CAUSES = {
+    "gain": ("kp", "damping", "armature", "delay", "offset"),
+    "friction": ("frictionloss",),
+    "stribeck": ("stribeck", "stribeck_speed"),
+    "load": ("friction_motor", "friction_external"),
+    "servo": ("min_torque", "encoder_step"),
+    "contact": ("zero", "stop_low", "stop_high"),
+}
+
+
+def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
+    """The simulators between the nominal and the identified one; the last one is the identified one itself."""
+    if simulator.nominal is None:
+        return []
+    robot, steps = nominal_of(simulator), []
+    for cause, fields in CAUSES.items():
+        servos = {
+            joint: {f: float(getattr(simulator, f)[i]) for f in fields if np.isfinite(getattr(simulator, f)[i])}
+            for i, joint in enumerate(simulator.joint_names)
+        }
+        changed = robot.with_servos(servos)
+        if cause == "contact":
+            changed = replace(changed, table=simulator.table)
+        if model_hash(changed) != model_hash(robot):
+            steps.append((cause, changed))
+        robot = changed
+    return steps
+
+
+def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
+    """By how much each step lowers the error, and its standard error over motions, rad."""
+    c = slice(None) if columns is None else columns
+    errors = {name: np.array([np.abs(r.error[:, c]).mean() for r in part]) for name, part in done.items()}
+    less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}
+    return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
 
 
 def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
@@ -107,18 +155,6 @@ def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, 
         again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
         found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
     return found
-
-
-def encoder_step(recordings: ListOf[Array]) -> float:
-    """The smallest step between distinct readings of one joint, rad; 0 where readings are continuous."""
-    values = np.unique(np.concatenate(recordings).astype(np.float64))
-    steps = np.diff(values)
-    steps = steps[steps > 2e-6]  # below: rounding of the stored float32
-    if steps.size < 10:
-        return 0.0
-    step = float(np.percentile(steps, 5))
-    off = np.abs(steps / step - np.round(steps / step))
-    return step if np.median(off) < 0.1 else 0.0
 
 
 def _mean(values: ListOf[float | None]) -> float | None:

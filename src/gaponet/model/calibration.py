@@ -23,7 +23,7 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.files import writing
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.identify import WINDOW, identify
+from gaponet.sim.refit import WINDOW, refit
 from gaponet.structure import read_json
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
@@ -88,9 +88,9 @@ def calibrate(
             f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
             "one and the same: give recordings of one mass"
         )
-    found = identify(
-        sequences, simulator, max(1, round(seconds / WINDOW)), progress=progress, fields=FIELDS,
-        corrector=model.corrector(simulator), prior=PRIOR, evaluations=EVALUATIONS, unknown_payload=unknown_payload,
+    found = refit(
+        sequences, simulator, max(1, round(seconds / WINDOW)), FIELDS, model.corrector(simulator), PRIOR, EVALUATIONS,
+        unknown_payload, progress=progress,
     )  # fmt: skip
     servos = {
         j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}

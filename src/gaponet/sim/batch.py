@@ -9,8 +9,9 @@ import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
 from gaponet.errors import UsageError
-from gaponet.robot import RobotSpec
+from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
+from gaponet.sim.servo import ServoLaw
 
 Array = np.ndarray
 Condition = tuple[float, str, float]  # payload_mass kg, payload_side, dt s
@@ -24,9 +25,17 @@ class BatchSim:
     """
 
     def __init__(
-        self, robot: RobotSpec, conditions: list[Condition], nthread: int = 0, locked: tuple[str, ...] = ()
+        self,
+        robot: RobotSpec,
+        conditions: list[Condition],
+        nthread: int = 0,
+        locked: tuple[str, ...] = (),
+        law: bool = False,
     ) -> None:
-        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked."""
+        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
+
+        With `law` the servo's law is there to be written to, though the robot has none.
+        """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
         self.models = {c: build_model(robot, c[0], c[1], c[2], locked, bare=True) for c in dict.fromkeys(conditions)}
@@ -41,6 +50,7 @@ class BatchSim:
         self.ctrl: Array = self.batch.bind("ctrl")
         self.torque: Array = self.batch.bind("actuator_force")
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
+        self.law = ServoLaw(self.batch, first) if robot.has_law or law else None
         self._late = CommandHistory(self.batch, first) if first.nhistory else None
         self._nstep = np.array([robot.steps_per(c[2]) for c in conditions])
         self._one_rate = bool((self._nstep == self._nstep[0]).all())
@@ -63,6 +73,8 @@ class BatchSim:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._late.fill(ids, past, self._nstep[ids], self._timestep[ids])
+        if self.law is not None:
+            self.law.reset(ids, self.qpos[ids] if past is None else past[:, 0])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
         """Hold position targets for one control period.
@@ -73,11 +85,45 @@ class BatchSim:
         """
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
-            self.batch.step(ids, nstep=int(self._nstep[0]))
+            self._advance(ids, int(self._nstep[0]))
             return
         moving = np.arange(self.num_envs) if ids is None else ids
         for n in np.unique(self._nstep[moving]):
-            self.batch.step(moving[self._nstep[moving] == n], nstep=int(n))
+            self._advance(moving[self._nstep[moving] == n], int(n))
+
+    def _advance(self, ids: Array | None, count: int) -> None:
+        if self.law is None:
+            self.batch.step(ids, nstep=count)
+            return
+        for _ in range(count):
+            self.law.before()
+            self.batch.step(ids, nstep=1)
+            self.law.after(ids)
+
+    def set_servos(self, joints: tuple[str, ...], values: dict[str, Array]) -> None:
+        """Give every simulation servos of its own.
+
+        Args:
+            joints: k names.
+            values: kp, damping, frictionloss, armature, offset, and any of zero, delay (up to the robot's) and LAW,
+                each (num_envs, k).
+        """
+        model, batch = next(iter(self.models.values())), self.batch
+        dof = np.array([model.joint(j).dofadr[0] for j in joints])
+        act = np.array([model.actuator(j).id for j in joints])
+        gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
+        gain[:, act, 0], bias[:, act, 1] = values["kp"], -values["kp"]
+        bias[:, act, 0] = values["kp"] * values["offset"]
+        for name in ("damping", "frictionloss", "armature"):
+            batch.expand(f"dof_{name}")[:, dof] = values[name]
+        if "delay" in values and model.nhistory:
+            batch.expand("actuator_delay")[:, act] = values["delay"]
+        if "zero" in values:
+            batch.expand("qpos0")[:, dof] = -values["zero"]
+        if self.law is not None:
+            self.law.bias[:, act], self.law.frictionloss[:, act] = bias[:, act, 0], values["frictionloss"]
+            for name in LAW:
+                self.law.values[name][:, act] = values.get(name, 0.0)
 
     def state(self) -> dict[str, Array]:
         """Copies of all that the next step follows from."""
@@ -90,7 +136,8 @@ class BatchSim:
 
     def _state(self) -> dict[str, Array]:
         late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
-        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late
+        servo = {} if self.law is None else {"servo_torque": self.law.torque, "servo_load": self.law.load}
+        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo
 
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""

@@ -31,7 +31,6 @@ def descend(
     evaluations: int,
     tolerance: float,
     progress: Callable[[int, int, float], None],
-    alone: bool = True,
 ) -> Fit:
     """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
 
@@ -44,16 +43,15 @@ def descend(
         evaluations: At most.
         tolerance: Ends when the cost falls by a smaller share.
         progress: Called with evaluations done, at most, and the present RMS error in rad.
-        alone: As if joints did nothing to each other.
     """
     low, high = problem.bounds()
     errors = problem.errors(x[None])[0]
-    jac = problem.jacobian(x, errors, alone)
+    jac = problem.jacobian(x, errors)
     damping, count, fresh = 1e-2, 1, True
     progress(count, evaluations, problem.rms(errors))
     while count < evaluations:
         if not fresh:
-            jac, fresh = problem.jacobian(x, errors, alone), True
+            jac, fresh = problem.jacobian(x, errors), True
         weight = weights(errors)
         normal, slope = jac.T @ (weight[:, None] * jac), jac.T @ (weight * errors)
         normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12

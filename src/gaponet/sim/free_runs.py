@@ -2,20 +2,18 @@
 
 A servo's parameters act on its own joint first: what they do to the others is weaker by the ratio of the inertias. So
 one simulation can move the same parameter of all joints, and each joint's error is put down to its own parameter: six
-simulations for a Jacobian, however many joints. Or it moves one joint of every limb, and the limb answers.
+simulations for a Jacobian, however many joints.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.sparse.csgraph import connected_components
 
 from gaponet.data.sequence import Sequence
-from gaponet.robot import RobotSpec
+from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import Corrector, idle_limbs
@@ -75,7 +73,6 @@ class FreeRuns:
         )
         model = build_model(robot)
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
-        self.limb = limbs_of(model, dof)
         gain = robot.kp[self.op]
         natural = gain * 0.05  # N·m·s/rad: a time constant of 50 ms
         self.scale = {
@@ -89,6 +86,7 @@ class FreeRuns:
         self.first = {
             "kp": gain, "damping": model.dof_damping[dof], "frictionloss": model.dof_frictionloss[dof],
             "armature": model.dof_armature[dof], "offset": robot.offset[self.op], "delay": robot.delay[self.op],
+            **{name: getattr(robot, name)[self.op] for name in ("zero", *LAW)},
         }  # fmt: skip
 
     def start(self) -> Array:
@@ -147,7 +145,7 @@ class FreeRuns:
         parts = [s for x in xs for s in self._carrying(x)]
         conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
         sim = BatchSim(replace(self.robot, delay=late), conditions, self.nthread, self.locked)
-        self._write(sim, sim.models[conditions[0]], self.values(np.repeat(xs, m, axis=0)))
+        sim.set_servos(self.robot.operated, self.values(np.repeat(xs, m, axis=0)))
         tile = np.tile(self.ctrl, (1, k, 1))
         q0, v0 = (np.stack([getattr(s, f)[0, self.free] for s in parts]) for f in ("qpos", "qvel"))
         sim.reset(slice(None), q0, v0, past=tile[0][:, None])
@@ -182,63 +180,27 @@ class FreeRuns:
             place[:, self.free] = now
         return self.corrector.correct(t, *full)[:, self.free]
 
-    def _write(self, sim: BatchSim, model: mujoco.MjModel, values: dict[str, Array]) -> None:
-        joints = [model.joint(j) for j in self.robot.operated]
-        dof = np.array([j.dofadr[0] for j in joints])
-        act = np.array([model.actuator(j).id for j in self.robot.operated])
-        gain, bias = sim.batch.expand("actuator_gainprm"), sim.batch.expand("actuator_biasprm")
-        gain[:, act, 0], bias[:, act, 1] = values["kp"], -values["kp"]
-        bias[:, act, 0] = values["kp"] * values["offset"]
-        for name in ("damping", "frictionloss", "armature"):
-            sim.batch.expand(f"dof_{name}")[:, dof] = values[name]
-        sim.batch.expand("actuator_delay")[:, act] = values["delay"]
+    def jacobian(self, x: Array, base: Array) -> Array:
+        """Forward differences towards the inside of the bounds, (m, P), from parameters (P,) whose errors are base.
 
-    def jacobian(self, x: Array, base: Array, alone: bool) -> Array:
-        """Forward differences towards the inside of the bounds, (m, P).
-
-        Args:
-            x: Parameters, (P,).
-            base: The errors there.
-            alone: One simulation moves a field of all joints, and each joint answers for itself; else one joint of
-                every limb, and the limb answers.
+        One simulation moves a field of all joints, and each joint answers for itself.
         """
         steps = np.r_[np.repeat([b[2] for b in self.limits.values()], self.n), [MASS_STEP] * self.unknown_payload]
         steps = np.where(x + steps > self.bounds()[1], -steps, steps)
-        # Which joint's parameter moves in the limb of joint i, (simulations of a field, n); −1: none.
-        movers = np.arange(self.n)[None] if alone else one_per_limb(self.limb)
-        columns = [np.where(m < 0, -1, m + self.n * f) for f in range(len(self.limits)) for m in movers]
-        moved = np.zeros((len(columns) + self.unknown_payload, self.size))
-        for row, column in zip(moved, columns, strict=False):
-            row[column[column >= 0]] = 1.0
-        if self.unknown_payload:
-            moved[-1, -1] = 1.0
+        field = np.repeat(np.arange(len(self.limits)), self.n)  # of each parameter
+        count = len(self.limits) + self.unknown_payload
+        moved = np.r_[field, [count - 1] * self.unknown_payload] == np.arange(count)[:, None]
         change = (self.errors(x + moved * steps) - base)[:, : self.rows]
         jac = np.zeros((len(base), self.size))
-        for answer, column in zip(change, columns, strict=False):
-            to = column[self.joint]
-            rows = np.flatnonzero(to >= 0)
-            jac[rows, to[rows]] = answer[rows] / steps[to[rows]]
+        rows = np.arange(self.rows)
+        for f in range(len(self.limits)):
+            column = self.joint + self.n * f
+            jac[rows, column] = change[f] / steps[column]
         if self.unknown_payload:  # a payload loads every joint
             jac[: self.rows, -1] = change[-1] / steps[-1]
         if self.prior:
             jac[self.rows :, : len(self.names)] = self._prices()
         return jac
-
-
-def limbs_of(model: mujoco.MjModel, dof: Array) -> Array:
-    """Number of the limb of each of these degrees of freedom, (n,): those on one chain, with none between limbs."""
-    linked = np.zeros((len(dof), len(dof)))
-    for i, d in enumerate(dof):
-        while d >= 0:
-            linked[i, dof == d] = 1.0
-            d = model.dof_parentid[d]
-    return connected_components(linked, directed=False)[1]
-
-
-def one_per_limb(limb: Array) -> Array:
-    """Row k: for every joint, the k-th joint of its limb, −1 where that has fewer, (largest limb, n)."""
-    members = [np.flatnonzero(limb == name) for name in limb]
-    return np.array([[m[k] if k < len(m) else -1 for m in members] for k in range(max(map(len, members)))])
 
 
 def _held(x: Array, rows: int) -> Array:

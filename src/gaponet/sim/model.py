@@ -11,12 +11,17 @@ import numpy as np
 from gaponet.errors import RobotError, UsageError
 from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
-from gaponet.robot import IDENTIFIED, RobotSpec
+from gaponet.robot import IDENTIFIED, LAW, RobotSpec
+from gaponet.sim.table import add_table, soften_table
 
-# Joint friction loss is a soft constraint in MuJoCo: with the default parameters a joint that should stick creeps.
-# These values hold it (tests/sim/test_model.py holds a loaded joint for 60 s), at no cost in speed.
+# Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
+# torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
+# is the stiffest that the solver still meets at this tolerance, whatever the armature, at no cost in speed; it makes
+# joint stops as much harder. noslip_iterations halve the speed of a humanoid and converge slowly in a light limb.
 STIFF_SOLREF = (0.004, 1.0)
-STIFF_SOLIMP = (0.999, 0.9999, 0.001, 0.5, 2.0)
+STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
+STIFF_MOBILITY = 0.1
+TOLERANCE = 1e-10
 
 PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
 
@@ -58,7 +63,14 @@ def build_model(
         )
     if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
         raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
+    stiffen_friction(model)
+    soften_table(model, robot)
     return model
+
+
+def stiffen_friction(model: mujoco.MjModel) -> None:
+    """Make friction hold; once after each compilation or mj_setConst, which undo it."""
+    model.dof_invweight0 *= STIFF_MOBILITY
 
 
 def build_spec(
@@ -74,10 +86,12 @@ def build_spec(
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else _positive(dt)
     spec.option.timestep = period / robot.steps_per(period)
+    spec.option.tolerance = TOLERANCE
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
     _set_joints(spec, robot)
+    add_table(spec, robot)
     _lock(spec, robot, locked)
     _add_actuators(spec, robot, locked)
     if bare:
@@ -122,7 +136,10 @@ def model_hash(robot: RobotSpec) -> str:
     of 50 in gain.
     """
     if "_model_hash" not in vars(robot):
-        text = [f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g}", *lines(build_model(robot))]
+        text = [
+            f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
+            *lines(build_model(robot)),
+        ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
         object.__setattr__(robot, "_model_hash", digest)
     return str(vars(robot)["_model_hash"])
@@ -137,7 +154,8 @@ def text_hash(robot: RobotSpec) -> str:
     servos = [np.ascontiguousarray(getattr(robot, field), np.float64) for field in IDENTIFIED]
     if any(np.nan_to_num(s).any() for s in servos):
         digest.update(b"".join(s.tobytes() for s in servos))
-    digest.update(repr((robot.joint_names, robot.decimation, STIFF_SOLREF, STIFF_SOLIMP)).encode())
+    stiff = (STIFF_SOLREF, STIFF_SOLIMP, STIFF_MOBILITY, TOLERANCE)
+    digest.update(repr((robot.joint_names, robot.decimation, *stiff)).encode())
     return digest.hexdigest()[:12]
 
 
@@ -160,6 +178,11 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             value = getattr(robot, field)[i]
             if np.isfinite(value):
                 setattr(joint, field, value)
+        joint.ref -= robot.zero[i]
+        stops = robot.stop_low[i], robot.stop_high[i]
+        if np.isfinite(stops).any():
+            joint.range = [a if np.isnan(b) else b for a, b in zip(joint.range, stops, strict=True)]
+            joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
 
@@ -167,7 +190,7 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for name in locked:
         joint = spec.joint(name)
-        angle = robot.qpos_home[robot.joint_names.index(name)]
+        angle = robot.qpos_home[robot.joint_names.index(name)] - joint.ref
         turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
         mujoco.mju_axisAngle2Quat(turn, np.array(joint.axis), angle)
         mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
@@ -190,6 +213,8 @@ def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
+    if robot.has_law:
+        spec.nuser_actuator = len(LAW)
     # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
     samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
@@ -202,6 +227,8 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...
         actuator.biasprm[0] = kp * robot.offset[i]
         actuator.forcelimited = True
         actuator.forcerange = (-limit, limit)
+        if robot.has_law:
+            actuator.userdata = [getattr(robot, term)[i] for term in LAW]
         if samples:
             actuator.nsample, actuator.interp, actuator.delay = samples, 1, robot.delay[i]
 

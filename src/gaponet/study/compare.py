@@ -65,12 +65,13 @@ class Compare:
                             motions=motions, unseen=unseen, sequences=len(entries))  # fmt: skip
 
 
-def identified(study: Study, tell: Callable[[int, int, float], None]) -> RobotSpec:
+def identified(study: Study, tell: Callable[[float, float, str], None]) -> RobotSpec:
     """The simulator identified on the training motions, in OUT/identified; once."""
     folder = study.out / "identified"
     if not (folder / "robot.toml").is_file():
-        train = study.data.sequences(split_entries(study.data, study.holdout_units)["train"])
-        save_robot(identify(train, study.robot, progress=tell).robot, folder)
+        parts = split_entries(study.data, study.holdout_units)
+        train, held = (study.data.sequences(parts[part]) for part in ("train", "val"))
+        save_robot(identify(train, study.robot, held, progress=tell).robot, folder)
     return load_robot(folder)
 
 

@@ -14,7 +14,7 @@ from mujoco.batch import Batch
 
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import expand_differences
-from gaponet.sim.model import build_model, qpos_range
+from gaponet.sim.model import build_model, qpos_range, stiffen_friction
 from gaponet.virtual.motor import Backlash, CommandLink, Thermal, cogging_torque, friction_limit, supply_share
 from gaponet.virtual.physics import Physics, stack
 
@@ -307,3 +307,4 @@ def _edit(model: mujoco.MjModel, robot: RobotSpec, unit: Physics, locked: tuple[
     if roll or pitch:  # what a level world looks like from a base that leans
         model.opt.gravity = g * np.array([np.sin(pitch), -np.sin(roll) * np.cos(pitch), -np.cos(roll) * np.cos(pitch)])
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    stiffen_friction(model)

@@ -1,0 +1,100 @@
+"""One unit's servo parameters near a robot's own, from half a minute of its log: least squares with a prior.
+
+What so little log does not determine stays with the robot's values; with a corrector the fit is made under it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec
+from gaponet.sim.descent import Fit, descend, weights
+from gaponet.sim.free_runs import FreeRuns
+from gaponet.sim.replay import Corrector
+
+WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """The fitted robot and what is known about the fit.
+
+    Attributes:
+        robot: The same robot with fitted parameters.
+        before, after: RMS error of the windows, rad.
+        payload_mass, payload_std: kg in each hand that is said to carry, where it was asked for.
+    """
+
+    robot: RobotSpec
+    before: float
+    after: float
+    payload_mass: float | None = None
+    payload_std: float | None = None
+
+
+def refit(
+    sequences: ListOf[Sequence],
+    robot: RobotSpec,
+    windows: int,
+    fields: tuple[str, ...],
+    corrector: Corrector | None,
+    prior: float,
+    evaluations: int,
+    unknown_payload: bool = False,
+    nthread: int = 0,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+) -> Refitted:
+    """Fit parameters of all operated joints at once.
+
+    Args:
+        sequences: Recordings.
+        robot: Where to start from; its payloads' masses are taken as true.
+        windows: Free runs of 8 s, taken evenly from the recordings.
+        fields: Which parameters; the others stay the robot's.
+        corrector: Corrects the targets on the way, as in replay.
+        prior: Price of leaving the robot's own values, rad per scale. All joints together leave them for a twentieth of
+            it, gains and zero offsets apart.
+        evaluations: At most so many.
+        unknown_payload: Do not believe the recordings' payload mass; fit one for all of them.
+        nthread: Threads, 0 for all cores.
+        progress: Called with evaluations done, at most, and the present RMS error in rad.
+    """
+    parts = cut(sequences, windows)
+    problem = FreeRuns(parts, robot, nthread, fields, corrector, prior, unknown_payload)
+    fit = descend(problem, problem.start(), evaluations, 1e-3, progress)
+    before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.errors)
+    mass = {"payload_mass": float(fit.x[-1]), "payload_std": jackknife(problem, fit)} if unknown_payload else {}
+    return Refitted(problem.robot_of(fit.x), before, after, **mass)
+
+
+def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
+    """Windows of WINDOW seconds (shorter where a recording is), evenly picked."""
+    parts = []
+    for s in sequences:
+        rows = min(round(WINDOW / s.dt), len(s))
+        parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
+    parts = [p for p in parts if p.duration > 1.0]
+    if not parts:
+        raise UsageError("no recording is longer than a second; identification needs longer ones")
+    return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+
+
+def jackknife(problem: FreeRuns, fit: Fit) -> float:
+    """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
+
+    The model's own errors last as long as a motion, so that rows of a window say little about each other.
+    """
+    jac, error = fit.jac, fit.errors
+    weight = weights(error)
+    moved = []
+    for window in range(len(problem.parts)):
+        keep = weight * np.r_[problem.window != window, np.ones(len(error) - problem.rows, bool)]
+        moved.append(np.linalg.lstsq(jac.T @ (keep[:, None] * jac), -jac.T @ (keep * error))[0][-1])
+    m = len(moved)
+    return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")

@@ -1,0 +1,194 @@
+"""Where a robot's tips touch a table: heights by forward kinematics, and the table that explains the recordings best.
+
+A zero of every joint's encoder is fitted with it, near none: zeros, the tip's place and the table's height trade
+against each other, so give a measured height ([table] in robot.toml) where there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from gaponet.data.sequence import Sequence
+from gaponet.metrics import standard_error
+from gaponet.robot import RobotSpec, Table
+from gaponet.sim.batch import BatchSim
+from gaponet.sim.evolve import evolve
+from gaponet.sim.joint_runs import SETTLE, SOFT
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import idle_limbs
+from gaponet.sim.table import write_table
+
+Array = np.ndarray
+
+CLEARANCE = 0.045  # m above the lowest tip, or the table, in which a joint's zero may hide a contact
+WINDOW = 5.0  # s
+WINDOWS, PER_MOTION, GENERATIONS = 14, 2, 30
+HEIGHTS = 10  # tried first, from the lowest tip upwards
+STEP = 0.005  # m between them
+ZERO, PRICE = 0.02, 2e-4  # rad: an ordinary zero, and what it costs (soft square of one for a window)
+# Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
+FRICTION = (0.0, 1.5, 0.15, 0.3)
+STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
+
+
+@dataclass(frozen=True)
+class Touch:
+    """What was found about the table.
+
+    Attributes:
+        robot: With the table and the zeros, where they explain the recordings better than none; else without.
+        kept: Whether they do.
+        before, after: Mean |error| without and with, rad, of the windows, (windows,).
+        motions: Motions in which a tip comes near.
+    """
+
+    robot: RobotSpec
+    kept: bool
+    before: Array
+    after: Array
+    motions: tuple[str, ...]
+
+
+def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
+    """Lowest point of any tip in every row, (rows,) m; none where robot.toml names no tip."""
+    if not robot.tips:
+        return []
+    model = build_model(replace(robot, table=None), bare=True)
+    data = mujoco.MjData(model)
+    tips = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in robot.tips]
+    found = []
+    for s in sequences:
+        height = np.full(len(s), np.inf)
+        for t in range(len(s)):
+            data.qpos[:] = s.qpos[t]
+            mujoco.mj_kinematics(model, data)
+            height[t] = min(data.xpos[b, 2] + data.xmat[b].reshape(3, 3)[2] @ p - r for b, p, r in tips)
+        found.append(height)
+    return found
+
+
+def touching_below(robot: RobotSpec, heights: ListOf[Array]) -> float:
+    """Height under which a tip may touch, m."""
+    if not robot.tips or not heights:
+        return -np.inf
+    lowest = min(h.min() for h in heights) if robot.table is None else robot.table.height
+    return float(lowest + CLEARANCE)
+
+
+def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
+    """The windows in which a tip comes below a height, longest first."""
+    found = []
+    for s, height in zip(sequences, heights, strict=True):
+        rows = min(round(WINDOW / s.dt), len(s))
+        starts = range(0, len(s) - rows + 1, rows)
+        found += [s.rows(slice(a, a + rows)) for a in starts if (height[a : a + rows] < below).any()]
+    return sorted(found, key=lambda s: -len(s))
+
+
+def most_wrong(scene: Scene, away: Array) -> list[Sequence]:
+    """At most WINDOWS, PER_MOTION of a motion, whose free runs without a table (1, 3 + n) are worst."""
+    order = np.argsort(-scene.mean(scene.errors(away))[0])
+    taken: dict[str, list[int]] = {}
+    for i in order.tolist():
+        taken.setdefault(scene.parts[i].meta.motion, []).append(i)
+    best = {i for mine in taken.values() for i in mine[:PER_MOTION]}
+    return [scene.parts[i] for i in sorted([i for i in order.tolist() if i in best][:WINDOWS])]
+
+
+def fit_table(
+    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, progress: Callable[[float], None]
+) -> Touch:
+    """Fit height, friction and stiffness of the table, and the zeros.
+
+    Args:
+        parts: Windows in which a tip is low; those that fit worst without a table are fitted.
+        robot: Servos and all; with a table its height is taken as measured.
+        lowest: Tip height in them, m.
+        nthread: Threads, 0 for all cores.
+        progress: Called with the least error of each generation, rad.
+    """
+    if not parts:
+        return Touch(robot, False, np.zeros(0), np.zeros(0), ())
+    n, measured = len(robot.operated), robot.table
+    with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
+    away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
+    scene = Scene(parts, with_table, nthread)
+    scene = Scene(most_wrong(scene, away), with_table, nthread)
+    motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
+    before = scene.errors(away)
+    guesses = np.repeat(away, HEIGHTS, axis=0)
+    guesses[:, 0] = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else measured.height
+    start = guesses[scene.cost(scene.errors(guesses)).argmin()]
+    free = 0.0 if measured is not None else 1.0
+    unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
+    low = np.array([start[0] - free * 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
+    high = np.array([start[0] + free * 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
+
+    def cost(xs: Array) -> Array:
+        x = xs[:, 0] * unit
+        errors = scene.errors(x)
+        progress(float(scene.mean(errors).mean(axis=1).min()))
+        return (scene.cost(errors) + PRICE * np.square(x[:, 3:] / ZERO).sum(axis=1))[:, None]
+
+    best = evolve((start / unit)[None], low / unit, high / unit, cost, GENERATIONS)[0] * unit
+    without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
+    kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
+    found = robot
+    if kept:
+        zeros = robot.zero[robot.operated_index] + best[3:]
+        servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
+        height, friction, stiffness = (float(f"{x:.4g}") for x in (best[0], best[1], np.exp(best[2])))
+        found = replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
+    return Touch(found, kept, without, within, motions)
+
+
+class Scene:
+    """Windows beside tables and zeros of many kinds: rows of [height m, friction, log stiffness, zeros rad]."""
+
+    def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
+        self.parts, self.robot, self.nthread, self.op = parts, robot, nthread, robot.operated_index
+        self.locked = idle_limbs(parts, robot)
+        self.free = robot.index([j for j in robot.joint_names if j not in self.locked])
+        self.at = np.searchsorted(self.free, self.op)
+        rows = len(parts[0])
+        held = lambda x: np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])  # noqa: E731
+        self.ctrl = np.stack([held(s.ctrl[:, self.free]) for s in parts], axis=1).astype(float)
+        self.real = np.stack([held(s.qpos[:, self.op]) for s in parts], axis=1)
+        lengths = np.array([len(s) for s in parts])
+        time = np.arange(1, rows)[:, None]
+        self.counted = (time >= SETTLE / parts[0].dt) & (time < lengths)
+
+    def errors(self, xs: Array) -> Array:
+        """q_sim − q_real, (rows − 1, k, windows, n) rad, of tables and zeros (k, 3 + n)."""
+        k, m = len(xs), len(self.parts)
+        conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.parts] * k
+        sim = BatchSim(self.robot, conditions, self.nthread, self.locked)
+        rows = np.repeat(xs, m, axis=0)
+        model = sim.models[conditions[0]]
+        write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
+        dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
+        sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
+        ctrl = np.tile(self.ctrl, (1, k, 1))
+        q0, v0 = (
+            np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel")
+        )
+        sim.reset(slice(None), q0, v0, past=ctrl[0][:, None])
+        out = np.empty((len(ctrl) - 1, k, m, len(self.op)), np.float32)
+        for t in range(len(out)):
+            sim.step(ctrl[t])
+            out[t] = sim.qpos[:, self.at].reshape(k, m, -1) - self.real[t + 1]
+        return out * self.counted[:, None, :, None]
+
+    def mean(self, errors: Array) -> Array:
+        """Mean |error| by window, (k, windows) rad."""
+        return np.asarray(np.abs(errors).mean(axis=3).sum(axis=0) / self.counted.sum(axis=0))
+
+    def cost(self, errors: Array) -> Array:
+        """Soft mean square, (k,)."""
+        soft = np.sqrt(1 + (errors / SOFT) ** 2) - 1
+        return np.asarray(soft.sum(axis=(0, 2, 3)) / (self.counted.sum() * len(self.op)))

@@ -1,0 +1,60 @@
+"""What is put into a simulated arm comes back: the terms of the servo's law, and the table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import TOML, commands, recordings, write_arm
+
+from gaponet.robot import LAW, Table
+from gaponet.sim import touching
+from gaponet.sim.identify import CLASSIC, Fit
+from gaponet.sim.joint_runs import JointRuns
+from gaponet.sim.replay import replay
+
+SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
+
+
+def played(robot, acting, count, rows):
+    """Recordings of an arm of known servos."""
+    template = recordings(robot, 1, rows=rows)[0]
+    asked = [replace(template, ctrl=commands(rows, seed)) for seed in range(count)]
+    twins = replay(asked, acting)
+    return [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, twins, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        {"stribeck": 0.15, "stribeck_speed": 0.2},
+        {"friction_motor": 0.2},
+        {"friction_external": 0.25},
+    ],
+)
+def test_a_term_of_the_law_comes_back(tmp_path, law):
+    robot = write_arm(tmp_path / "arm")
+    parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
+    fit = Fit(JointRuns(parts, robot), robot, parts)
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.guess[f] for f in LAW if f in law}
+    found = fit.descend(tuple(law), start, 35, lambda error: None)
+    assert set(CLASSIC) < set(found)
+    std = fit.uncertainty(found)
+    for field, value in law.items():
+        for i, joint in enumerate(robot.joint_names):  # within 5 %, or said to be uncertain by as much
+            assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
+            assert std[joint][field] < 0.5 * value
+
+
+def test_a_table_comes_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(touching, "GENERATIONS", 12)
+    tip = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
+    robot = write_arm(tmp_path / "arm", toml=TOML + tip)
+    parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
+    heights = touching.tip_heights(parts, robot)
+    found = touching.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
+    assert found.kept
+    assert found.after.mean() < 0.2 * found.before.mean()
+    assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
+    assert np.abs(found.robot.zero).max() < 0.02
+    free = played(robot, robot, 2, 100)
+    assert not touching.fit_table(free, robot, -0.1, 1, lambda error: None).kept

@@ -1,0 +1,119 @@
+"""The servo's law: friction by speed and load, least torque, encoder steps; one definition for every simulator."""
+
+import mujoco
+import numpy as np
+import pytest
+from arm import TOML, write_arm
+
+from gaponet.sim.batch import BatchSim
+from gaponet.sim.model import build_model
+
+
+def law(robot, **values):
+    return robot.with_servos(dict.fromkeys(robot.joint_names, values))
+
+
+def pull(robot, torque, seconds=0.3):
+    """Speed of the elbow after a steady torque on it, from rest, no gravity, (rad/s)."""
+    sim = BatchSim(law(robot, kp=1e-3), [(0.0, "both", 0.02)], 1)
+    sim.batch.expand("opt.gravity")[:] = 0.0
+    sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))
+    sim.batch.bind("qfrc_applied")[:] = [0.0, torque]
+    for _ in range(round(seconds / 0.02)):
+        sim.step(np.zeros((1, 2)))
+    return float(sim.qvel[0, 1])
+
+
+def test_friction_at_rest_exceeds_that_in_motion(arm):
+    sticky = law(arm, stribeck=0.1, stribeck_speed=0.05)  # frictionloss is 0.05
+    assert pull(arm, 0.1) > 0.05
+    assert abs(pull(sticky, 0.14)) < 1e-4
+    # Once it slides fast the difference is gone: damping 0.5 alone takes what is beyond 0.05 N·m.
+    assert pull(sticky, 1.05, 0.5) == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_loaded_motor_has_more_friction(tmp_path):
+    robot = law(write_arm(tmp_path / "arm"), frictionloss=0.0, friction_motor=0.2, damping=3.0)
+    sim = BatchSim(robot, [(0.0, "both", 0.02)] * 2, 1)
+    home = np.zeros((2, 2))
+    sim.reset(slice(None), home, home)
+    for _ in range(200):
+        sim.step(home)
+    rest = sim.qpos[0].copy()
+    held = -0.2 * 9.81 * 0.1  # N·m: the fore arm's weight
+    assert abs(sim.law.torque[0, 1]) == pytest.approx(abs(held) / 1.2, rel=0.05)  # friction carries the rest
+    # What friction may take there, it takes: a small push moves nothing.
+    sim.batch.bind("qfrc_applied")[1] = [0.0, 0.2 * held]
+    for _ in range(100):
+        sim.step(home)
+    np.testing.assert_allclose(sim.qpos[1], rest, atol=2e-4)
+
+
+def test_a_coarse_encoder_hides_small_errors(arm):
+    robot = law(arm, encoder_step=0.02, frictionloss=0.0, damping=1.0)
+    sim = BatchSim(robot, [(0.0, "both", 0.02)], 1)
+    sim.batch.expand("opt.gravity")[:] = 0.0
+    sim.reset(slice(None), np.full((1, 2), 0.008), np.zeros((1, 2)))
+    for _ in range(50):
+        sim.step(np.zeros((1, 2)))
+    np.testing.assert_allclose(sim.qpos, 0.008, atol=1e-9)
+
+
+def test_a_least_torque_overcomes_friction_at_small_errors(arm):
+    still = {"frictionloss": 0.2, "encoder_step": 0.0015}
+    ends = []
+    for least in (0.0, 0.4):
+        sim = BatchSim(law(arm, **still, min_torque=least), [(0.0, "both", 0.02)], 1)
+        sim.batch.expand("opt.gravity")[:] = 0.0
+        sim.reset(slice(None), np.full((1, 2), 0.006), np.zeros((1, 2)))
+        for _ in range(100):
+            sim.step(np.zeros((1, 2)))
+        ends.append(np.abs(sim.qpos).max())
+    assert ends[0] > 0.005 > 0.003 > ends[1]
+
+
+def test_a_law_of_zeros_is_no_law_bit_for_bit(arm):
+    sims = [BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, law=with_law) for with_law in (False, True)]
+    rng = np.random.default_rng(0)
+    for sim in sims:
+        sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))
+    for _ in range(50):
+        target = rng.normal(0, 0.3, (3, 2))
+        for sim in sims:
+            sim.step(target)
+    np.testing.assert_array_equal(sims[0].qpos, sims[1].qpos)
+
+
+def test_a_state_put_back_goes_on_the_same(arm):
+    robot = law(arm, stribeck=0.1, stribeck_speed=0.05, friction_motor=0.2, friction_external=0.1)
+    sim = BatchSim(robot, [(0.5, "both", 0.02)] * 2, 1)
+    sim.reset(slice(None), np.full((2, 2), 0.1), np.zeros((2, 2)))
+    for _ in range(20):
+        sim.step(np.full((2, 2), 0.3))
+    kept = sim.state()
+    ends = []
+    for _ in range(2):
+        sim.set_state(kept)
+        for _ in range(20):
+            sim.step(np.full((2, 2), -0.2))
+        ends.append(sim.qpos.copy())
+    np.testing.assert_array_equal(*ends)
+
+
+def test_the_compiled_model_carries_the_law(arm):
+    model = build_model(law(arm, stribeck=0.1, stribeck_speed=0.05))
+    assert model.actuator_user[0].tolist() == [0.1, 0.05, 0.0, 0.0, 0.0, 0.0]
+    assert build_model(arm).nuser_actuator == 0
+
+
+def test_a_zero_turns_the_arm_under_the_same_reading(tmp_path):
+    robot = write_arm(tmp_path / "arm", toml=TOML)
+    turned = robot.with_servos({"shoulder": {"zero": 0.3}})
+    places = []
+    for r, angle in ((robot, 0.3), (turned, 0.0)):
+        model = build_model(r)
+        data = mujoco.MjData(model)
+        data.qpos[:] = [angle, 0.0]
+        mujoco.mj_forward(model, data)
+        places.append(data.body("fore").xpos.copy())
+    np.testing.assert_allclose(*places, atol=1e-12)
