@@ -30,7 +30,7 @@ test: setup
 
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
-	$(BIN)/python -m pytest -m faults
+	$(BIN)/python -m pytest -m faults -rP
 
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup

@@ -19,7 +19,7 @@ from deploy.robot_process import RobotProcess
 from gaponet.deploy.controller import Controller
 from gaponet.deploy.driver import DriverError
 from gaponet.deploy.drivers.unitree import UnitreeDriver
-from gaponet.deploy.phases import ControlConfig
+from gaponet.deploy.phases import ControlConfig, Phase
 from gaponet.deploy.recording import Recording
 from gaponet.deploy.safety import Limits, SafetyConfig
 from gaponet.errors import UsageError
@@ -51,13 +51,20 @@ def swing(k: int) -> np.ndarray:
 def run(at_fault, robot: RobotSpec = ROBOT, domain: int = DOMAIN) -> Recording:
     """Swing; do something in period AT; give up long after."""
 
+    injected = [0.0]
+
     def policy(k, state):
         if k == AT:
+            injected[0] = time.monotonic()
             at_fault()
         return swing(k) if k < AT + 30 else None
 
     driver = UnitreeDriver(robot, domain=domain)
-    return Controller(driver, robot, SLOW, SAFETY, guard=False).run(policy)
+    recording = Controller(driver, robot, SLOW, SAFETY, guard=False).run(policy)
+    damped = next((e.time for e in recording.events if e.phase == Phase.DAMP), float("nan"))
+    kind = recording.fault.kind if recording.fault else "none"
+    print(f"{kind}: damped {1e3 * (damped - injected[0]):.0f} ms after the fault, live, {SLOW.rate:g} Hz")
+    return recording
 
 
 def judge(recording: Recording, heard: dict[str, list]) -> None:
