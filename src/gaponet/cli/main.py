@@ -26,7 +26,7 @@ TASKS = {
         "doctor": "gaponet.cli.logs:doctor",
         "data": "gaponet.cli.data:data",
         "collect": "gaponet.cli.collect:collect",
-        "robot": "gaponet.cli.robot:robot",
+        "robot": "gaponet.cli.robots.robot:robot",
     },
     "The gap": {
         "pair": "gaponet.cli.gap:pair",
@@ -43,14 +43,14 @@ TASKS = {
     "Is it closed?": {
         "eval": "gaponet.cli.train:evaluate",
         "report": "gaponet.cli.train:report",
-        "runs": "gaponet.cli.runs:runs",
-        "compare": "gaponet.cli.compare:compare",
-        "experiment": "gaponet.cli.experiment:experiment",
+        "runs": "gaponet.cli.studies.runs:runs",
+        "compare": "gaponet.cli.studies.compare:compare",
+        "experiment": "gaponet.cli.studies.experiment:experiment",
     },
     "On a robot, real or virtual": {
-        "run": "gaponet.cli.run:run",
-        "record": "gaponet.cli.record:record",
-        "virtual": "gaponet.cli.virtual:virtual",
+        "run": "gaponet.cli.robots.run:run",
+        "record": "gaponet.cli.robots.record:record",
+        "virtual": "gaponet.cli.robots.virtual:virtual",
     },
     "Try it, time it": {
         "demo": "gaponet.cli.demo:demo",

@@ -41,9 +41,7 @@ def view(
     robot: str | None = None,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
-    """Watch one recording: target, nominal simulator, simulator with a model, and the robot, side by side.
-
-    A window opens where there is a display; --render and --web need none.
+    """Watch one recording: target, simulator without and with a model, robot. --render, --web need no display.
 
     Args:
         dataset: Dataset folder.

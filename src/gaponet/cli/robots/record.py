@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from gaponet.cli.out import Out, writes
-from gaponet.cli.run import Asked, Request, asked_robot, perform, tracking
+from gaponet.cli.robots.run import Asked, Request, asked_robot, perform, tracking
 from gaponet.errors import DatasetError, UsageError
 
 

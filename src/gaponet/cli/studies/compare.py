@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from gaponet.cli.experiment import Shared, carry_out
 from gaponet.cli.out import writes
+from gaponet.cli.studies.experiment import Shared, carry_out
 from gaponet.data.store import open_dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar
