@@ -106,7 +106,20 @@ def cases(given: Path) -> dict[str, Case]:
         return ["train", data, "--out", str(out), "--budget", "4000", *resume, *TRAIN]
 
     def experiment(out: Path) -> list[str]:
-        return ["experiment", "data", data, str(out), "--quick", "--models", "mlp", "--seeds", "1", "--shares", "1.0"]
+        return [
+            "experiment",
+            "data",
+            data,
+            "--out",
+            str(out),
+            "--quick",
+            "--models",
+            "mlp",
+            "--seeds",
+            "1",
+            "--shares",
+            "1.0",
+        ]
 
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),

@@ -26,7 +26,8 @@ def dataset_robot(folder):
 
 
 def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, capsys):
-    words = ["experiment", "data", str(place / "data"), str(place / "out"), "--robot", str(place / "arm"), "--models",
+    words = ["experiment", "data", str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm"),
+             "--models",
              "mlp", "--shares", "0.5", "1", *TRAIN, "--json"]  # fmt: skip
     assert main(words) == 0
     captured = capsys.readouterr()
@@ -47,7 +48,7 @@ def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, 
 
 
 def test_what_cannot_be_asked_of_a_dataset_is_one_line(place, capsys):
-    where = [str(place / "data"), str(place / "out"), "--robot", str(place / "arm")]
+    where = [str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm")]
     assert main(["experiment", "unit", *where]) == 2
     assert "leaving one out needs recordings of two or more" in capsys.readouterr().err
     assert main(["experiment", "payload", *where]) == 2

@@ -87,7 +87,7 @@ def _command(kind: type[Any]) -> Any:
         _ask(kind, dataset, out, question, options)
 
     place = tyro.conf.Positional[Path]
-    ask.__annotations__ = {"dataset": place, "out": place, "question": Annotated[kind, FLAT], "options": Shared}
+    ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
     trained_on = " that the models were trained on" if kind in PLAYED else ""
     ask.__doc__ = "\n    ".join((
         f"{inspect.getdoc(kind)}\n\nArgs:", f"dataset: Dataset folder{trained_on}.",
