@@ -82,11 +82,13 @@ class TrackingEnv(gymnasium.Env):
 class AlignedActions(gymnasium.Wrapper):
     """Any gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad: aligned."""
 
-    def __init__(self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "") -> None:
+    def __init__(
+        self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "", extrapolate: bool = False
+    ) -> None:
         """Refuses other gains, joints, rates or payloads, as deploy.mujoco_loop does."""
         super().__init__(env)
         scene: Any = env.unwrapped
-        self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix)
+        self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)
 
     def reset(self, **how: Any) -> tuple[Any, dict[str, Any]]:
         """Another episode."""

@@ -232,7 +232,7 @@ class GapModel:
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""
-        from gaponet.sim.model import model_hash, text_hash
+        from gaponet.sim.model import model_hash
 
         card = self.card
         if card["robot"] != robot.name or tuple(card["joint_names"]) != robot.operated:
@@ -240,12 +240,12 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        old = "simulator" not in card
-        trained, asked = (card["simulator_hash"], text_hash(robot)) if old else (card["simulator"], model_hash(robot))
+        trained, asked = card.get("simulator") or card["simulator_hash"], model_hash(robot)
         if trained != asked:
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
-                "(MJCF, gains or limits differ); use the robot folder that the run keeps, or train again"
+                "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
+                "keeps, or train again"
             )
         if dt is not None:
             self.require_rate(dt)

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.errors import RobotError, UsageError
 from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
-from gaponet.robot import IDENTIFIED, LAW, RobotSpec
+from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.table import add_table, soften_table
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
@@ -143,20 +143,6 @@ def model_hash(robot: RobotSpec) -> str:
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
         object.__setattr__(robot, "_model_hash", digest)
     return str(vars(robot)["_model_hash"])
-
-
-def text_hash(robot: RobotSpec) -> str:
-    """What model_hash was until November 2026, for cards written before: the MJCF's text, gains and limits."""
-    digest = hashlib.sha256()
-    digest.update(robot.mjcf.read_bytes())
-    for part in (robot.kp, robot.kd, robot.effort_limit):
-        digest.update(np.ascontiguousarray(part, np.float64).tobytes())
-    servos = [np.ascontiguousarray(getattr(robot, field), np.float64) for field in IDENTIFIED]
-    if any(np.nan_to_num(s).any() for s in servos):
-        digest.update(b"".join(s.tobytes() for s in servos))
-    stiff = (STIFF_SOLREF, STIFF_SOLIMP, STIFF_MOBILITY, TOLERANCE)
-    digest.update(repr((robot.joint_names, robot.decimation, *stiff)).encode())
-    return digest.hexdigest()[:12]
 
 
 def _read(robot: RobotSpec) -> mujoco.MjSpec:

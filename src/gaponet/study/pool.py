@@ -28,7 +28,7 @@ from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.files import write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
-from gaponet.sim.model import model_hash, text_hash
+from gaponet.sim.model import model_hash
 from gaponet.study.variant import Variant
 from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig
@@ -107,8 +107,6 @@ def plan(
         if not file.is_file():
             raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
         kept = read_kept(file)
-        if kept.get("simulator") == text_hash(cell.robot):  # set up before November 2026
-            kept["simulator"] = wanted["simulator"]
         kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig()))))
         if kept != wanted:
             changed = ", ".join(k for k in wanted if kept.get(k) != wanted[k])
