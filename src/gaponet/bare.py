@@ -19,7 +19,6 @@ from gaponet.errors import RobotError
 from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
 
-Array = np.ndarray
 Places = dict[str, Iterator[int]]  # tag → number of the next one in the model
 
 DROPPED = ("actuator", "sensor", "keyframe", "asset", "visual", "statistic", "custom", "size")

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-Array = np.ndarray
+from gaponet.arrays import Array
 
 ODD = 1.0471975511965976
 LENGTH, MASS, INERTIA, HULL = 1e-7 * ODD, 1e-7 * ODD, 1e-11 * ODD, 1e-4 * ODD  # m, kg, kg·m², m of a mesh that touches

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz

@@ -16,12 +16,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import JointMismatchError, RobotError
 
 if TYPE_CHECKING:
     from gaponet.robot_table import RobotTable
-
-Array = np.ndarray
 
 BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
 from gaponet.model.backends import Backend
-
-Array = np.ndarray
 
 BATCH = 4096
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OPENBLAS", "OMP", "MKL")}

@@ -27,7 +27,6 @@ from gaponet.sim.replay import idle_limbs, replay
 from gaponet.training.config import RewardConfig, TrainConfig, fast
 from gaponet.training.env import DeltaEnv
 
-Array = np.ndarray
 Turn = Callable[[], object]
 Speeds = dict[str, dict[str, float]]
 Others = Callable[[DeltaEnv, TrainConfig], dict[str, tuple[Turn, int]]]  # name → a turn, its control steps

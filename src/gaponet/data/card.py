@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from gaponet import __version__
+from gaponet.arrays import Array
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
@@ -17,7 +18,6 @@ from gaponet.errors import DatasetError
 from gaponet.files import write_text
 from gaponet.structure import read_json
 
-Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 
 QUANTILE_ROWS = 100_000  # so many rows, evenly spread over the set, give the 1 % and 99 % quantiles

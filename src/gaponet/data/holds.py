@@ -12,9 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-
-Array = np.ndarray
 
 WINDOW_S = 0.5  # this long must command and state be still
 CTRL_STILL = 1e-3  # range of the command in the window, rad

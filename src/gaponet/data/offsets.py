@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypedDict
 
+from gaponet.arrays import Array
 from gaponet.data.holds import Holds, StaticError, find_holds, join, static_error
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
@@ -31,7 +32,6 @@ from gaponet.files import write_text
 from gaponet.robot import RobotSpec
 from gaponet.structure import Json, read_json
 
-Array = np.ndarray
 Condition = tuple[float, str]  # payload_mass kg, payload_side
 Gravity = Callable[
     [Array, float, str], Array

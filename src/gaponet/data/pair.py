@@ -7,12 +7,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import DatasetError, UsageError
-
-Array = np.ndarray
 
 
 @dataclass(frozen=True)

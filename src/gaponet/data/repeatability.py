@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-
-Array = np.ndarray
 
 SAME_COMMAND = 1e-3  # rad; repetitions whose commands differ by more somewhere were not asked for the same thing
 MOVED = 0.02  # rad; joints commanded to move by less say nothing

@@ -10,13 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Interval
 
+from gaponet.arrays import Array
 from gaponet.data.log import Log
 from gaponet.data.signals import differentiate, resample_linear, resample_zoh
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 from gaponet.structure import Json
-
-Array = np.ndarray
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-Array = np.ndarray
+from gaponet.arrays import Array
 
 FAST = 0.3  # rad/s of fast_speed from which a lag is mostly delay; below, it is mostly stiction
 

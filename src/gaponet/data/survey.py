@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.holds import Holds, find_holds
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import FAST, differentiate, estimate_delay, fast_speed
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 MAX_LAG_S = 0.4
 BLOCKED_ERROR = 0.15  # standing this far from a command, rad; a loaded joint may, so the command must also move

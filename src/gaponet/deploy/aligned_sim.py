@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
-
-Array = np.ndarray
 
 
 class AlignedSim:

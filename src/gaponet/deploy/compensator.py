@@ -23,6 +23,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
 from gaponet.errors import ModelError, UsageError
@@ -31,8 +32,6 @@ from gaponet.model.calibration import Calibration
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import idle_joints
-
-Array = np.ndarray
 
 INVERSE = "inverse"  # folder of the learned inverse beside the model (training/learned_inverse.py)
 SETTLE = 100  # control periods in which the shadow comes to rest at a start

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.clock import Clock, MonotonicClock, uncollected
 from gaponet.deploy.driver import Driver, DriverError, Fault, State
 from gaponet.deploy.guard import Guard
@@ -29,7 +30,6 @@ from gaponet.motion.minjerk import blend, move_time
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
 
-Array = np.ndarray
 Policy = Callable[[int, State], Array | None]  # period since the start of the run, state → targets (n) rad; None: end
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-import numpy as np
-
+from gaponet.arrays import Array
 from gaponet.errors import GAPONetError
 
-Array = np.ndarray
 End = Literal["hand_over", "hold", "damp"]
 
 

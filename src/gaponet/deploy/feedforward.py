@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
-
-Array = np.ndarray
 
 SPEED, ACCELERATION = 4.0, 40.0  # rad/s, rad/s²: as far as targets are believed; a step of theirs asks for more
 FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; none where nothing moves

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.errors import UsageError, missing_extra
@@ -19,8 +20,6 @@ try:
     import gymnasium
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(missing_extra(error) or str(error), name=error.name) from None
-
-Array = np.ndarray
 
 
 class TrackingEnv(gymnasium.Env):

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
 
 if TYPE_CHECKING:
     import mujoco
-
-Array = np.ndarray
 
 GAIN_TOLERANCE = 1e-3  # of kp and kd
 

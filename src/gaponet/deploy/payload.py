@@ -5,10 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
-
-Array = np.ndarray
 
 MEMORY = 1.0  # s: time constant of forgetting
 RATE = 1.0  # kg/s: a payload that appears at once is believed over this time, so that commands do not jump

@@ -10,12 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.log import Channel, Log
 from gaponet.deploy.driver import State
 from gaponet.errors import LogError
 from gaponet.files import whole, write_text, writing
-
-Array = np.ndarray
 
 
 class Event(NamedTuple):

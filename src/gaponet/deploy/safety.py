@@ -22,11 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import Fault, State
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 ROUNDING = 1e-9  # of a bound: kept free so that a limit computed back from a command is not passed by rounding
 

@@ -26,8 +26,6 @@ from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
-Array = np.ndarray
-
 
 def gap_budget(
     run: Path,

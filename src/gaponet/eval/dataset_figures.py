@@ -9,12 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
 from gaponet.plot.methods import COLOURS
 from gaponet.plot.style import figure, joint_label, legend, styled
-
-Array = np.ndarray
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
 LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True))

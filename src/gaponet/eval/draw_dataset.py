@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from gaponet.arrays import Array
 from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
@@ -22,7 +23,6 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.pairing import pair_dataset
 
-Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # figures done, total, what is done now
 
 RANGE_SEQUENCES, RANGE_ROWS = 400, 40_000  # most read for joint ranges, and rows kept of each joint

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.json_file import write_json
 from gaponet.data.pair import Twin
 from gaponet.data.repeatability import MOVED
@@ -32,7 +33,6 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 from gaponet.structure import read_json
 
-Array = np.ndarray
 SHOWN = 8  # sequences whose trajectories are kept for the report
 LEARNED = ("inverse", "mlp", "transformer", "fno", "gaponet")  # kinds of model
 ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures

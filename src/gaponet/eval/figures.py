@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from gaponet.arrays import Array
 from gaponet.data.repeatability import MOVED
 from gaponet.plot.charts import Course, Once, against, bars, lines
 from gaponet.plot.methods import COLOURS, colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
-
-Array = np.ndarray
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError, UsageError
@@ -23,7 +24,6 @@ from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
 
-Array = np.ndarray
 Tell = Callable[[str, float, float], None]
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN = 3  # motions shown without a click

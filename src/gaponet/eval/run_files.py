@@ -9,10 +9,10 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.structure import Count, Json, Number, parse_json, read_json, read_npz
 
-Array = np.ndarray
 MEND = "give a complete run folder of gaponet train, or evaluate again"
 Method = Literal[
     "nominal", "delay_offset", "identified", "inverse", "mlp", "transformer", "fno", "gaponet", "calibrated"

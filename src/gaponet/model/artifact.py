@@ -15,6 +15,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError, UsageError
 from gaponet.model import fused
@@ -24,8 +25,6 @@ from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
 from gaponet.structure import Json, Name, Number, read_format, read_json, validated
-
-Array = np.ndarray
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
 RECORDED_TOLERANCE = 0.02  # relative, of gains

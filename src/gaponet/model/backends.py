@@ -10,10 +10,10 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.model.fused import FusedForward, read_weights
 
-Array = np.ndarray
 ROWS, ROWS_SHARED = 64, 256  # of a batch at once, by one thread and by several: what lies between layers stays in cache
 Backend = Literal["onnxruntime", "numpy"]
 

@@ -6,13 +6,12 @@ from collections.abc import Sequence as ListOf
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.model.backends import Network
 from gaponet.model.config import ModelConfig
 from gaponet.model.loop import Ask, DeltaLoop, Infer
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 
 class DeltaCorrector:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.files import whole, writing
 from gaponet.model import fused
@@ -19,8 +20,6 @@ from gaponet.model.backends import OnnxNetwork
 from gaponet.model.deeponet import build_network
 from gaponet.model.fuse import FusedNet, fuse
 from gaponet.model.layers import DeltaNet
-
-Array = np.ndarray
 
 PARITY = 1e-5  # rad
 

@@ -7,11 +7,10 @@ import torch
 from scipy.linalg import block_diag
 from torch import Tensor, nn
 
+from gaponet.arrays import Array
 from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.deeponet import OperatorNet
 from gaponet.model.fused import CLAMP, JOINT_WISE, PARTS, Layers
-
-Array = np.ndarray
 
 
 def fuse(net: nn.Module) -> dict[str, Array] | None:

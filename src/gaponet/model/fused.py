@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.structure import read_npz
 
-Array = np.ndarray
 Layers = list[tuple[Array, Array]]  # weight (in, out), bias (out)
 
 FILE = "weights.npz"

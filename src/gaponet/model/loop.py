@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.backends import Bound, Network
 from gaponet.model.config import ModelConfig
 from gaponet.model.observation import History, Layout, zeros_like
 
-Array = np.ndarray
 Infer = Callable[[Array], Array]  # x (B, dim) float32 → Δa (B, n) rad, or offsets (B, m, n) rad
 Ask = Callable[[Array, Array | None], Array]  # environments (k,), offsets (k, m, n) rad → answers (k, m, 2n)
 

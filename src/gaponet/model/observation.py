@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.model.config import ModelConfig
-
-Array = np.ndarray
 
 
 class Layout:

@@ -10,11 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-
-Array = np.ndarray
 
 
 def probe_offsets(config: ModelConfig, n: int) -> Array:

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.motion.feasible import Feasibility
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 ROLES = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll")
 

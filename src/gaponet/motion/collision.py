@@ -15,11 +15,10 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.arrays import Array
 from gaponet.errors import RobotError
 from gaponet.robot import RobotSpec
 from gaponet.structure import read_toml
-
-Array = np.ndarray
 
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 Point = tuple[Metres, Metres, Metres]

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.motion.minjerk import fade, move_time, through
 
-Array = np.ndarray
 Signal = Callable[[float, float, np.random.Generator, float], Array]  # (low, high, rng, dt) → (T,) rad
 
 

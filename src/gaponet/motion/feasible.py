@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.motion.collision import CLEARANCE, Collision
 from gaponet.motion.motion import GRID, Motion
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model
-
-Array = np.ndarray
 
 MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
 MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)

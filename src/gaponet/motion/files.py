@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.formats import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.errors import LogError
 from gaponet.files import whole, write_text
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
 LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz

@@ -15,8 +15,6 @@ from gaponet.motion.upper_body import BUILDERS, Kit
 from gaponet.motion.whole_body import WHOLE_BODY, available
 from gaponet.robot import RobotSpec
 
-Array = np.ndarray
-
 
 class Library:
     """Makes motions of one robot by name, and remembers what is costly to find."""

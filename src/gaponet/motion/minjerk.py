@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-Array = np.ndarray
+from gaponet.arrays import Array
 
 PEAK_SPEED = 1.875  # of a minimum-jerk move, over its mean speed
 

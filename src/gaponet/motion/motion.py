@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import LEVELS
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 GRID = 0.01  # s: motions are made at 100 Hz; 50 Hz plays every second row
 

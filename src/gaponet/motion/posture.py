@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.motion.collision import CLEARANCE
 from gaponet.motion.feasible import Feasibility
 from gaponet.sim.dynamics import static_torque
-
-Array = np.ndarray
 
 POINTS = 41  # across the range
 CANDIDATES = 400

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.motion.arm import Arm, HandIK, arms
 from gaponet.motion.feasible import Feasibility
 from gaponet.motion.minjerk import fade, through
 from gaponet.motion.motion import GRID
 
-Array = np.ndarray
 Sides = tuple[str, ...]
 
 # Elbows bent, hands in front of the belly: the posture from which people start; (ROLES), rad, left arm.

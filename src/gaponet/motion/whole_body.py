@@ -9,11 +9,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.motion.minjerk import fade, through
 from gaponet.motion.motion import GRID
 from gaponet.motion.upper_body import Kit
-
-Array = np.ndarray
 
 DURATION = 8.0  # s
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.plot.methods import COLOURS
 from gaponet.plot.style import DASHED, DOTTED, figure, legend, styled
 
@@ -33,8 +34,6 @@ class Once:
     mean: float
     std: float = math.nan
 
-
-Array = np.ndarray
 
 Bars = Mapping[str, tuple[str, ListOf[Interval]]]  # label → colour, value of each group
 Dot = tuple[str, str, Interval, bool]  # group, name, value, whether it is the default

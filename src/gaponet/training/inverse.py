@@ -14,13 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
 from gaponet.sim.model import build_model
-
-Array = np.ndarray
 
 FRICTION_SPEED = 0.02  # rad/s: below it, recorded motion is as good as rest
 

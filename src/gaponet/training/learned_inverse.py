@@ -12,14 +12,13 @@ from dataclasses import asdict, replace
 import numpy as np
 import torch
 
+from gaponet.arrays import Array
 from gaponet.deploy.compensator import INVERSE, Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
 from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 HIDDEN = (256, 128)
 CONVERGED = CompensatorConfig(iterations=8, feedback=0.0, blend=0.0)  # 0.5⁸ of an error that is small to begin with

@@ -62,8 +62,6 @@ from gaponet.training.ppo import make_runner, trained_by, update
 from gaponet.training.sensor_fit import points_of, torch_infer
 from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
-Array = np.ndarray
-
 VALIDATION_RUNS = 24  # free runs per validation at most, evenly picked
 
 

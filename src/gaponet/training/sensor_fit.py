@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaponet.arrays import Array
 from gaponet.model.layers import DeltaNet
 from gaponet.model.loop import Infer
 from gaponet.model.observation import Layout
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import Condition
-
-Array = np.ndarray
 
 STEPS = 600
 BATCH = 256

@@ -14,13 +14,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.sensor_fit import Asked, Report, explained, fit_predictor, points_of, sensor_labels
-
-Array = np.ndarray
 
 
 def recipe(config: TrainConfig) -> WarmStartConfig:

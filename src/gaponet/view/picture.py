@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.view.gl import CURE
 from gaponet.view.scene import Scene
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
-
-Array = np.ndarray
 
 INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
 DOT = "  ·  "  # Pillow's own font has this, but no ×

@@ -8,12 +8,11 @@ from contextlib import suppress
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.view.gl import choose_gl
-
-Array = np.ndarray
 
 
 def prepare() -> None:

@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import RobotError, UsageError
 from gaponet.motion.collision import Shapes
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
 from gaponet.structure import read_toml
 from gaponet.view.side_by_side import Played, SideBySide
-
-Array = np.ndarray
 
 PAYLOAD = (0.93, 0.60, 0.10, 1.0)
 GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
@@ -19,8 +20,6 @@ from gaponet.plot.methods import colour, title
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
-
-Array = np.ndarray
 
 
 @dataclass(frozen=True)

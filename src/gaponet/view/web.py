@@ -9,11 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.view.film import Clip
 from gaponet.view.scene import Scene
-
-Array = np.ndarray
 
 FRAME = 1 / 30  # s
 HOST = "127.0.0.1"  # nobody else's business; forward the port to look from elsewhere

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
+from gaponet.arrays import Array
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 # ok; note, a fact to know; warning, usable but look first; error, do not train on it before it is mended.
 LEVELS = ("ok", "note", "warning", "error")

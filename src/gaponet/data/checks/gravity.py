@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding
 from gaponet.data.offsets import Condition, Gravity
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
-Array = np.ndarray
 Loads = dict[Condition, tuple[Array, Array]]  # angles and torques, (k, n) each
 
 TURNS = (0.3, 0.6, 1.0, 1.5708, 2.3, 3.1416)  # of a zero, rad, both ways

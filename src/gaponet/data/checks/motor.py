@@ -6,13 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding, names, some
 from gaponet.data.holds import StaticError, join, static_error
 from gaponet.data.signals import FAST
 from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 SAG = 0.02  # static error worth a line, rad
 

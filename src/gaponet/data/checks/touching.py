@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding, some
 from gaponet.data.offsets import Gravity
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 
-Array = np.ndarray
 Heights = Callable[[Sequence], Array]  # lowest tip in every row, m
 
 LOW, HIGH = 0.03, 0.05  # m above the lowest tip of all

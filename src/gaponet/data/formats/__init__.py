@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.log import CHANNELS, DERIVED, Log
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 FORMATS = {
     "sage": "SAGE folder: control.csv and state_motor.csv beside each other",

@@ -20,13 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.formats import refuse_absurd, to_radians
 from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
 from gaponet.data.log import Channel, Log
 from gaponet.errors import JointMismatchError, LogError, UsageError
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 OPTIONS = ("position_unit",)
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")

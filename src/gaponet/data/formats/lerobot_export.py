@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.formats.lerobot_set import FEATURES, LATER, OURS, STATED, VERSION
 from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.data.sequence import Sequence
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-Array = np.ndarray
 Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 Group = tuple[float, tuple[str, ...]]  # dt, channels
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-Array = np.ndarray
+from gaponet.arrays import Array
+
 EpisodeStats = dict[str, dict[str, Array]]  # {feature: {min, max, mean, std (n), count (1)}}
 
 

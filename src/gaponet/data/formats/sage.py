@@ -14,12 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.formats import refuse_absurd, to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
 OPTIONS: tuple[str, ...] = ()

@@ -24,13 +24,12 @@ from pathlib import Path
 import numpy as np
 from typing_extensions import TypedDict
 
+from gaponet.arrays import Array
 from gaponet.data.formats import TABLES, refuse_absurd, to_radians
 from gaponet.data.log import CHANNELS, REQUIRED, Channel, Log
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import LOG_UNITS, RobotSpec
 from gaponet.structure import read_toml
-
-Array = np.ndarray
 
 OPTIONS = ("columns", "position_unit", "time_unit")
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

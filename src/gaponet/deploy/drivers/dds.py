@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import DriverError
 from gaponet.deploy.drivers.hg import HEADER
 
@@ -31,8 +32,6 @@ try:
     from cyclonedds.topic import Topic
 except ImportError:
     raise DriverError("cyclonedds is not installed; run: pip install 'gaponet[dds]'") from None
-
-Array = np.ndarray
 
 QUEUE = 64  # messages kept for us between two reads: 128 ms at 500 Hz
 

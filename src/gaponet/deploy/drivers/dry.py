@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import Driver, State
 from gaponet.deploy.recording import Recording
-
-Array = np.ndarray
 
 
 class DryRun:

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-Array = np.ndarray
+from gaponet.arrays import Array
+
 Fields = list[tuple[str, Any, int]]  # name, scalar type or Fields, count
 
 MOTORS = 35  # slots in a message; H1-2 uses 27

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import DriverError, End, Fault, State
 from gaponet.deploy.drivers import feetech as reg
 from gaponet.deploy.drivers.so101_calibration import SPEAK, STEP, ServoRow, numbered, read_calibration, settle
@@ -34,8 +35,6 @@ else:
 
 if TYPE_CHECKING:
     from serial import Serial
-
-Array = np.ndarray
 
 STALL_CURRENT = 2.7 / 0.0065  # steps: 2.7 A at 12 V (Feetech's data sheet of the STS3215)
 BAUD = 1_000_000

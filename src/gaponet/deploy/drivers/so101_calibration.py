@@ -9,12 +9,11 @@ from typing import Annotated
 import annotated_types as at
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import DriverError
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.structure import read_json
-
-Array = np.ndarray
 
 STEPS = 4096  # of an encoder, a turn
 STEP = 2 * np.pi / STEPS  # rad

@@ -22,8 +22,6 @@ from gaponet.deploy.drivers.virtual import LiveUnit
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
-Array = np.ndarray
-
 PERIOD = 0.005  # s between two steps of the physics
 BEHIND = 0.5  # s of arrears that are dropped: an interrupted process does not hurry afterwards
 CATCH_UP = 4  # steps

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.driver import DriverError, End, Fault, State
 from gaponet.deploy.drivers import hg
 from gaponet.deploy.safety import damping
@@ -28,7 +29,6 @@ from gaponet.robot import RobotSpec
 if TYPE_CHECKING:
     from gaponet.deploy.drivers.dds import Bus
 
-Array = np.ndarray
 Topic = Literal["arm_sdk", "lowcmd"]
 Joints = Literal["arms", "upper_body", "all"]
 

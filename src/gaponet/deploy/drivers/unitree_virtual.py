@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.clock import MonotonicClock, uncollected
 from gaponet.deploy.drivers import hg
 from gaponet.deploy.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
@@ -22,7 +23,6 @@ from gaponet.files import whole
 from gaponet.robot import RobotSpec
 from gaponet.virtual.physics import Physics
 
-Array = np.ndarray
 FaultKind = Literal[
     "none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock",
     "encoder", "motor", "remote", "fall", "machine",

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.clock import Clock
 from gaponet.deploy.driver import DriverError, End, State
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.unit import VirtualRobot
-
-Array = np.ndarray
 
 STATE_PERIOD = 0.002  # s: a virtual robot speaks at 500 Hz, as the H1-2 does
 DAMPING = 4.0  # times the robot's kd while damping; see drivers.unitree

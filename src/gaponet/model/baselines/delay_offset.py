@@ -10,13 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Interval
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import ModelError
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import Progress, replay
 from gaponet.structure import Angle, read_json
-
-Array = np.ndarray
 
 MAX_DELAY = 0.16  # s, in steps of the control period
 PIECE = 20.0  # s, free run per fitting piece

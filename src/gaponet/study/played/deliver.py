@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
@@ -19,8 +20,6 @@ from gaponet.study.played.play import Driven, Played, compensations, of_seed, pl
 from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
 from gaponet.virtual.physics import Physics
-
-Array = np.ndarray
 
 LAST = 1.0  # s at the end of a hold in which offsets are averaged
 NEAR = 0.01  # m: delivered

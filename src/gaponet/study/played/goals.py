@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.motion.arm import Arm, HandIK
 from gaponet.motion.feasible import Feasibility
@@ -14,8 +15,6 @@ from gaponet.motion.minjerk import move_time, through
 from gaponet.motion.motion import GRID
 from gaponet.motion.upper_body import Kit
 from gaponet.robot import RobotSpec
-
-Array = np.ndarray
 
 STOPS = 2  # goals on one trajectory, held one after the other
 REST = 1.5  # s at the start: time for a compensator to blend in

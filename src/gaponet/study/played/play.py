@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
@@ -16,8 +17,6 @@ from gaponet.sim.model import idle_joints, model_hash
 from gaponet.study.played.trained import Trained
 from gaponet.virtual.physics import Physics
 from gaponet.virtual.unit import VirtualRobot
-
-Array = np.ndarray
 
 PLANNED = CompensatorConfig(dynamics=True)  # targets of planned motions are smooth
 WARMTH = 12.0  # K above ambient at the start: a robot that has been working (virtual/play.py)

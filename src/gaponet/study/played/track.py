@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
@@ -21,8 +22,6 @@ from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
 from gaponet.study.played.unseen import Unseen
 from gaponet.virtual.physics import Physics
-
-Array = np.ndarray
 
 REST = 2.0  # s under the first target before a motion begins: time for a compensator to blend in
 

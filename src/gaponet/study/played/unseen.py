@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import UsageError
@@ -18,8 +19,6 @@ from gaponet.motion.upper_body import BUILDERS
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import idle_joints
 from gaponet.study.played.trained import Trained
-
-Array = np.ndarray
 
 VARIANT = 90  # recipes count from 0: motions of this number are of no recipe
 SEED = 2026  # of the library here; recipes have others
