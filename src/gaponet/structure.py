@@ -23,7 +23,7 @@ from pydantic import AfterValidator, AllowInfNan, ConfigDict, TypeAdapter, Valid
 from pydantic_core import PydanticSerializationError, to_json
 from typing_extensions import TypedDict
 
-from gaponet.errors import GAPONetError
+from gaponet.errors import GAPONetError, UsageError
 
 T = TypeVar("T")
 LARGEST = 64 << 20  # bytes of a document that is read at once; ours have kilobytes
@@ -115,6 +115,26 @@ def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = 
     except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
         raise error(_line(path, f"not valid TOML: {found}", hint)) from None
     return validated(kind, table, path, error, hint, more)
+
+
+def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, dict[str, Any]]:
+    """Path and table of folder/NAME.toml, which the package ships, or of the file at a path.
+
+    Args:
+        kind: What it is, for messages: "recipe".
+        folder: Where the package keeps them.
+        name_or_path: Name without ".toml", or a path.
+
+    Raises:
+        UsageError: No such file, or not TOML.
+    """
+    path = folder / f"{name_or_path}.toml"
+    if not path.is_file():
+        path = Path(name_or_path)
+    if not path.is_file():
+        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+        raise UsageError(f"no {kind} '{name_or_path}': in the package are {known}; or give a .toml file")
+    return path, read_toml(dict[str, Any], path, UsageError)
 
 
 def read_npz(path: Path, error: type[GAPONetError], hint: str = "") -> dict[str, np.ndarray]:

@@ -11,8 +11,7 @@ from typing import Annotated
 from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
-from gaponet.packaged import load_toml
-from gaponet.structure import validated
+from gaponet.structure import load_toml, validated
 
 RECIPES = Path(__file__).parent / "recipes"
 MOST_TAKES = 1_000_000

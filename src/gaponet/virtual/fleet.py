@@ -18,9 +18,8 @@ from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
 from gaponet.errors import UsageError
-from gaponet.packaged import load_toml
 from gaponet.robot import RobotSpec
-from gaponet.structure import Extended, Name, validated
+from gaponet.structure import Extended, Name, load_toml, validated
 from gaponet.virtual.physics import Physics
 
 Array = np.ndarray
