@@ -172,12 +172,13 @@ def identify(
     robot: RobotSpec | Place | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
-    mixed_gains: bool = False,
     terms: tuple[str, ...] = ("stribeck", "load"),
     table: bool = True,
     threads: int = 0,
 ) -> Identification:
     """Fit the servos of the simulator, and what the robot touches, to the training motions.
+
+    Recordings made with several gains are fitted together, each in a simulator of its own gains.
 
     Args:
         dataset: Recordings.
@@ -186,15 +187,13 @@ def identify(
         robot: Where to start, if not from the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
-        mixed_gains: Take recordings made with different kp or kd together.
         terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
         table: Look for a table under the robot's tips; kept in the same way.
         threads: For the table, 0 for all cores.
 
     Raises:
-        DatasetError, UsageError: A unit is not there, or gains differ.
+        DatasetError, UsageError: A unit is not there.
     """
-    from gaponet.data.sequence import require_same_gains
     from gaponet.data.split import split_entries
     from gaponet.files import writing
     from gaponet.robot_folder import save_robot
@@ -207,8 +206,6 @@ def identify(
     if set(units) - held:
         raise UsageError(f"--units {min(set(units) - held)}: not in {data.path}")
     parts = split_entries(data, tuple(sorted((held - set(units) if units else set()) | set(holdout_units))))
-    if not mixed_gains:
-        require_same_gains((e.meta for e in parts["train"]), data.joint_names, spec.operated)
     began, val = time.monotonic(), data.sequences(parts["val"])
     with writing(Path(out), "robot"), bar("identifying") as update:
         found = fit(data.sequences(parts["train"]), spec, val, windows, terms, table, threads, update)

@@ -28,6 +28,7 @@ STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 IDENTIFIED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
+GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
 
 
@@ -170,6 +171,20 @@ class RobotSpec:
             for name, value in values.items():
                 changed[name][self.index([joint])[0]] = value
         return dataclasses.replace(self, **changed, nominal=self.nominal or self)
+
+    def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
+        """The same robot with its servos set to other gains, (n) N·m/rad and N·m·s/rad; None leaves them as they are.
+
+        The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp.
+        """
+        nominal = self.nominal or self
+        known = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
+        if np.allclose(known, (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
+            return self
+        ratio = np.divide(known[0], nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
+        nominal = dataclasses.replace(nominal, kp=known[0], kd=known[1])
+        own = self.nominal and nominal
+        return dataclasses.replace(self, kp=self.kp * ratio, kd=known[1], nominal=own)
 
     @functools.cached_property
     def qpos_range(self) -> Array:

@@ -1,5 +1,7 @@
 """Twins: free runs under recorded commands."""
 
+from dataclasses import replace
+
 import numpy as np
 from arm import commands, record, recordings, write_arm
 
@@ -30,6 +32,30 @@ def test_sequences_of_any_length_and_payload_run_side_by_side(tmp_path):
         alone = replay([sequence], robot)[0]
         np.testing.assert_array_equal(twin.qpos, alone.qpos)
         assert twin.qpos.shape == sequence.qpos.shape
+
+
+def test_each_recording_runs_at_its_own_gains(tmp_path):
+    robot = write_arm(tmp_path)
+    ctrl = np.round(commands(60, 1) * 256) / 256
+    sequences = []
+    for kp, kd in ((8.0, 0.0), (20.0, 0.0), (40.0, 1.0)):
+        told = {"kp": (kp, kp), "kd": (kd, kd)}
+        made = record(robot.with_gains(*told.values()), ctrl, f"at {kp}")
+        sequences.append(replace(made, meta=replace(made.meta, **told)))
+    for sequence, twin in zip(sequences, replay(sequences, robot), strict=True):
+        np.testing.assert_array_equal(sequence.qpos, twin.qpos)
+    soft = sequences[0]
+    untold = replace(soft, meta=replace(soft.meta, notes={"gains": "of robot.toml"}))
+    assert np.abs(replay([untold], robot)[0].qpos - soft.qpos).max() > 0.01
+
+
+def test_an_identified_gain_goes_with_the_recorded_one(tmp_path):
+    robot = write_arm(tmp_path)
+    found = robot.with_servos({"elbow": {"kp": 16.0}})
+    set_to = found.with_gains((10.0, 10.0), None)
+    np.testing.assert_allclose(set_to.kp, [10.0, 8.0])
+    np.testing.assert_allclose(set_to.nominal.kp, 10.0)
+    assert found.with_gains((20.0, 20.001), (0.0, 0.0)) is found
 
 
 def test_the_recording_after_the_first_row_is_not_looked_at(tmp_path):

@@ -265,3 +265,11 @@ def test_recordings_with_two_stiffnesses_are_mixed_only_when_told(robot, tmp_pat
     with pytest.raises(UsageError, match="--mixed-gains"):
         Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
     Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
+
+
+def test_gains_other_than_the_robots_are_named(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for sequence in recordings(robot, 8):
+        data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0, 5.0), kd=(0.1, 0.1))))
+    with pytest.raises(UsageError, match=r"kp \(5.0, 5.0\) .*robot.toml says others"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)

@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
 
@@ -28,7 +28,7 @@ def bench_aligned(
         rounds: Turns each.
     """
     locked = idle_joints(robot, robot.operated)
-    nominal = BatchSim(robot, [(0.0, "both", robot.dt)] * num_envs, 0, locked)
+    nominal = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 0, locked)
     aligned = AlignedSim(robot, model, 0.0, num_envs=num_envs, locked=locked)
     rng = np.random.default_rng(0)
     phase = rng.uniform(0, 2 * np.pi, (num_envs, nominal.n))

@@ -145,7 +145,7 @@ def _bare_loop(robot: RobotSpec, num_envs: int, steps: int, nthread: int = 0) ->
     """The same simulations without anything around them."""
     motions = [wander(robot, steps + 1, seed) for seed in range(num_envs)]
     locked = idle_limbs(motions, robot)
-    condition: Condition = (0.0, "both", robot.dt)
+    condition = Condition(0.0, "both", robot.dt)
     sim = BatchSim(robot, [condition] * num_envs, nthread, locked)
     ctrl = np.stack([m.ctrl for m in motions], axis=1).astype(float)[..., robot.index(sim.joint_names)]
     zero = np.zeros_like(ctrl[0])

@@ -48,7 +48,6 @@ def identify(
     robot: str | None = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
-    mixed_gains: tyro.conf.FlagCreatePairsOff[bool] = False,
     json: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
@@ -65,11 +64,10 @@ def identify(
         robot: Robot name or folder to start from, if not the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in gaponet train.
-        mixed_gains: Take recordings made with different kp or kd together.
         json: One JSON object on stdout.
     """
     screen = Out(json)
-    made = api.identify(dataset, out, windows, robot, units, holdout_units, mixed_gains, terms, table, threads)
+    made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, threads)
     found = made.found
     _tell(screen, found, made.val)
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")

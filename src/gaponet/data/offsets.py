@@ -33,6 +33,7 @@ from gaponet.robot import RobotSpec
 from gaponet.structure import Json, read_json
 
 Condition = tuple[float, str]  # payload_mass kg, payload_side
+Setting = tuple[float, str, tuple[float, ...] | None]  # the same, and kp while recording where it is known
 Gravity = Callable[
     [Array, float, str], Array
 ]  # qpos (k, n) rad, payload_mass, payload_side → holding torque (k, n) N·m
@@ -101,17 +102,17 @@ def fit_unit(
 ) -> UnitOffsets:
     """Fit the offsets of one unit from all its sequences; those whose rests are known, by hash, are not read again."""
     known = known or {}
-    found: dict[Condition, list[Holds]] = {}
+    found: dict[Setting, list[Holds]] = {}
     for entry in dataset.entries:
         if entry.meta.unit_id == unit_id:
-            key = (entry.meta.payload_mass, entry.meta.payload_side)
+            key = (entry.meta.payload_mass, entry.meta.payload_side, entry.meta.known_gains[0])
             rests = known.get(entry.hash) or find_holds(dataset.read(entry), robot.operated_index)
             found.setdefault(key, []).append(rests)
     n = len(robot.joint_names)
     return fit_offsets({key: join(parts, n) for key, parts in found.items()}, robot, gravity)
 
 
-def fit_offsets(holds: dict[Condition, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
+def fit_offsets(holds: dict[Setting, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
     """Fit the offsets of the operated joints.
 
     Args:
@@ -155,9 +156,10 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     return {**read_json(OffsetsFile, file, DatasetError, hint, more=True)}
 
 
-def _nominal_sag(qpos: Array, condition: Condition, robot: RobotSpec, gravity: Gravity) -> Array:
+def _nominal_sag(qpos: Array, setting: Setting, robot: RobotSpec, gravity: Gravity) -> Array:
     """Static error of the nominal model, (k, n) rad; 0 for a joint without gain."""
-    return -gravity(qpos, *condition) / np.where(robot.kp > 0, robot.kp, np.inf)
+    kp = robot.with_gains(setting[2], None).kp
+    return -gravity(qpos, *setting[:2]) / np.where(kp > 0, kp, np.inf)
 
 
 def _without_zero(error: StaticError, beyond: StaticError) -> JointOffset:
@@ -183,7 +185,7 @@ def _rests(holds: Holds, robot: RobotSpec, most: int) -> _Rests:
 
 
 def _fit_zeros(
-    rests: dict[Condition, _Rests], robot: RobotSpec, gravity: Gravity
+    rests: dict[Setting, _Rests], robot: RobotSpec, gravity: Gravity
 ) -> tuple[dict[str, dict[str, Any]], float]:
     """Zero offsets by joint as fields of JointOffset, and kp_real / kp."""
     fixed, cov = _least_squares(rests, robot, gravity, free_stiffness=False)
@@ -210,7 +212,7 @@ def _fit_zeros(
 
 
 def _least_squares(
-    rests: dict[Condition, _Rests], robot: RobotSpec, gravity: Gravity, free_stiffness: bool
+    rests: dict[Setting, _Rests], robot: RobotSpec, gravity: Gravity, free_stiffness: bool
 ) -> tuple[Array, Array]:
     """Parameters [z (m), half_band (m), ln stiffness or 0] and their covariance.
 

@@ -14,15 +14,15 @@ from gaponet.arrays import Array
 from gaponet.data.log import Log
 from gaponet.data.signals import differentiate, resample_linear, resample_zoh
 from gaponet.errors import LogError, UsageError
-from gaponet.robot import RobotSpec
+from gaponet.robot import GAIN_TOLERANCE, RobotSpec
 from gaponet.structure import Json
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
-GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SHORTEST, LONGEST = 1e-4, 1.0  # periods, s
 MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
+ASSUMED = "of robot.toml"  # note of gains that the log did not say
 LEVELS = ("joint", "upper_body", "whole_body")
 
 
@@ -62,6 +62,12 @@ class SequenceMeta:
             raise LogError(f"{self.source}: unit_id and motion must be named")
         if self.level not in LEVELS:
             raise LogError(f"{self.source}: level '{self.level}' is not one of {', '.join(LEVELS)}")
+
+    @property
+    def known_gains(self) -> tuple[tuple[float, ...] | None, tuple[float, ...] | None]:
+        """kp and kd; None where the log did not say them and those of robot.toml stand for them."""
+        kp, _, kd = str(self.notes.get("gains", "")).removeprefix("kp ").partition(", kd ")
+        return None if kp == ASSUMED else self.kp, None if (kd or kp) == ASSUMED else self.kd
 
 
 @dataclass(frozen=True)
@@ -222,7 +228,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     if converted:
         notes["converted_from"] = converted
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
-    said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else "of robot.toml" for n in gains]
+    said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
 

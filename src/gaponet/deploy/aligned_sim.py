@@ -8,7 +8,7 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 
 
 class AlignedSim:
@@ -54,7 +54,7 @@ class AlignedSim:
         self.robot, self.model, self.single = robot, model, num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
-        conditions = [(float(mass), payload_side, self.dt) for mass in self.payload_mass]
+        conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
         self.sim = BatchSim(robot, conditions, nthread, locked)
         self.joint_names, self.n = self.sim.joint_names, self.sim.n
         free = robot.index(self.joint_names)

@@ -30,7 +30,7 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.model.calibration import Calibration
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
 INVERSE = "inverse"  # folder of the learned inverse beside the model (training/learned_inverse.py)
@@ -127,7 +127,7 @@ class Compensator:
         self.masses = np.linspace(0.0, heaviest, 1 + int(np.ceil(heaviest / payload_step - 1e-9)))
         locked = idle_joints(robot, robot.operated)
         # The last rows never move: they hold the model with each mass, to be copied when a payload changes.
-        carried = [(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
+        carried = [Condition(float(m), payload_side, self.dt) for m in (*[0.0] * num, *self.masses)]
         self.shadow = BatchSim(robot, carried, nthread, locked)
         self.ids, self.op = np.arange(num), robot.operated_index
         self.free = robot.index(self.shadow.joint_names)

@@ -42,9 +42,10 @@ class DeltaCorrector:
     def _simulator(self, start: ListOf[Sequence]) -> Ask:
         """A simulator to be asked in which idle limbs are clamped; it is asked only while a sequence lasts (`rest`)."""
         from gaponet.model.sensor import ProbeOracle
+        from gaponet.sim.batch import Condition
         from gaponet.sim.replay import idle_limbs
 
-        conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in start]
+        conditions = [Condition.of(s, self.robot) for s in start]
         oracle = ProbeOracle(self.robot, self.config, conditions, locked=idle_limbs(start, self.robot), whole=True)
 
         def ask(ids: Array, offsets: Array | None) -> Array:

@@ -2,23 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
+from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoLaw
 
 Array = np.ndarray
-Condition = tuple[float, str, float]  # payload_mass kg, payload_side, dt s
+
+
+class Condition(NamedTuple):
+    """What a recording was made under: kg, side, s, and gains (n) where they are not the robot's own."""
+
+    payload_mass: float
+    payload_side: str
+    dt: float
+    kp: tuple[float, ...] | None = None
+    kd: tuple[float, ...] | None = None
+
+    @classmethod
+    def of(cls, sequence: Sequence, robot: RobotSpec) -> Condition:
+        """Of a recording of this robot."""
+        meta, gains = sequence.meta, sequence.meta.known_gains
+        other = () if robot.with_gains(*gains) is robot else gains
+        return cls(meta.payload_mass, meta.payload_side, sequence.dt, *other)
 
 
 class BatchSim:
-    """num_envs simulations of a robot; each may carry its own payload and control period.
+    """num_envs simulations of a robot; each may have its own payload, control period and gains.
 
     `qpos` and `qvel` are live (num_envs, n) views: a write is the state at the next step. Results are bit-identical to
     a loop of mj_step over one MjData each, at any number of threads.
@@ -38,8 +55,11 @@ class BatchSim:
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
-        self.models = {c: build_model(robot, c[0], c[1], c[2], locked, bare=True) for c in dict.fromkeys(conditions)}
+        conditions = [Condition(*c) for c in conditions]
+        robots = {c: robot.with_gains(c.kp, c.kd) for c in dict.fromkeys(conditions)}
+        self.models = {c: build_model(r, *c[:3], locked, bare=True) for c, r in robots.items()}
         first = self.models[conditions[0]]
+        self._stiffer = np.array([robots[c].kp / np.where(robot.kp > 0, robot.kp, 1.0) for c in conditions])
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
@@ -105,15 +125,16 @@ class BatchSim:
 
         Args:
             joints: k names.
-            values: kp, damping, frictionloss, armature, offset, and any of zero, delay (up to the robot's) and LAW,
-                each (num_envs, k).
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of zero, delay (up to
+                the robot's) and LAW, each (num_envs, k).
         """
         model, batch = next(iter(self.models.values())), self.batch
         dof = np.array([model.joint(j).dofadr[0] for j in joints])
         act = np.array([model.actuator(j).id for j in joints])
         gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
-        gain[:, act, 0], bias[:, act, 1] = values["kp"], -values["kp"]
-        bias[:, act, 0] = values["kp"] * values["offset"]
+        kp = values["kp"] * self._stiffer[:, self.robot.index(joints)]
+        gain[:, act, 0], bias[:, act, 1] = kp, -kp
+        bias[:, act, 0] = kp * values["offset"]
         for name in ("damping", "frictionloss", "armature"):
             batch.expand(f"dof_{name}")[:, dof] = values[name]
         if "delay" in values and model.nhistory:

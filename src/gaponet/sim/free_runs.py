@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 
 from gaponet.data.sequence import Sequence
 from gaponet.robot import LAW, RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import Corrector, idle_limbs
 
@@ -143,7 +143,7 @@ class FreeRuns:
         late = np.array(self.robot.delay)
         late[self.op] = MAX_DELAY
         parts = [s for x in xs for s in self._carrying(x)]
-        conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in parts]
+        conditions = [Condition.of(s, self.robot) for s in parts]
         sim = BatchSim(replace(self.robot, delay=late), conditions, self.nthread, self.locked)
         sim.set_servos(self.robot.operated, self.values(np.repeat(xs, m, axis=0)))
         tile = np.tile(self.ctrl, (1, k, 1))

@@ -59,28 +59,33 @@ class JointRuns:
         after = round(SETTLE / self.dt)
         near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
         time = np.arange(rows)[:, None]
+        # Gains while recording: kp as a multiple of the robot's own, kd in N·m·s/rad, (windows, n).
+        set_to = [robot.with_gains(*p.meta.known_gains) for p in parts]
+        self.stiffer = np.array([(r.kp / robot.kp)[self.op] for r in set_to])
+        self.kd = np.array([r.kd[self.op] for r in set_to])
         self.counted = (time > max(after, 1)) & (time < lengths) & ~near
 
     def errors(self, values: dict[str, Array]) -> Array:
         """q_sim − q_real of parameters (k, n) each, (rows, k, windows, n) rad; zero where rows do not count.
 
         Args:
-            values: kp, damping, frictionloss, armature, offset, delay, and any of LAW.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of LAW.
         """
         k, n = values["kp"].shape
         v = {name: x[:, None] for name, x in values.items()}
         law = {name: v.get(name, np.zeros((1, 1, n))) for name in LAW}
-        kp, mass = v["kp"], v["armature"]
+        kp, mass = v["kp"] * self.stiffer, v["armature"]
+        damping = v["damping"] + self.kd
         limit = self.robot.effort_limit[self.op]
         h = self.dt / self.count
         q, w = np.repeat(self.qpos[:1], k, axis=0), np.repeat(self.qvel[:1], k, axis=0)
         out = np.zeros((len(self.ctrl), *q.shape), np.float32)
         for t in range(len(out) - 1):
             inertia = self.inertia[t] + mass
-            turn, stop = h / (inertia + h * v["damping"]), inertia / h
+            turn, stop = h / (inertia + h * damping), inertia / h
             for part in range(self.count):
                 aim = self._target(t, part, values["delay"]) + v["offset"]
-                torque = np.clip(servo_torque(law, kp, aim, q), -limit, limit)
+                torque = np.clip(servo_torque(law, kp, aim, q) - self.kd * w, -limit, limit)
                 load = self.weight[t] + self.slope[t] * (q - self.at[t])
                 most = friction_limit(law, v["frictionloss"], w, torque, load)
                 net = torque - load - self.pull[t] - v["damping"] * w

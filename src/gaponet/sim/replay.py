@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints, model_hash
 
 Array = np.ndarray
@@ -41,7 +41,7 @@ def replay(
     """Step every sequence's commands from its first recorded state; the recording is not looked at again.
 
     Args:
-        sequences: Recordings; payload and period of each are the simulation's.
+        sequences: Recordings; payload, period and gains of each are the simulation's.
         robot: The nominal simulator.
         corrector: Alters targets on the way; None for the nominal simulator.
         nthread: Threads, 0 for all cores.
@@ -105,7 +105,7 @@ def _free_run(
 ) -> list[Twin]:
     """Sequences in order of falling length: those still running are always a prefix."""
     lengths = np.array([len(s) for s in sequences])
-    sim = BatchSim(robot, [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences], nthread, locked)
+    sim = BatchSim(robot, [Condition.of(s, robot) for s in sequences], nthread, locked)
     free = robot.index(sim.joint_names)
     ctrl = np.zeros((lengths[0], len(sequences), len(robot.joint_names)))
     out = np.zeros((4, *ctrl.shape))

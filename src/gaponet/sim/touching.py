@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec, Table
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.evolve import evolve
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
@@ -166,7 +166,7 @@ class Scene:
     def errors(self, xs: Array) -> Array:
         """q_sim − q_real, (rows − 1, k, windows, n) rad, of tables and zeros (k, 3 + n)."""
         k, m = len(xs), len(self.parts)
-        conditions = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.parts] * k
+        conditions = [Condition.of(s, self.robot) for s in self.parts] * k
         sim = BatchSim(self.robot, conditions, self.nthread, self.locked)
         rows = np.repeat(xs, m, axis=0)
         model = sim.models[conditions[0]]

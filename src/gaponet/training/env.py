@@ -30,8 +30,8 @@ class DeltaEnv(VecEnv):
 
     Observation groups: "actor" = x = [o_t | a_t], and more for some models; "critic" = that and the recorded states at
     t and t+1, payload, rate (training only: the recorded state never reaches the actor). An environment keeps its
-    payload and rate for life, in proportion to the frames recorded under them. A motion's end is a time-out, not a
-    failure.
+    payload, rate and gains for life, in proportion to the frames recorded under them. A motion's end is a time-out,
+    not a failure.
     """
 
     def __init__(
@@ -93,12 +93,14 @@ class DeltaEnv(VecEnv):
             )
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
-        keys = [(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in sequences]
+        keys = [Condition.of(s, self.robot) for s in sequences]
         self.conditions = list(dict.fromkeys(keys))
         seq_group = np.array([self.conditions.index(k) for k in keys])
         frames = np.bincount(seq_group, length)
         if self.num_envs < len(frames):
-            raise UsageError(f"{self.num_envs} environments for {len(frames)} payload and rate conditions; use more")
+            raise UsageError(
+                f"{self.num_envs} environments for {len(frames)} conditions of payload, rate and gains; use more"
+            )
         share = np.cumsum(frames) / frames.sum() * self.num_envs
         self.group = np.searchsorted(share, np.arange(self.num_envs) + 0.5).astype(int)
         self.members = [np.flatnonzero(seq_group == g) for g in range(len(frames))]

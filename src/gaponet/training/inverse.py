@@ -26,6 +26,7 @@ FRICTION_SPEED = 0.02  # rad/s: below it, recorded motion is as good as rest
 
 def inverse_targets(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> tuple[Array, Array]:
     """The least and the greatest u*, (T, n) rad each: held over [t, t+1), they lead the simulator from row t to t+1."""
+    robot = robot.with_gains(*sequence.meta.known_gains)
     model = build_model(robot, sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt)
     qpos = lowpass(sequence.qpos.astype(float), sequence.dt, cutoff)
     qvel = differentiate(qpos, sequence.dt)

@@ -40,6 +40,7 @@ from gaponet.model.export import export
 from gaponet.model.layers import DeltaNet
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
+from gaponet.sim.batch import Condition
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.structure import validated
@@ -96,6 +97,11 @@ class Trainer:
             together = (e.meta for part in self.parts.values() for e in part)
             require_same_gains(together, dataset.joint_names, robot.operated)
         self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
+        if not config.mixed_gains and (other := next((c for c in self._conditions() if c.kp or c.kd), None)):
+            raise UsageError(
+                f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
+                "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
+            )
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n = len(robot.operated)
         torch.manual_seed(config.seed)
@@ -322,8 +328,8 @@ class Trainer:
         words += ["--holdout-units", *holdout_units] if holdout_units else []
         return shlex.join(words + options(asdict(self.config)))
 
-    def _conditions(self) -> set[tuple[float, str, float]]:
-        return {(s.meta.payload_mass, s.meta.payload_side, s.dt) for s in self.train_set}
+    def _conditions(self) -> set[Condition]:
+        return {Condition.of(s, self.robot) for s in self.train_set}
 
     def _card(self) -> dict[str, Any]:
         seen = self.train_set

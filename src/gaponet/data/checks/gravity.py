@@ -100,7 +100,8 @@ def _torques(surveys: list[Survey]) -> Loads:
 
 def _rests(surveys: list[Survey], robot: RobotSpec) -> Loads:
     """What the servos must make at rest to hold the arm so far from its command."""
-    return _joined((s, (s.holds.qpos, robot.kp * (s.holds.ctrl - s.holds.qpos))) for s in surveys)
+    kps = (robot.with_gains(*s.entry.meta.known_gains).kp for s in surveys)
+    return _joined((s, (s.holds.qpos, kp * (s.holds.ctrl - s.holds.qpos))) for s, kp in zip(surveys, kps, strict=True))
 
 
 def _joined(parts: Iterable[tuple[Survey, tuple[Array, Array]]]) -> Loads:
