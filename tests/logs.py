@@ -119,3 +119,16 @@ def arm_sequence(
     meta = SequenceMeta(robot.name, str(fields.pop("unit", "a")), motion, payload, notes=notes)  # type: ignore[arg-type]
     qvel = fields.pop("qvel", np.gradient(qpos, robot.dt, axis=0))
     return Sequence(meta, robot.joint_names, robot.dt, ctrl, qpos, qvel, **fields)  # type: ignore[arg-type]
+
+
+def write_bam(file: Path, rows: int = 60, off: int | None = None, **changes: object) -> Path:
+    """One recording of BAM's test bench at firmware gain 400; torque off from row `off` on."""
+    ctrl, qpos = wave(rows, 1, 0.0053)[:, 0], late(wave(rows, 1, 0.0053), 3)[:, 0]
+    entries = [
+        {"timestamp": 0.0035 + 0.0053 * i, "position": q, "speed": 0.0, "load": 65530, "input_volts": 7.3, "temp": 39,
+         "goal_position": u, "torque_enable": off is None or i < off}
+        for i, (u, q) in enumerate(zip(ctrl.tolist(), qpos.tolist(), strict=True))
+    ]  # fmt: skip
+    head = {"mass": 0.49, "length": 0.1, "kp": 400, "vin": 7.4, "motor": "xl330", "trajectory": "sin_sin"}
+    file.write_text(json.dumps(head | {"entries": entries} | changes))
+    return file

@@ -13,7 +13,7 @@ from gaponet.sim.model import build_model, model_hash
 
 
 def test_the_package_holds_h1_2_and_so101():
-    assert available() == ["h1_2", "so101"]
+    assert available() == ["h1_2", "so101", "xl330_bench"]
 
 
 def test_h1_2_operates_the_ten_arm_joints_of_27():
@@ -59,7 +59,9 @@ def test_an_unknown_joint_names_the_file_the_valid_names_and_the_likely_one(so10
 
 
 def test_an_unknown_robot_names_those_of_the_package():
-    with pytest.raises(RobotError, match="no robot 'nope': in the package are h1_2, so101; or give a folder"):
+    with pytest.raises(
+        RobotError, match="no robot 'nope': in the package are h1_2, so101, xl330_bench; or give a folder"
+    ):
         load_robot("nope")
 
 
@@ -131,8 +133,8 @@ def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
 def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
-    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are h1_2, so101; for the folder here write "
-                       r"\./arm"):  # fmt: skip
+    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are h1_2, so101, xl330_bench; for the folder "
+                       r"here write \./arm"):  # fmt: skip
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
         assert load_robot(way).name == "arm"

@@ -43,7 +43,7 @@ def import_logs(
     The same call again adds what is missing.
 
     Args:
-        src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
+        src: SAGE folder, LeRobot set (v3.0), BAM logs (JSON), or a table (CSV, Parquet) or a folder of tables.
         robot: The robot that was recorded.
         out: Dataset folder; appended to where it exists.
         unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.

@@ -29,6 +29,7 @@ MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the M
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 IDENTIFIED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
+SERVO = ("kp", "effort_limit", *IDENTIFIED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
 
 
@@ -165,8 +166,8 @@ class RobotSpec:
         return any(getattr(self, name).any() for name in LAW)
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
-        """The same robot with identified values: joint → kp or any of IDENTIFIED."""
-        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in ("kp", *IDENTIFIED)}
+        """The same robot with identified values: joint → any of SERVO."""
+        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO}
         for joint, values in servos.items():
             for name, value in values.items():
                 changed[name][self.index([joint])[0]] = value

@@ -9,7 +9,7 @@ import numpy as np
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.files import write_text, writing
-from gaponet.robot import BUILTIN, IDENTIFIED, LAW, RobotSpec, available, load_robot
+from gaponet.robot import BUILTIN, LAW, SERVO, RobotSpec, available, load_robot
 
 KEPT = "robot"  # folder of a run or a dataset
 MOVE_KEPT = "move that folder away to keep the other robot from now on"
@@ -75,7 +75,7 @@ def keeps_robot(holder: Path) -> bool:
 
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
-    values = {name: float(getattr(robot, name)[i]) for name in ("kp", *IDENTIFIED)}
+    values = {name: float(getattr(robot, name)[i]) for name in SERVO}
     told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in LAW)}
     lines = [f"{name} = {value!r}\n" for name, value in told.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)

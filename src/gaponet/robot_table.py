@@ -42,6 +42,7 @@ class Servo:
     """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
 
     kp: Gain | None = None
+    effort_limit: Gain | None = None
     damping: Gain | None = None
     armature: Gain | None = None
     frictionloss: Gain | None = None

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from arm import write_arm
-from logs import arm_columns, arm_sequence, late, stock, table_text, wave, write_so101
+from logs import arm_columns, arm_sequence, late, stock, table_text, wave, write_bam, write_so101
 
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
@@ -32,6 +32,11 @@ BOUNDS = {"qvel": 1e3, "qacc": 1e6, "tau": 1e3, "tau_eq": 1e6, "temperature": 40
 @functools.cache
 def so101() -> RobotSpec:
     return load_robot("so101")
+
+
+@functools.cache
+def bench() -> RobotSpec:
+    return load_robot("xl330_bench")
 
 
 @functools.cache
@@ -74,14 +79,12 @@ def require_sane(dataset: Dataset, robot: RobotSpec, inside: Path) -> None:
                 raise AbsurdError(f"{entry.id}: {name} up to {np.abs(values).max()}")
 
 
-def importing(
-    robot: Callable[[], RobotSpec], at: str = "", stated: bool = False, **options: str
-) -> Callable[..., None]:
+def importing(robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **options: str) -> Callable[..., None]:
     """Import `at` below the folder and look at what was stored."""
 
     def use(source: Path, out: Path) -> None:
         given = options | ({"columns": str(source / options["columns"])} if "columns" in options else {})
-        unit, payload = (None, None) if stated else ("lab", 0.0)
+        unit, payload = None if stated == "all" else "lab", None if stated else 0.0
         report = import_logs(source / at, robot(), unit, payload, out, **given)  # type: ignore[arg-type]
         require_sane(Dataset(out), robot(), source)
         if len(report.entries) != len(Dataset(out).entries):
@@ -166,7 +169,8 @@ TARGETS = (
     Target("parquet", written(_parquet), importing(arm, position_unit="rad", time_unit="s"), 1.5),
     Target("columns", written(_mapped), importing(arm, "logs", columns="map.toml"), 1.0, (".toml", "a.csv")),
     Target("lerobot", written(lambda f: stock(f / "set", rows=(25, 15))), importing(so101, position_unit="deg"), 2.5),
-    Target("export", written(_export), importing(arm, stated=True, fmt="lerobot"), 2.0),
+    Target("bam", written(lambda f: write_bam(f / "a.json", ROWS, 30)), importing(bench, stated="payload"), 1.0),
+    Target("export", written(_export), importing(arm, stated="all", fmt="lerobot"), 2.0),
     Target("motion", written(_motions), _read_motions, 1.5),
     Target("recipe", written(lambda f: (f / "mine.toml").write_text(RECIPE)), _read_recipe, 0.7, (".toml",)),
 )  # fmt: skip

@@ -32,7 +32,7 @@ def import_logs(
     payload_mass: float | None = None,
     payload_side: str | None = None,
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: Literal["sage", "table", "lerobot"] | None = None,
+    format: Literal["sage", "table", "lerobot", "bam"] | None = None,
     columns: Path | None = None,
     position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,
@@ -44,7 +44,7 @@ def import_logs(
     """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
 
     Args:
-        src: SAGE folder, LeRobot set (v3.0), or a table (CSV, Parquet) or a folder of tables.
+        src: SAGE folder, LeRobot set (v3.0), BAM logs (JSON), or a table (CSV, Parquet) or a folder of tables.
         robot: Robot name or folder.
         out: Dataset folder; appended to where it exists.
         unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
@@ -90,6 +90,15 @@ def doctor(
     out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
 
 
+def cuts(entries: list[Entry]) -> dict[str, list[str]]:
+    """Why recordings were cut → which."""
+    found: dict[str, list[str]] = {}
+    for entry in entries:
+        if cut := entry.meta.notes.get("cut"):
+            found.setdefault(cut, []).append(entry.meta.motion)
+    return found
+
+
 def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     """("a=b",) → {"a": "b"}."""
     for pair in pairs:
@@ -112,6 +121,8 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
+    for cut, motions in cuts(entries).items():
+        out.say(f"{', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
     lags = {name: fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}
     show_offsets(out, lags, offsets)

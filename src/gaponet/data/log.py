@@ -33,8 +33,9 @@ class Log:
         joint_names: The robot's own names, (n).
         channels: Channels among CHANNELS and DERIVED, at least ctrl and qpos.
         source: File or folder it was read from, for errors and for the manifest.
-        meta: Whatever the format also says (events, gains, firmware). Two entries are acted on: dt, the exact period
-            of regular rows, s; stated, fields of SequenceMeta that the format itself holds.
+        meta: Whatever the format also says (events, firmware). Acted on are: dt, the exact period of regular rows,
+            s; kp and kd, gains of joint_names; notes, for SequenceMeta; stated, fields of SequenceMeta that the format
+            itself holds.
     """
 
     robot: str

@@ -215,13 +215,17 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     if odd:  # a joint logged as a fraction of its range has its velocity in any unit at all
         qvel = differentiate(arrays["qpos"], dt)
         arrays.setdefault("qvel", qvel)[:, odd] = qvel[:, odd]
-    notes = meta.notes | {
-        "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz",
-        "rate_hz": round(1 / median, 3),
-        "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
-        "longest_gap_ms": round(float(period.max()) * 1e3, 3),
-        "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
-    }
+    notes = (
+        meta.notes
+        | log.meta.get("notes", {})
+        | {
+            "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz",
+            "rate_hz": round(1 / median, 3),
+            "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
+            "longest_gap_ms": round(float(period.max()) * 1e3, 3),
+            "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
+        }
+    )
     absent = [name for name in robot.joint_names if name not in log.joint_names]
     if absent:
         notes["held_at_home"] = absent

@@ -113,7 +113,8 @@ class Limits:
             gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
             qpos_range: Ranges of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
         """
-        kp, kd = gains or ((robot.nominal or robot).kp, (robot.nominal or robot).kd)
+        nominal = robot.nominal or robot
+        kp, kd = gains or (nominal.kp, nominal.kd)
         at = robot.index(joints)
         ranges = np.stack([robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range])[:, at]
         low, high = ranges[..., 0].max(axis=0) + config.margin, ranges[..., 1].min(axis=0) - config.margin
@@ -122,7 +123,7 @@ class Limits:
             raise UsageError(f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller")
         full = lambda value: np.full(len(joints), value)  # noqa: E731
         return cls(
-            low, high, full(config.speed), config.torque_share * robot.effort_limit[at], kp[at], kd[at],
+            low, high, full(config.speed), config.torque_share * nominal.effort_limit[at], kp[at], kd[at],
             full(config.delta), full(config.delta_rate), full(config.acceleration),
         )  # fmt: skip
 

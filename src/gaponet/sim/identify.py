@@ -39,6 +39,7 @@ CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
     "load": ("friction_motor",),
+    "limit": ("effort_limit",),
     "external": ("friction_external",),
     "min_torque": ("min_torque",),
     "encoder": ("encoder_step",),
@@ -155,12 +156,12 @@ class Fit:
         self.runs, self.base, self.op, self.n = runs, robot, robot.operated_index, len(robot.operated)
         model = build_model(replace(robot, table=None))
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
-        kp = robot.kp[self.op]
+        kp, limit = robot.kp[self.op], robot.effort_limit[self.op]
         self.armature = model.dof_armature[dof]
         self.first: Values = {
             "kp": kp, "damping": model.dof_damping[dof], "frictionloss": model.dof_frictionloss[dof],
             "armature": np.maximum(self.armature, 1e-3),
-            **{f: getattr(robot, f)[self.op] for f in ("offset", "delay", *LAW)},
+            **{f: getattr(robot, f)[self.op] for f in ("offset", "delay", "effort_limit", *LAW)},
         }  # fmt: skip
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in self.op])
         one = np.ones(self.n)
@@ -177,10 +178,12 @@ class Fit:
             "friction_motor": (0 * one, 0.8 * one, 0.05 * one),
             "friction_external": (0 * one, 0.8 * one, 0.05 * one),
             "min_torque": (0 * kp, 0.05 * kp, 0.002 * kp),
+            "effort_limit": (0.2 * limit, 3 * limit, 0.2 * limit),
             "encoder_step": (counts, counts, one),
         }
         self.guess = {"stribeck": 0.003 * kp, "stribeck_speed": 0.05 * one, "friction_motor": 0.05 * one,
-                      "friction_external": 0.02 * one, "min_torque": 0.003 * kp, "encoder_step": counts}  # fmt: skip
+                      "friction_external": 0.02 * one, "effort_limit": 0.6 * limit,  # one that is too high is not felt
+                      "min_torque": 0.003 * kp, "encoder_step": counts}  # fmt: skip
 
     def start(self) -> Values:
         """The given robot, a little late."""
@@ -189,7 +192,7 @@ class Fit:
 
     def fields_of(self, values: Values) -> list[str]:
         """Names, classic ones first."""
-        return [f for f in (*CLASSIC, *LAW) if f in values]
+        return [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values]
 
     def with_term(self, values: Values, term: str) -> Values:
         """Values with a first guess at a term's fields."""

@@ -69,14 +69,15 @@ class JointRuns:
         """q_sim − q_real of parameters (k, n) each, (rows, k, windows, n) rad; zero where rows do not count.
 
         Args:
-            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of LAW.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and
+                any of effort_limit and LAW.
         """
         k, n = values["kp"].shape
         v = {name: x[:, None] for name, x in values.items()}
         law = {name: v.get(name, np.zeros((1, 1, n))) for name in LAW}
         kp, mass = v["kp"] * self.stiffer, v["armature"]
         damping = v["damping"] + self.kd
-        limit = self.robot.effort_limit[self.op]
+        limit = v.get("effort_limit", self.robot.effort_limit[self.op])
         h = self.dt / self.count
         q, w = np.repeat(self.qpos[:1], k, axis=0), np.repeat(self.qvel[:1], k, axis=0)
         out = np.zeros((len(self.ctrl), *q.shape), np.float32)

@@ -67,4 +67,4 @@ def test_a_broken_folder_is_one_line_and_exit_code_2(tmp_path, capsys, toml, mes
 
 def test_check_without_a_name_says_which_there_are(capsys):
     assert main(["robot", "check"]) == 2
-    assert "needs a robot name (h1_2, so101) or a folder" in capsys.readouterr().err
+    assert "needs a robot name (h1_2, so101, xl330_bench) or a folder" in capsys.readouterr().err

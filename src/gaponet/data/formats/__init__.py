@@ -27,6 +27,7 @@ FORMATS = {
     "sage": "SAGE folder: control.csv and state_motor.csv beside each other",
     "table": "CSV or Parquet with named columns, a file or a folder of files",
     "lerobot": "LeRobotDataset v3.0 folder: meta/info.json",
+    "bam": "JSON of BAM's servo test bench, a file or a folder of files",
 }
 TABLES = (".csv", ".parquet")
 UNITS = CHANNELS | DERIVED
@@ -42,11 +43,20 @@ def detect(path: Path) -> str:
         return "lerobot"
     if path.is_dir() and any(next(path.rglob(name), None) for name in ("control.csv", "state_motor.csv")):
         return "sage"
-    files = [path] if path.is_file() else path.iterdir()
+    files = [path] if path.is_file() else sorted(path.iterdir())
     if any(f.is_file() and f.suffix.lower() in TABLES for f in files):
         return "table"
+    if any(f.is_file() and f.suffix.lower() == ".json" and is_bam(f) for f in files):
+        return "bam"
     known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())
     raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+
+
+def is_bam(file: Path) -> bool:
+    """Whether a file begins as BAM's logs do."""
+    with file.open("rb") as stream:
+        start = stream.read(4096)
+    return all(name in start for name in (b'"trajectory"', b'"entries"', b'"goal_position"'))
 
 
 def find_logs(path: Path, fmt: str | None = None) -> list[Path]:

@@ -193,7 +193,13 @@ class SO101Driver:
             for name, field in READINGS.items()
         }
         sign = self.steps.sign
-        tau = np.abs(raw["current"]) / STALL_CURRENT * self.robot.effort_limit * np.sign(raw["load"]) * sign
+        tau = (
+            np.abs(raw["current"])
+            / STALL_CURRENT
+            * (self.robot.nominal or self.robot).effort_limit
+            * np.sign(raw["load"])
+            * sign
+        )
         self._state = State(
             now, self.steps.qpos(raw["qpos"]), raw["qvel"] * STEP * sign, tau, raw["temperature"], self._bus.refused,
             fault=self._fault(),

@@ -217,7 +217,7 @@ class UnitreeDriver:
         state = self._state
         qpos = np.nan_to_num(state.qpos) if state else np.zeros(len(self._motor))
         qvel = state.qvel if state else np.zeros(len(self._motor))
-        kd = damping(DAMPING * self.kd, qvel, self.robot.effort_limit)
+        kd = damping(DAMPING * self.kd, qvel, (self.robot.nominal or self.robot).effort_limit)
         self._send(qpos, np.zeros_like(kd), kd, weight)
 
     def _send(self, ctrl: Array, kp: Array, kd: Array, weight: float) -> None:

@@ -1,0 +1,103 @@
+"""BAM's JSON (github.com/Rhoban/bam): one servo on a pendulum, {mass, length, kp, vin, motor, trajectory, entries}.
+
+The mass at the arm's end is the payload, and the arm's length says at which mount: `--robot xl330_bench` has one for
+each. kp is the firmware's; MOTORS makes N·m/rad of it. A recording ends where torque is switched off: from there on
+nothing is commanded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, NotRequired
+
+import numpy as np
+from annotated_types import Gt, Interval, Len
+from typing_extensions import TypedDict
+
+from gaponet.data.formats import is_bam, refuse_absurd
+from gaponet.data.log import Channel, Log
+from gaponet.errors import LogError
+from gaponet.robot import RobotSpec
+from gaponet.structure import read_json
+
+OPTIONS: tuple[str, ...] = ()
+# Motor → N·m/rad for a firmware kp of 1 and 1 V. xl330: PWM is kp/256 of the error in ticks of 2π/4096, and 885 is all
+# of the voltage (both as the logs' load says); 0.52 N·m at 5 V at stall (ROBOTIS, XL330-M288-T).
+MOTORS = {"xl330": 4096 / (2 * np.pi) / 256 / 885 * 0.52 / 5}
+Size = Annotated[float, Gt(0), Interval(le=1e3)]
+
+
+class Entry(TypedDict):
+    """One sample; rad, rad/s, s, °C."""
+
+    timestamp: float
+    position: float
+    goal_position: float | None
+    torque_enable: bool
+    speed: NotRequired[float]
+    temp: NotRequired[float]
+
+
+class Recording(TypedDict):
+    """One file; kg, m, V."""
+
+    mass: Annotated[float, Interval(ge=0, le=100)]
+    arm_mass: NotRequired[Annotated[float, Interval(ge=0, le=100)]]
+    length: Size
+    kp: Annotated[float, Gt(0), Interval(le=1e6)]
+    vin: Size
+    motor: str
+    trajectory: str
+    entries: Annotated[list[Entry], Len(2)]
+
+
+def find(path: Path) -> list[Path]:
+    """The recordings at or below a path."""
+    return [path] if path.is_file() else sorted(f for f in path.rglob("*.json") if is_bam(f))
+
+
+def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) -> Iterator[tuple[str, Log]]:
+    """Yield (trajectory, Log) for every recording; the motor's name stands for the joint."""
+    files = find(path)
+    if not files:
+        raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
+    for file in files:
+        told = read_json(Recording, file, LogError, "record it again, or leave the file out", more=True)
+        yield told["trajectory"], refuse_absurd(_log(file, told, robot, joint_map), robot)
+
+
+def _log(file: Path, told: Recording, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
+    if told["motor"] not in MOTORS:
+        raise LogError(
+            f"{file}: motor is '{told['motor']}': what its kp {told['kp']:g} means in N·m/rad is known of "
+            f"{', '.join(MOTORS)} only; convert the log to a table (docs/data-format.md) and give --kp"
+        )
+    on = told["entries"]
+    off = next((i for i, e in enumerate(on) if not e["torque_enable"] or e["goal_position"] is None), len(on))
+    if off < 2:
+        raise LogError(f"{file}: torque is off from the start; a log needs commands that the servo follows")
+    on, cut = on[:off], on[off:]
+    channels = {"ctrl": "goal_position", "qpos": "position", "qvel": "speed", "temperature": "temp"}
+    time = np.array([e["timestamp"] for e in on])
+    gain = told["kp"] * told["vin"] * MOTORS[told["motor"]]
+    return Log(
+        robot.name,
+        (robot.resolve(told["motor"], str(file), joint_map),),
+        {
+            name: Channel(time, np.array([[e[key]] for e in on], float))  # type: ignore[literal-required]
+            for name, key in channels.items()
+            if all(key in e for e in on)
+        },
+        str(file),
+        {
+            "files": {name: str(file) for name in channels},
+            "kp": [gain],
+            "stated": {
+                "payload_mass": told["mass"] + 0.5 * told.get("arm_mass", 0.0),  # its weight as seen from the joint
+                "payload_side": f"{1e3 * told['length']:.0f}mm",
+            },
+            "notes": {"firmware_kp": told["kp"], "volts": told["vin"]}
+            | ({"cut": f"torque is off from {cut[0]['timestamp']:.2f} s on"} if cut else {}),
+        },
+    )
