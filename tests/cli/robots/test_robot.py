@@ -10,7 +10,7 @@ from gaponet.cli.main import main
 
 def test_list_names_the_packages_robots(capsys):
     assert main(["robot", "list", "--json"]) == 0
-    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == ["h1_2", "so101"]
+    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == ["h1_2", "so101", "xl330_bench"]
 
 
 @pytest.mark.parametrize("name", ["so101", "h1_2"])
