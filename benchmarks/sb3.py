@@ -35,12 +35,13 @@ from gaponet.model.observation import frames_before
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
-from gaponet.training.config import TrainConfig
+from gaponet.training.config import RewardConfig, TrainConfig
 from gaponet.training.env import DeltaEnv
 
 Array = np.ndarray
 
 THEIR_BATCH = 64  # samples in a mini-batch, where nothing else is said
+REWARD = RewardConfig()
 PROCESSES = 8
 PROCESS_STEPS = 256  # control periods per update and process
 
@@ -151,7 +152,7 @@ def _ppo(
 ) -> PPO:
     """The same network or an MLP, everything else as in ours."""
     ppo, model = config.ppo, config.model
-    policy: dict[str, Any] = {"log_std_init": math.log(ppo.init_std), "ortho_init": False}
+    policy: dict[str, Any] = {"log_std_init": math.log(ppo.std), "ortho_init": False}
     if hidden is None:
         policy |= {"model": model, "critic_hidden": ppo.critic_hidden}
     else:
@@ -191,16 +192,15 @@ class _Batched(VecEnv):
         return self.env.get_observations()["actor"].numpy()
 
     def step_async(self, actions: Array) -> None:
-        self.actions = torch.from_numpy(actions)
+        self.actions = actions
 
     def step_wait(self) -> tuple[Array, Array, Array, list[dict[str, Any]]]:
-        obs, reward, done, _ = self.env.step(self.actions)
-        ended = done.numpy()
+        reward, ended = self.env.step(self.actions)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        observed = obs["actor"].numpy()
+        observed = self.env.get_observations()["actor"].numpy()
         for i in np.flatnonzero(ended):
             infos[i] = {"TimeLimit.truncated": True, "terminal_observation": observed[i]}
-        return observed, reward.numpy(), ended, infos
+        return observed, reward.mean(axis=1), ended, infos
 
     def close(self) -> None:
         pass
@@ -256,8 +256,8 @@ class SingleEnv(gymnasium.Env):
         data.ctrl[:] = target
         mujoco.mj_step(self.model, data, self.robot.decimation)
         self.row += 1
-        error = data.qpos[op] - self.motion.qpos[self.row, self.robot.operated_index]
-        reward = -32.83 * float((error**2).mean())
+        error = np.abs(data.qpos[op] - self.motion.qpos[self.row, self.robot.operated_index])
+        reward = -float(np.minimum(error / REWARD.position, REWARD.cap).mean())
         over = self.row >= len(self.motion) - 1 or self.row - self.first >= self.steps
         return self._observe(), reward, False, over, {}
 

@@ -1,5 +1,6 @@
 """Fine-tune a policy in the aligned simulator, then play it on a robot it has never met: ASAP's use of a gap model.
 
+    pip install "rsl-rl-lib>=5.5,<6"
     python examples/finetune_policy.py RUN        # RUN: gaponet train (or demo) on virtual H1-2 units 1 to 3
 
 A small network learns by PPO, in the nominal simulator, to make the arms follow motions with 0 to 3 kg in each hand. It

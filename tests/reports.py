@@ -20,7 +20,7 @@ FACTS = {
     "versions": {"gaponet": "0"}, "virtual": True,
 }  # fmt: skip
 LINE = {"stage": "ppo", "steps": 1, "seconds": 0.5, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
-CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "init_std": 0.1}, "seed": 0, "robot": "arm",
+CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0, "robot": "arm",
           "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
 
 

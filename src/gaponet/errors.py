@@ -45,7 +45,7 @@ class UsageError(GAPONetError):
 
 # Modules of optional dependencies → the extra that brings them.
 EXTRAS = {
-    "torch": "train", "rsl_rl": "train", "tensordict": "train", "onnx": "train", "onnxruntime": "deploy",
+    "torch": "train", "onnx": "train", "onnxruntime": "deploy",
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
     "tensorboard": "tensorboard", "wandb": "wandb",

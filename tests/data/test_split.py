@@ -9,7 +9,15 @@ from arm import commands, record
 from logs import arm_sequence, late, wave
 
 from gaponet.data.pair import split_by_motion
-from gaponet.data.split import PARTS, make_split, read_split, require_distinct_samples, split_entries, write_split
+from gaponet.data.split import (
+    PARTS,
+    make_split,
+    read_split,
+    require_distinct_samples,
+    split_entries,
+    spread,
+    write_split,
+)
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 
@@ -44,6 +52,16 @@ def test_held_out_units_are_in_the_test_part_alone(dataset):
     assert values(parts["test"], "unit_id") == {"two"}
     assert values(parts["train"] + parts["val"], "unit_id") == {"one", "three"}
     assert not values(parts["train"], "motion") & values(parts["val"], "motion")
+
+
+def test_a_few_entries_are_of_every_payload_and_unit_and_of_several_motions(dataset):
+    """Every sixth entry would be of one payload and one unit: the recipe has six of each motion."""
+    few = spread(dataset.entries, 8)
+    assert len(few) == 8
+    conditions = {(e.meta.payload_mass, e.meta.unit_id) for e in few}
+    assert len(conditions) == 6
+    assert len(values(few, "motion")) >= 6
+    assert spread(few, 100) == few
 
 
 def test_payloads_are_numbers_however_they_are_written(dataset):

@@ -134,7 +134,7 @@ def _evaluation(folder: Path) -> None:
 
     parts = {"left": {"nominal": 0.02, "gaponet": 0.01}, "floor": {"both": 0.001}}
     budget = parts | {"by_joint": {"elbow": parts}, "virtual": False, "unseen": True, "sequences": 1, "robot": "arm"}
-    config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "init_std": 0.1}, "seed": 0,
+    config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0,
               "robot": "arm", "dataset": "../set", "dataset_hash": "0123"}  # fmt: skip
     line = {"stage": "ppo", "steps": 1, "seconds": 0.5, "reward": None, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
     delays = {"delay": {"shoulder": 0.02, "elbow": 0.02}, "offset": {"shoulder": 0.0, "elbow": 0.0}}

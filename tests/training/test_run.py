@@ -23,7 +23,7 @@ from gaponet.training.run import Trainer
 SMALL = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
     warm_start=WarmStartConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
-    ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1),
+    ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
 )
 STEPS = Budget(steps=3 * 16 * 60 + 8 * 16 * 16)

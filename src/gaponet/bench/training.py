@@ -26,6 +26,7 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs, replay
 from gaponet.training.config import RewardConfig, TrainConfig, fast
 from gaponet.training.env import DeltaEnv
+from gaponet.training.ppo import Learner
 
 Turn = Callable[[], object]
 Speeds = dict[str, dict[str, float]]
@@ -76,24 +77,23 @@ def bench_train(
         speeds by name, expected (control steps/s) and share of it, times_others (PPO's speed over that of each of the
         others), parameters, peak_memory_bytes.
     """
-    from gaponet.training.ppo import make_runner, update
-
     torch.set_num_threads(config.learner_threads)
     config = _for_envs(config, num_envs)
     quick = fast(config)
     steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
     env = _environment(robot, config.model, num_envs, config.threads)
     net = build_network(config.model, env.num_actions)
-    runner = make_runner(env, net, config.ppo)
-    quick_runner = make_runner(env, build_network(quick.model, env.num_actions), quick.ppo)
+    learner = Learner(env, net, config.ppo)
+    quick_learner = Learner(env, build_network(quick.model, env.num_actions), quick.ppo)
+    collected = learner.collect()
     turns: dict[str, Turn] = {
         "bare Batch loop": _bare_loop(robot, num_envs, steps, config.threads),
         "environment step": _idle_steps(env, steps),
-        "inference": lambda: _inference(runner, steps),
-        "collection": lambda: _collect(runner),
-        "update": lambda: _update(runner),
-        "PPO": lambda: update(runner),
-        "PPO, fast preset": lambda: update(quick_runner),
+        "inference": lambda: _inference(learner, steps),
+        "collection": learner.collect,
+        "update": lambda: learner.learn(collected),
+        "PPO": learner.update,
+        "PPO, fast preset": quick_learner.update,
     }
     counts = dict.fromkeys(turns, batch)
     theirs = {} if others is None else others(env, config)
@@ -161,7 +161,7 @@ def _bare_loop(robot: RobotSpec, num_envs: int, steps: int, nthread: int = 0) ->
 
 
 def _idle_steps(env: DeltaEnv, steps: int) -> Turn:
-    idle = torch.zeros(env.num_envs, env.num_actions)
+    idle = np.zeros((env.num_envs, env.num_actions), np.float32)
 
     def run() -> None:
         for _ in range(steps):
@@ -170,27 +170,11 @@ def _idle_steps(env: DeltaEnv, steps: int) -> Turn:
     return run
 
 
-def _inference(runner: Any, steps: int) -> None:
-    """Features, sensors, actor, critic and sampling, nothing stored."""
-    with torch.inference_mode():
+def _inference(learner: Learner, steps: int) -> None:
+    """Features, sensors, actor and critic, nothing stored."""
+    with torch.no_grad():
         for _ in range(steps):
-            runner.alg.act(runner.env.get_observations())
-
-
-def _collect(runner: Any) -> None:
-    """The first half of rsl_rl's OnPolicyRunner.learn: what an update needs."""
-    runner.alg.storage.clear()
-    obs = runner.env.get_observations()
-    with torch.inference_mode():
-        for _ in range(runner.cfg["num_steps_per_env"]):
-            obs, reward, done, extras = runner.env.step(runner.alg.act(obs))
-            runner.alg.process_env_step(obs, reward, done, extras)
-        runner.alg.compute_returns(obs)
-
-
-def _update(runner: Any) -> None:
-    """The second half, on what _collect left."""
-    runner.alg.update()
+            learner.look()
 
 
 def recordings(robot: RobotSpec, count: int) -> list[Sequence]:

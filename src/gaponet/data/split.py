@@ -8,9 +8,11 @@ listed twice nor the same samples under another name, unit or payload.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import re
 from collections.abc import Callable
+from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +98,20 @@ def split_entries(
             held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
             raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {held}")
     return parts
+
+
+def spread(entries: ListOf[Entry], most: int) -> list[Entry]:
+    """At most so many entries, taken in turn from each payload, unit and rate, and from other motions each time.
+
+    Every k-th of a recipe's entries can have the same payload: recipes count in fours as well.
+    """
+    groups: dict[tuple[object, ...], list[Entry]] = {}
+    for entry in entries:
+        m = entry.meta
+        groups.setdefault((m.payload_mass, m.payload_side, m.unit_id, round(1 / entry.dt, 1)), []).append(entry)
+    turned = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
+    found = [e.id for turn in itertools.zip_longest(*turned) for e in turn if e is not None][:most]
+    return [e for e in entries if e.id in found]
 
 
 def _same_rate(a: float, b: float) -> bool:

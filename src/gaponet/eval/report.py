@@ -307,7 +307,7 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
          shape.get("sensors", "–") if shape["kind"] == "gaponet" else "–"],
         ["sensor predictor R²", _r2(r2)],
         ["steps, time", f"{card['steps']:,} control steps in {card['seconds'] / 60:.1f} min"],
-        ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['init_std']:g} rad"],
+        ["PPO", f"{ppo['num_envs']} environments, {ppo['epochs']} epochs, σ {ppo['std']:g} rad"],
         ["seed", str(card["seed"])],
         ["ONNX against torch", f"{card['parity_rad']:.1e} rad"],
     ]  # fmt: skip

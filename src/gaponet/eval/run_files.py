@@ -92,7 +92,7 @@ class PPO(TypedDict):
 
     num_envs: int
     epochs: int
-    init_std: float
+    std: float
 
 
 class Model(TypedDict):

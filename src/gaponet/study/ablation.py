@@ -19,7 +19,7 @@ from gaponet.study.variant import parse_variant
 from gaponet.training.config import TrainConfig
 
 DEFAULT = "gaponet"
-COLD = "warm_start.rounds=0:ppo.critic_warmup=0:ppo.learning_rate=1e-4:ppo.init_std=0.05"  # PPO's values of the paper
+COLD = "warm_start.rounds=0"
 
 WIDE = "branch_hidden=128,128:trunk_hidden=64,64:sensor_hidden=256,256"
 PAPER_SIZE = "coupling=full:branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"

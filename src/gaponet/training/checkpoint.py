@@ -20,7 +20,7 @@ from gaponet.training.env import DeltaEnv
 from gaponet.training.warm_start import WarmStart
 
 State = dict[str, Any]
-ROWS = ("row", "first", "last", "previous", "now")  # of each environment
+ROWS = ("row", "first", "last", "now", "elapsed")  # of each environment
 
 
 def write_state(path: Path, state: State) -> None:
@@ -46,7 +46,6 @@ def env_state(env: DeltaEnv) -> State:
     arrays = {name: getattr(env, name) for name in ROWS} | _inputs(env) | env.sim.state()
     return {
         "arrays": {name: torch.from_numpy(np.array(x)) for name, x in arrays.items()},
-        "episode_length": env.episode_length_buf.clone(),
         "reward": (env.reward_sum, env.reward_count),
         "rng": rng_text(env.rng),
     }
@@ -65,7 +64,6 @@ def restore_env(env: DeltaEnv, state: State) -> None:
     for name, x in _inputs(env).items():
         x[:] = arrays[name]
     env.sim.set_state(arrays)
-    env.episode_length_buf[:] = state["episode_length"]
     env.reward_sum, env.reward_count = state["reward"]
     set_rng(env.rng, state["rng"])
 

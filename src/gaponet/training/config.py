@@ -13,16 +13,12 @@ from gaponet.model.config import Layers, ModelConfig
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """r = −position·mean(Δq²) − velocity·mean(Δq̇²) − delta·mean(Δa²) − delta_rate·mean((Δa_t − Δa_{t−1})²)."""
+    """Of each joint: r = −min(|Δq| / position, cap)."""
 
-    position: Annotated[float, Interval(ge=0, le=1e6)] = 32.83
-    """κ of the paper, 1/rad²."""
-    velocity: Annotated[float, Interval(ge=0, le=1e6)] = 0.3283
-    """0.01 κ, s²/rad²."""
-    delta: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
-    """Price of a large correction, 1/rad²."""
-    delta_rate: Annotated[float, Interval(ge=0, le=1e6)] = 0.1
-    """Price of a jerky correction, 1/rad²."""
+    position: Annotated[float, Interval(gt=0, le=1e3)] = 0.01
+    """Error that costs 1, rad."""
+    cap: Annotated[float, Interval(gt=0, le=1e6)] = 8.0
+    """Highest cost of a joint; what has fallen far behind shall not drown the rest."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +50,39 @@ class WarmStartConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """PPO of rsl_rl, start values of the method."""
+    """PPO with reward, value, advantage and ratio of each joint (training/ppo.py)."""
 
-    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 512
+    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations."""
     num_steps: Annotated[int, Interval(ge=1, le=100000)] = 32
     """Decisions between updates; a decision is model.delta_hold control periods."""
-    epochs: Annotated[int, Interval(ge=1, le=1000)] = 2
+    epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over each batch."""
-    mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 8
+    mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 4
     """Mini-batches per pass; 2048 samples each stay in the cache."""
-    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-5
-    """Start value; adapts to desired_kl, not below 1e-5."""
-    desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.008
-    """Step size is halved or doubled to stay near this KL."""
-    gamma: Annotated[float, Interval(gt=0, le=1)] = 0.95
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-4
+    """Start value of the actor's step size; adapts to desired_kl."""
+    critic_learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
+    """The critic's own; with the actor's it would learn nothing in time."""
+    desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
+    """The actor's step size goes up or down by half to stay near this KL per joint."""
+    gamma: Annotated[float, Interval(gt=0, lt=1)] = 0.95
     """Discount per control period; a correction acts within the lag, and a longer view only adds variance."""
     lam: Annotated[float, Interval(gt=0, le=1)] = 0.95
     """GAE λ."""
     clip: Annotated[float, Interval(gt=0, le=1)] = 0.2
     """PPO clip range."""
-    critic_warmup: Annotated[int, Interval(ge=0, le=10000000)] = 10
-    """Updates of the critic alone, before a warm-started actor moves."""
-    init_std: Annotated[float, Interval(ge=0, le=1e6)] = 0.003
-    """Exploration σ at start, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
+    critic_warmup: Annotated[int, Interval(ge=0, le=10000000)] = 8
+    """Updates of the critic alone, before the actor moves."""
+    explained: Annotated[float, Interval(le=1)] = 0.5
+    """Share of the returns' variance that the critic must explain before the actor moves."""
+    std: Annotated[float, Interval(gt=0, le=1e6)] = 0.004
+    """Exploration σ, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
     and the best noisy policy is not the best policy."""
+    noise_time: Annotated[float, Interval(ge=0, le=1e6)] = 0.2
+    """Correlation time of the exploration, s; 0 for white noise."""
+    noise_share: Annotated[float, Interval(gt=0, le=1)] = 0.5
+    """Share of the joints that explore at a time; a joint at rest beside them shows what it does alone."""
     critic_hidden: Layers = (256, 128)
     """Hidden layers of the critic."""
 
@@ -93,7 +97,7 @@ class TrainConfig:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     seed: Annotated[int, Interval(ge=0, le=2**63)] = 0
     """Seed of everything random."""
-    episode_s: Annotated[float, Interval(gt=0, le=1e5)] = 10.0
+    episode_s: Annotated[float, Interval(gt=0, le=1e5)] = 40.0
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
     split: str = ""
     """Split file of gaponet data split; default: by motion, a fixed rule."""

@@ -6,8 +6,6 @@ from collections.abc import Sequence as ListOf
 
 import numpy as np
 import torch
-from rsl_rl.env import VecEnv
-from tensordict import TensorDict
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
@@ -22,16 +20,18 @@ from gaponet.training.config import RewardConfig
 
 Array = np.ndarray
 
+AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
-class DeltaEnv(VecEnv):
+
+class DeltaEnv:
     """num_envs simulations, each following one recording from a random frame on.
 
     A step is a decision: its correction is held for config.delta_hold control periods; its reward is their mean.
 
-    Observation groups: "actor" = x = [o_t | a_t], and more for some models; "critic" = that and the recorded states at
-    t and t+1, payload, rate (training only: the recorded state never reaches the actor). An environment keeps its
-    payload, rate and gains for life, in proportion to the frames recorded under them. A motion's end is a time-out,
-    not a failure.
+    Observation groups: "actor" = x = [o_t | a_t], and more for some models; "critic" = the recorded state now, recorded
+    positions and commands to come, payload, rate (training only: the recorded state never reaches the actor). An
+    environment keeps its payload, rate and gains for life, in proportion to the frames recorded under them. A motion's
+    end is a time-out, not a failure.
     """
 
     def __init__(
@@ -49,8 +49,6 @@ class DeltaEnv(VecEnv):
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
         self.robot, self.config, self.reward_config = robot, config, reward
-        self.cfg = {"reward": reward, "model": config}
-        self.device = "cpu"
         self.num_envs = num_envs
         self.num_actions = len(robot.operated)
         self.max_episode_length = episode_steps
@@ -63,11 +61,10 @@ class DeltaEnv(VecEnv):
         shortest = min(c[2] for c in self.conditions)
         under_way = 1 + int(np.ceil(robot.delay.max() / shortest))  # periods whose command a late servo has not met yet
         self.depth = max(self.loop.history.depth, under_way)
-        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.long)
+        self.elapsed = np.zeros(num_envs, np.int64)  # control periods since the reset
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
         self.first = np.zeros(num_envs, np.int64)  # first row of its recording
         self.last = np.zeros(num_envs, np.int64)
-        self.previous = np.zeros((num_envs, self.num_actions), np.float32)
         self.now = np.zeros((num_envs, self.track.shape[1]), np.float32)  # the recorded row, as in track
         self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
@@ -126,34 +123,41 @@ class DeltaEnv(VecEnv):
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
         self.loop.begin(ids, *(x[before][..., self.op] for x in (self.qpos, self.qvel, self.ctrl)))
-        self.previous[ids] = 0.0
-        self.episode_length_buf[ids] = 0
+        self.elapsed[ids] = 0
         self.now[ids] = self.track[t]
 
-    def get_observations(self) -> TensorDict:
+    def get_observations(self) -> dict[str, torch.Tensor]:
         """Actor and critic observations of the present row."""
-        state, op, sim = 2 * self.num_actions, self.op, self.sim
-        actor = self.loop.observe(sim.qpos[:, op], sim.qvel[:, op], self.now[:, state:], self.payload).copy()
-        then = self.track.take(self.row + 1, axis=0)
-        critic = np.concatenate([actor, self.now[:, :state], then[:, :state], self.condition_features], axis=1)
-        return TensorDict(
-            {"actor": torch.from_numpy(actor), "critic": torch.from_numpy(critic)}, batch_size=[self.num_envs]
-        )
+        n, sim = self.num_actions, self.sim
+        q, v = sim.qpos[:, self.op], sim.qvel[:, self.op]
+        actor = self.loop.observe(q, v, self.now[:, 2 * n :], self.payload).copy()
+        rows = np.minimum(self.row[:, None] + AHEAD, self.last[:, None])
+        ahead = self.track.take(rows, axis=0)  # (num_envs, rows ahead, 3n)
+        # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
+        seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
+                (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
+        critic = np.concatenate(seen, axis=1, dtype=np.float32)
+        return {"actor": torch.from_numpy(actor), "critic": torch.from_numpy(critic)}
 
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """Hold the correction for delta_hold control periods; each is compared with the recording one row on."""
-        delta = np.clip(actions.numpy(), -self.config.delta_max, self.config.delta_max)
-        reward = np.zeros(self.num_envs, np.float32)
+    def step(self, delta: Array) -> tuple[Array, Array]:
+        """Hold corrections for delta_hold control periods; each is compared with the recording one row on.
+
+        Args:
+            delta: (num_envs, n) rad.
+
+        Returns:
+            Mean reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,).
+        """
+        delta = np.clip(delta, -self.config.delta_max, self.config.delta_max)
+        reward = np.zeros((self.num_envs, self.num_actions), np.float32)
         for _ in range(self.config.delta_hold):
             self.advance(delta)
-            reward += self._reward(delta) / self.config.delta_hold
-            self.previous[:] = delta
-        done = self.ended() | (self.episode_length_buf.numpy() >= self.max_episode_length)
+            reward += self._reward() / self.config.delta_hold
+        done = self.ended() | (self.elapsed >= self.max_episode_length)
         ids = np.flatnonzero(done)
         if ids.size:
             self.reset(ids)
-        dones = torch.from_numpy(done)
-        return self.get_observations(), torch.from_numpy(reward), dones, {"time_outs": dones}
+        return reward, done
 
     def ended(self) -> Array:
         """Whether the recording has too few rows left for one more decision, (num_envs,)."""
@@ -168,23 +172,17 @@ class DeltaEnv(VecEnv):
         n.step(target)
         self.row += 1
         self.track.take(self.row, axis=0, out=self.now)
-        self.episode_length_buf += 1
+        self.elapsed += 1
 
-    def _reward(self, delta: Array) -> Array:
-        c, op, n = self.reward_config, self.op, self.num_actions
-        terms = [
-            (c.position, self.sim.qpos[:, op] - self.now[:, :n]),
-            (c.velocity, self.sim.qvel[:, op] - self.now[:, n : 2 * n]),
-            (c.delta, delta),
-            (c.delta_rate, delta - self.previous),
-        ]
-        cost = sum(weight / n * np.einsum("ij,ij->i", x, x) for weight, x in terms)
+    def _reward(self) -> Array:
+        c, n = self.reward_config, self.num_actions
+        cost = np.minimum(np.abs(self.sim.qpos[:, self.op] - self.now[:, :n]) / c.position, c.cap)
         self.reward_sum -= float(cost.mean())
         self.reward_count += 1
-        return (-cost).astype(np.float32)
+        return -cost.astype(np.float32)
 
     def mean_reward(self) -> float:
-        """Per step and environment since last asked."""
+        """Per step, environment and joint since last asked."""
         mean = self.reward_sum / max(self.reward_count, 1)
         self.reward_sum, self.reward_count = 0.0, 0
         return mean

@@ -35,7 +35,8 @@ class Kept:
     rounds_done: int = 0
     updates: int = 0
     sensor_r2: Report | None = None
-    runner: State | None = None
+    learner: State | None = None
+    """Of PPO: its critic and optimisers."""
     env: State | None = None
     """State of PPO's environments."""
     warm: State | None = None

@@ -1,140 +1,207 @@
-"""PPO by rsl_rl: our network as its actor, our environment as its VecEnv, one update at a time."""
+"""PPO in which every joint has its own reward, value, advantage and ratio.
+
+What a joint's correction does shows in that joint's error. Summed over the robot, the others' errors are noise in its
+advantage, and one ratio for all joints is clipped as soon as any of them moves. So the robot is n learners that share
+a network. The critic learns alone until it explains the returns (Andrychowicz et al. 2021 on why it has its own
+optimiser); exploration is correlated in time, since a servo filters white noise away (Korenkevych et al. 2019).
+"""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from rsl_rl.env import VecEnv
-from rsl_rl.models import MLPModel
-from rsl_rl.runners import OnPolicyRunner
-from tensordict import TensorDict
-from torch import nn
+from torch import Tensor, nn
 
-from gaponet.model.layers import DeltaNet
+from gaponet.model.layers import DeltaNet, Standardise, dense
 from gaponet.training.config import PPOConfig
 from gaponet.training.env import DeltaEnv
 
-STD_RANGE = (0.001, math.exp(-1))  # rad
+LOWEST, HIGHEST, FACTOR = 1e-6, 1e-3, 1.5  # bounds of the actor's step size, and its change when KL asks for one
 
 
-class PreparedEnv(VecEnv):
-    """An environment whose actor observation is what the network prepares from it.
+class Critic(nn.Module):
+    """Value of each joint, (B, n), from the network's features and what only training knows."""
 
-    Features and sensors are not trained here, so each sample passes them once, not once in every epoch of every update.
-    """
-
-    def __init__(self, env: DeltaEnv, net: DeltaNet) -> None:
-        self.env, self.net = env, net
-        self.num_envs, self.num_actions, self.device, self.cfg = env.num_envs, env.num_actions, env.device, env.cfg
-        self.max_episode_length, self.episode_length_buf = env.max_episode_length, env.episode_length_buf
-
-    def get_observations(self) -> TensorDict:
-        """Groups "actor", flattened, and "critic"."""
-        return self._prepared(self.env.get_observations())
-
-    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
-        """Step the environment."""
-        obs, reward, done, extras = self.env.step(actions)
-        return self._prepared(obs), reward, done, extras
-
-    def _prepared(self, obs: TensorDict) -> TensorDict:
-        with torch.inference_mode():
-            actor = self.net.prepare(obs["actor"]).flatten(1)
-        return TensorDict({"actor": actor, "critic": obs["critic"]}, batch_size=obs.batch_size)
-
-
-class Correct(nn.Module):
-    """The trained part of a network on flattened prepared inputs."""
-
-    def __init__(self, net: DeltaNet) -> None:
+    def __init__(self, features: int, seen: int, hidden: tuple[int, ...], n: int) -> None:
         super().__init__()
-        self.net = net
-        with torch.inference_mode():
-            self.shape = net.prepare(torch.zeros(1, net.config.input_dim(net.n))).shape[1:]
+        self.standardise, self.net = Standardise(seen), dense(features + seen, hidden, n)
 
-    def forward(self, prepared: torch.Tensor) -> torch.Tensor:
-        """(B, …) flattened → Δa, (B, n) rad."""
-        return self.net.correct(prepared.reshape(-1, *self.shape))
+    def forward(self, features: Tensor, seen: Tensor) -> Tensor:
+        return self.net(torch.cat([features, self.standardise(seen).clamp(-5.0, 5.0)], dim=1))
 
 
-class DeltaActor(MLPModel):
-    """rsl_rl's model with its MLP swapped for ours; normalisers are inside ours."""
+@dataclass
+class Batch:
+    """What was collected, one row per decision: targets, values and advantages are (B, n), of each joint."""
 
-    def __init__(
-        self,
-        obs: TensorDict,
-        obs_groups: dict[str, list[str]],
-        obs_set: str,
-        output_dim: int,
-        net: DeltaNet,
-        distribution_cfg: dict[str, Any],
-    ) -> None:
-        super().__init__(obs, obs_groups, obs_set, output_dim, hidden_dims=(1,), distribution_cfg=distribution_cfg)
-        self.mlp = Correct(net)
-
-    def get_latent(self, obs: TensorDict, masks: torch.Tensor | None = None, hidden_state: Any = None) -> torch.Tensor:
-        """The one observation group as it is; rsl_rl would copy it."""
-        return obs["actor"]
+    prepared: Tensor
+    features: Tensor
+    seen: Tensor
+    mean: Tensor
+    sampled: Tensor
+    """The correction less the part of its noise that was known before."""
+    explored: Tensor
+    """1 where the joint was disturbed; elsewhere nothing can be learned about its correction."""
+    advantage: Tensor
+    returns: Tensor
 
 
-def make_runner(env: DeltaEnv, net: DeltaNet, ppo: PPOConfig) -> OnPolicyRunner:
-    """A silent runner that trains a copy of net, its sensor predictor excepted; call `update` for one iteration."""
-    prepared = PreparedEnv(env, net)
-    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the models
-        runner = OnPolicyRunner(prepared, _runner_config(net, ppo), log_dir=None, device="cpu")
-    prepared.net = trained_by(runner)
-    if prepared.net.predictor is not None:
-        prepared.net.predictor.requires_grad_(False)
-    return runner
+@dataclass
+class Update:
+    """What an update found. Attributes: share of the returns' variance that the critic explains; KL of the actor's
+    step, per joint; step sizes; mean |Δa|, rad; mean reward."""
+
+    explained_variance: float = float("nan")
+    kl: float = float("nan")
+    learning_rate: float = float("nan")
+    critic_learning_rate: float = float("nan")
+    mean_delta: float = float("nan")
+    reward: float = float("nan")
 
 
-def trained_by(runner: OnPolicyRunner) -> DeltaNet:
-    """The network that a runner trains."""
-    return runner.alg.actor.mlp.net
+class Learner:
+    """A network, the environment it acts in, and a critic; `update` is one iteration."""
+
+    def __init__(self, env: DeltaEnv, net: DeltaNet, config: PPOConfig) -> None:
+        """net: Trained in place, its sensor predictor excepted."""
+        self.env, self.net, self.config = env, net, config
+        if net.predictor is not None:
+            net.predictor.requires_grad_(False)
+        self.trained = [p for p in net.parameters() if p.requires_grad]
+        observed = env.get_observations()
+        self.critic = Critic(net.features.dim, observed["critic"].shape[1], config.critic_hidden, env.num_actions)
+        self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
+        held = env.robot.dt * env.config.delta_hold
+        self.kept = math.exp(-held / config.noise_time) if config.noise_time else 0.0
+        self.spread = config.std * math.sqrt(1 - self.kept**2)
+        self.noise = torch.zeros(env.num_envs, env.num_actions)
+        self.updates, self.ready, self.found = 0, False, Update()
+
+    def update(self) -> Update:
+        """Run num_steps decisions in every environment, then learn from them."""
+        batch = self.collect()
+        self.learn(batch)
+        self.updates += 1
+        return self.found
+
+    def collect(self) -> Batch:
+        """Roll out with the present network; returns what was seen and what came of it."""
+        env, config = self.env, self.config
+        explored = (torch.rand_like(self.noise) < config.noise_share).float()
+        self.noise *= explored
+        rows: list[dict[str, Tensor]] = []
+        gamma = config.gamma**env.config.delta_hold  # a step is a decision
+        with torch.no_grad():
+            for _ in range(config.num_steps):
+                row = self.look()
+                known = self.kept * self.noise
+                self.noise = known + self.spread * explored * torch.randn_like(known)
+                delta = row["mean"] + self.noise
+                reward, done = (torch.from_numpy(x) for x in env.step(delta.numpy()))
+                row |= {"sampled": delta - known, "explored": explored, "done": done.float()[:, None]}
+                # The end of a motion is a time-out: what would have come is worth what the critic says of now.
+                row["reward"] = (1 - gamma) * reward + gamma * row["value"] * row["done"]
+                rows.append(row)
+            seen = {name: torch.stack([r[name] for r in rows]) for name in rows[0]}
+            last = self.look()["value"]
+            seen["advantage"] = advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
+            seen["returns"] = seen["advantage"] + seen["value"]
+            self._measure(seen)
+        fields = Batch.__dataclass_fields__
+        return Batch(**{name: x.flatten(0, 1).clone() for name, x in seen.items() if name in fields})
+
+    def look(self) -> dict[str, Tensor]:
+        """What the network and the critic make of the present state."""
+        observed = self.env.get_observations()
+        x, seen = observed["actor"], observed["critic"]
+        if not self.updates and not self.critic.standardise.mean.any():
+            self.critic.standardise.fit(seen)
+        prepared, features = self.net.prepare(x), self.net.features(x)
+        return {"prepared": prepared, "features": features, "seen": seen, "mean": self.net.correct(prepared),
+                "value": self.critic(features, seen)}  # fmt: skip
+
+    def _measure(self, seen: dict[str, Tensor]) -> None:
+        left = (seen["returns"] - seen["value"]).flatten(0, 1).var(0) / seen["returns"].flatten(0, 1).var(0)
+        found = self.found = Update(
+            explained_variance=1 - float(left.mean()), mean_delta=float(seen["mean"].abs().mean())
+        )
+        found.reward = self.env.mean_reward()
+        self.ready |= self.updates >= self.config.critic_warmup and found.explained_variance >= self.config.explained
+
+    def learn(self, batch: Batch) -> None:
+        """Fit the critic and, once it explains the returns, move the actor."""
+        config, explored = self.config, batch.explored
+        own = batch.advantage - (explored * batch.advantage).sum(0) / explored.sum(0)
+        batch.advantage = own / ((explored * own**2).sum(0) / explored.sum(0)).sqrt().clamp_min(1e-8)
+        distances = []
+        for _ in range(config.epochs):
+            for rows in torch.randperm(len(own)).chunk(config.mini_batches):
+                value = self.critic(batch.features[rows], batch.seen[rows])
+                self._descend(self.critic_optimiser, (value - batch.returns[rows]).square().mean())
+                if self.ready:
+                    distances.append(self._move(batch, rows))
+        self.found.kl = sum(distances) / max(len(distances), 1)
+        self.found.learning_rate = self.optimiser.param_groups[0]["lr"] if self.ready else 0.0
+        self.found.critic_learning_rate = self.config.critic_learning_rate
+
+    def _move(self, batch: Batch, rows: Tensor) -> float:
+        """One step of the actor; returns its KL from the network that collected, per joint that explored."""
+        mean, old, sampled = self.net.correct(batch.prepared[rows]), batch.mean[rows], batch.sampled[rows]
+        weight = batch.explored[rows] / batch.explored[rows].sum().clamp_min(1.0)
+        ratio = (((sampled - old) ** 2 - (sampled - mean) ** 2) / (2 * self.spread**2)).exp()
+        clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
+        advantage = batch.advantage[rows]
+        self._descend(self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum())
+        kl = float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.spread**2)
+        for group in self.optimiser.param_groups:
+            if kl > 2 * self.config.desired_kl:
+                group["lr"] = max(LOWEST, group["lr"] / FACTOR)
+            elif kl < self.config.desired_kl / 2:
+                group["lr"] = min(HIGHEST, group["lr"] * FACTOR)
+        return kl
+
+    @staticmethod
+    def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
+        optimiser.zero_grad()
+        loss.backward()
+        nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], 1.0)
+        optimiser.step()
+
+    def state(self) -> dict[str, Any]:
+        """All but the network and the environment, for a checkpoint."""
+        return {
+            "critic": self.critic.state_dict(), "optimiser": self.optimiser.state_dict(),
+            "critic_optimiser": self.critic_optimiser.state_dict(), "noise": self.noise,
+            "updates": self.updates, "ready": self.ready,
+        }  # fmt: skip
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Undo `state`."""
+        self.critic.load_state_dict(state["critic"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.critic_optimiser.load_state_dict(state["critic_optimiser"])
+        self.noise, self.updates, self.ready = state["noise"].clone(), state["updates"], state["ready"]
 
 
-def update(runner: OnPolicyRunner) -> None:
-    """Run one PPO iteration: num_steps control periods in every environment, then the update."""
-    runner.learn(1)
+def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+    """Generalised advantage estimates (Schulman et al. 2016).
 
-
-def _runner_config(net: DeltaNet, ppo: PPOConfig) -> dict[str, Any]:
-    return {
-        "num_steps_per_env": ppo.num_steps,
-        "save_interval": 10**9,
-        "check_for_nan": True,
-        "obs_groups": {"actor": ["actor"], "critic": ["critic"]},
-        "actor": {
-            "class_name": DeltaActor,
-            "net": net,
-            "distribution_cfg": {
-                "class_name": "GaussianDistribution",
-                "init_std": ppo.init_std,
-                "std_range": STD_RANGE,
-                "std_type": "log",
-            },
-        },
-        "critic": {
-            "class_name": "MLPModel",
-            "hidden_dims": ppo.critic_hidden,
-            "activation": "elu",
-            "obs_normalization": True,
-        },
-        "algorithm": {
-            "class_name": "PPO",
-            "num_learning_epochs": ppo.epochs,
-            "num_mini_batches": ppo.mini_batches,
-            "learning_rate": ppo.learning_rate,
-            "desired_kl": ppo.desired_kl,
-            "gamma": ppo.gamma**net.config.delta_hold,  # a step is a decision
-            "lam": ppo.lam,
-            "clip_param": ppo.clip,
-            "entropy_coef": 0.0,
-            "max_grad_norm": 1.0,
-            "schedule": "adaptive",
-        },
-    }
+    Args:
+        reward: (T, N, n), of a motion's last step with what is worth what would have come.
+        value: (T, N, n), of the state before each step.
+        last: (N, n), of the state after the last.
+        done: (T, N, 1), 1 where a motion ended.
+        gamma: Discount per step.
+        lam: λ.
+    """
+    found, ahead = torch.empty_like(reward), torch.zeros_like(last)
+    for t in reversed(range(len(reward))):
+        goes_on = 1 - done[t]
+        surprise = reward[t] + gamma * goes_on * last - value[t]
+        ahead = surprise + gamma * lam * goes_on * ahead
+        found[t], last = ahead, value[t]
+    return found

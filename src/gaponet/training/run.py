@@ -27,7 +27,7 @@ import torch
 
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import require_same_gains
-from gaponet.data.split import Parts, read_split, split_entries
+from gaponet.data.split import Parts, read_split, split_entries, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text, writing
@@ -59,11 +59,11 @@ from gaponet.training.gain import choose_gain
 from gaponet.training.inverse import inverse_labels
 from gaponet.training.kept import Kept
 from gaponet.training.loggers import Loggers
-from gaponet.training.ppo import make_runner, trained_by, update
+from gaponet.training.ppo import Learner, Update
 from gaponet.training.sensor_fit import points_of, torch_infer
 from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
-VALIDATION_RUNS = 24  # free runs per validation at most, evenly picked
+VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
 
 
 class Trainer:
@@ -96,7 +96,8 @@ class Trainer:
         if not config.mixed_gains:
             together = (e.meta for part in self.parts.values() for e in part)
             require_same_gains(together, dataset.joint_names, robot.operated)
-        self.train_set, self.val_set = (dataset.sequences(self.parts[p]) for p in ("train", "val"))
+        self.train_set = dataset.sequences(self.parts["train"])
+        self.val_set = dataset.sequences(spread(self.parts["val"], VALIDATION_RUNS))
         if not config.mixed_gains and (other := next((c for c in self._conditions() if c.kp or c.kd), None)):
             raise UsageError(
                 f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
@@ -107,9 +108,10 @@ class Trainer:
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, self.n)
-        untrained = copy.deepcopy(self.net.state_dict())
-        self.kept = Kept(untrained, untrained, dataset=dataset_hash(dataset.entries))
-        self.reward = self.nominal = float("nan")
+        self.untrained = copy.deepcopy(self.net.state_dict())
+        self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
+        self.nominal = float("nan")
+        self.found = Update()
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
@@ -138,7 +140,7 @@ class Trainer:
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
             if recipe(self.config).rounds > self.kept.rounds_done:
                 self._warm_start()
-            elif not recipe(self.config).rounds and self.kept.runner is None:
+            elif not recipe(self.config).rounds and self.kept.learner is None:
                 self._cold_start()
             self._ppo()
             self._shrink()
@@ -199,29 +201,33 @@ class Trainer:
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
         env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        self.net.load_state_dict(self.kept.trained_state)
-        runner = make_runner(env, self.net, ppo)
-        if self.kept.runner is not None:
-            runner.alg.load(self.kept.runner, None, True)
-        if self.kept.env is not None:
+        if self.kept.learner is None:
+            self.net.load_state_dict(self._ppo_start())
+        learner = Learner(env, self.net, ppo)
+        if self.kept.learner is not None and self.kept.env is not None:
+            learner.load(self.kept.learner)
             restore_env(env, self.kept.env)
             torch.set_rng_state(self.rng)
-        self.kept.warm, self.net = None, trained_by(runner)
+        self.kept.warm = None
         env.loop.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
-        trained = [p for p in runner.alg.actor.parameters() if p.requires_grad]
         while self._spent() < 1:
-            for p in trained:  # first let the critic learn what the policy is worth
-                p.requires_grad_(self.kept.updates >= ppo.critic_warmup)
-            update(runner)
+            self.found = learner.update()
             self.kept.updates += 1
             self.kept.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
-            self.reward = env.mean_reward()
             self._tick()
             if self.kept.updates % self.config.validate_every == 0:
-                self.kept.runner, self.kept.env = runner.alg.save(), env_state(env)
+                self.kept.learner, self.kept.env = learner.state(), env_state(env)
                 self._consider()
-        self.kept.runner, self.kept.env = runner.alg.save(), env_state(env)
+        self.kept.learner, self.kept.env = learner.state(), env_state(env)
         self._consider()
+
+    def _ppo_start(self) -> State:
+        """The best of the warm start or, where that is worse than no correction, the untrained network beside it."""
+        best = self.kept.trained_state
+        if self.kept.trained <= self.kept.progress[0]["val_mpjae"] or not recipe(self.config).rounds:
+            return best
+        fitted_before = ("predictor.", "points.", "features.", "answers.")
+        return {k: v if k.startswith(fitted_before) else self.untrained[k] for k, v in best.items()}
 
     def _shrink(self) -> None:
         """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
@@ -259,12 +265,13 @@ class Trainer:
 
         Nominal is the simulator before identification, also where training starts from an identified one.
         """
-        picked = self.val_set[:: -(-len(self.val_set) // VALIDATION_RUNS)]
         corrector = self._corrector(net) if net is not None else None
         simulator = self.robot if net is not None else self.robot.nominal or self.robot
-        twins = replay(picked, simulator, corrector, self.config.threads, lock_idle=True)
+        twins = replay(self.val_set, simulator, corrector, self.config.threads, lock_idle=True)
         op = self.robot.operated_index
-        return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(picked, twins, strict=True)]))
+        return float(
+            np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(self.val_set, twins, strict=True)])
+        )
 
     def _corrector(self, net: DeltaNet) -> DeltaCorrector:
         config = self.config.model
@@ -280,9 +287,11 @@ class Trainer:
         if self.stage in ("warm start", "ppo") and self.kept.val < self.kept.trained:
             self.kept.trained, self.kept.trained_state = self.kept.val, copy.deepcopy(net.state_dict())
         line = {
-            "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1), "reward": self.reward,
+            "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1),
             "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
+        if self.stage == "ppo":
+            line |= vars(self.found)
         self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
         self._save()
@@ -299,7 +308,7 @@ class Trainer:
         """Show where the run stands; returns the share of the budget spent."""
         k, spent = self.kept, self._spent()
         share = min(spent, 1.0)
-        self.show(Status(self.stage, share, k.steps, self.seconds(), self.reward, k.val, k.best, self.nominal))
+        self.show(Status(self.stage, share, k.steps, self.seconds(), self.found.reward, k.val, k.best, self.nominal))
         return spent
 
     def _save(self) -> None:
@@ -357,7 +366,7 @@ class Trainer:
                 "warm_start_rounds": [self.kept.rounds_done, recipe(self.config).rounds],
                 "ppo_updates": self.kept.updates,
             },
-            versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch", "rsl-rl-lib")}
+            versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
         )
 
