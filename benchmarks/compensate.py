@@ -79,7 +79,7 @@ def play(
     """Measured positions, commands and the shadow's positions of the operated joints, (T, N, n) rad each."""
     op, count = robot.operated_index, len(mass)
     locked = idle_joints(robot, robot.operated)
-    physics = load_fleet("default", robot).unit(unit)
+    physics = load_fleet("easy", robot).unit(unit)
     robots = VirtualRobot(robot, [physics] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked)
     robots.reset(targets[0], list(range(count)), WARMTH)
     shadow = replace(AT_ONCE, aim="simulator", iterations=0, feedback=0.0)  # sends what it is given

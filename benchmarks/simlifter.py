@@ -81,7 +81,7 @@ def speed(robot: RobotSpec, names: list[str], count: int, nproc: int) -> dict[st
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "data"
         part = replace(recipe, motions=spread(names, count))
-        done = collect(robot, load_fleet("default", robot), part, out, nproc=nproc)
+        done = collect(robot, load_fleet("easy", robot), part, out, nproc=nproc)
         cpu.append(cpu_s())
         size, twins_size = (sum(f.stat().st_size for f in (out / d).rglob("*.parquet")) for d in (".", "twins"))
         channels = sorted(set.intersection(*(set(e.channels) for e in Dataset(out).entries)))
@@ -114,7 +114,7 @@ def gap(robot: RobotSpec, names: list[str], nproc: int) -> tuple[dict[str, Any],
         load_recipe("simlifter"), motions=spread(upper, 12), units=UNITS, rates=(50.0,), repetitions=2
     )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        collect(robot, load_fleet("default", robot), recipe, Path(folder) / "data", nproc=nproc, twins=False)
+        collect(robot, load_fleet("easy", robot), recipe, Path(folder) / "data", nproc=nproc, twins=False)
         sequences = Dataset(Path(folder) / "data").sequences()
     twins = replay(sequences, robot, nthread=nproc, lock_idle=True)
     both = runs(sequences, [t.qpos for t in twins], robot)
@@ -153,7 +153,7 @@ def page(result: dict[str, Any]) -> str:
     yard = " and ".join(f"{x:.0f}" for x in s["mj_step_us"])
     return f"""# The virtual SimLifter dataset
 
-**Every number on this page is from virtual H1-2 robots (fleet `default`).** {date.today()}, 2 cores, no GPU.
+**Every number on this page is from virtual H1-2 robots (fleet `easy`).** {date.today()}, 2 cores, no GPU.
 Regenerate: `python benchmarks/simlifter.py`.
 
 ## Speed and size

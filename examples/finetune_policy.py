@@ -172,7 +172,7 @@ class Unit:
     """One virtual unit, once per payload and motion, behind the calls of AlignedSim; its sensors are all one sees."""
 
     def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array) -> None:
-        physics = load_fleet("default", robot).unit(name)
+        physics = load_fleet("easy", robot).unit(name)
         payloads = [(float(mass), "both") for mass in payload_mass]
         self.robots = VirtualRobot(robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0)
         self.payload_mass, self.free, self.home = payload_mass, robot.index(task.joints), robot.qpos_home
@@ -267,7 +267,7 @@ def main(
         more: Further updates, once in the aligned and once in the nominal simulator.
         num_envs: Simulations side by side.
         seeds: All is learnt anew with each.
-        unit: Of the default fleet.
+        unit: Of the easy fleet.
         quick: Only see that it runs.
     """
     begin = time.perf_counter()

@@ -46,7 +46,7 @@ def spec(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fleet(spec):
-    return load_fleet("default", spec)
+    return load_fleet("easy", spec)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ if __name__ == "__main__":
     gaponet.collect.ROWS = (4, 4)  # four jobs: the last two are still being played when the first two are written
     robot = load_robot(sys.argv[1])
     recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
-    collect(robot, load_fleet("default", robot), recipe, sys.argv[2], seed=5, nproc=2)
+    collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
 """
 
 
@@ -159,7 +159,7 @@ def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tm
     child.wait()
     assert 0 < len(Dataset(out)) < 16
     _wait_for_orphans(child.pid)
-    collect(spec, load_fleet("default", spec), RECIPE, out, seed=5, nproc=1)
+    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=1)
     assert list(hashes(out).items()) == list(hashes(whole[0]).items())
     assert len(list((out / "sequences").glob("*.parquet"))) == 16
     assert not list((out / "sequences").glob(".*"))
@@ -182,8 +182,8 @@ def _wait_for_orphans(session):
 def test_what_something_else_collected_is_not_mixed(whole, spec):
     out, _ = whole
     with pytest.raises(DatasetError, match=r"was collected with seed 5, not 6 \(collect.json\); choose another folder"):
-        collect(spec, load_fleet("default", spec), RECIPE, out, seed=6, nproc=1)
-    with pytest.raises(DatasetError, match="was collected with fleet 'default', not 'shifted'"):
+        collect(spec, load_fleet("easy", spec), RECIPE, out, seed=6, nproc=1)
+    with pytest.raises(DatasetError, match="was collected with fleet 'easy', not 'shifted'"):
         collect(spec, load_fleet("shifted", spec), RECIPE, out, seed=5, nproc=1)
 
 
@@ -200,7 +200,7 @@ def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
         load_recipe("big")
     with pytest.raises(UsageError, match="recipe 'test': no motion of this robot matches 'reach"):
         collect(spec, fleet, replace(RECIPE, motions=("reach-*",)), tmp_path / "a", nproc=1)
-    with pytest.raises(UsageError, match="fleet 'default' has no unit 'virtual-9'"):
+    with pytest.raises(UsageError, match="fleet 'easy' has no unit 'virtual-9'"):
         collect(spec, fleet, replace(RECIPE, units=("virtual-9",)), tmp_path / "a", nproc=1)
     with pytest.raises(UsageError, match="repetitions and variants are counts"):
         replace(RECIPE, repetitions=0)

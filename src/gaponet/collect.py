@@ -39,6 +39,7 @@ __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
 
 Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
 
+CLAIM, HARD = "collect.json", "hard"
 MOST_PROCESSES = 1024
 ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
 
@@ -118,6 +119,16 @@ def collect(
     return Collected(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
 
 
+def fleet_of(dataset: Dataset) -> str:
+    """Name of the fleet that a dataset was collected from; `hard` where it was not collected here."""
+    path = dataset.path / CLAIM
+    return str(_claimed(path).get("fleet", HARD)) if path.is_file() else HARD
+
+
+def _claimed(path: Path) -> dict[str, Any]:
+    return read_json(dict[str, Any], path, DatasetError, "restore it or collect into another folder")
+
+
 def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> tuple[object, ...]:
     """What a sequence is, apart from its samples; two of the same key would be the same recording."""
     return motion, unit, payload, round(dt * 1e9), repetition
@@ -129,7 +140,7 @@ def _listed(dataset: Dataset) -> list[tuple[SequenceMeta, float]]:
 
 def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int) -> None:
     """Write beside the data what made it; refuse to mix it with what something else made."""
-    path = dataset.path / "collect.json"
+    path = dataset.path / CLAIM
     mine = {
         "virtual": True,
         "robot": robot.name,
@@ -140,7 +151,7 @@ def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, see
         "payload_side": recipe.payload_side,
     }
     if path.is_file():
-        theirs = read_json(dict[str, Any], path, DatasetError, "restore it or collect into another folder")
+        theirs = _claimed(path)
         for key, value in mine.items():
             if theirs.get(key) != value:
                 raise DatasetError(

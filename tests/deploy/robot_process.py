@@ -45,7 +45,7 @@ def main(domain: int) -> None:
     from gaponet.virtual.fleet import load_fleet
 
     robot = load_robot("h1_2")
-    served = VirtualH12(robot, load_fleet("default", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
+    served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
     threading.Thread(target=served.run, daemon=True).start()
     for line in sys.stdin:
         word, _, rest = line.strip().partition(" ")

@@ -35,7 +35,7 @@ class Tampered(VirtualDriver):
     """A virtual arm that lies, is late or goes silent from some time after its connection on; notes what it is sent."""
 
     def __init__(self, robot: RobotSpec, clock: SimulatedClock, at: float = np.inf, kind: str = "") -> None:
-        super().__init__(robot, load_fleet("default", robot).unit("virtual-1"), clock, period=0.01)
+        super().__init__(robot, load_fleet("easy", robot).unit("virtual-1"), clock, period=0.01)
         self.at, self.kind = at, kind
         self.sent: list[tuple[float, np.ndarray | None]] = []
 

@@ -57,7 +57,7 @@ def _dataset(folder: Path) -> None:
         data.state(licence="CC0-1.0")
         write_split(data, make_split(data, "motion"), "motion")
         (data.path / "offsets.json").write_text(json.dumps({"applied": False, "unit": "rad", "units": {}}))
-        (data.path / "collect.json").write_text(json.dumps({"fleet": "default", "seed": 0}))
+        (data.path / "collect.json").write_text(json.dumps({"fleet": "easy", "seed": 0}))
         _copy(data.path, folder)
 
 
@@ -169,15 +169,17 @@ def _use_run(source: Path, out: Path) -> None:
 
 
 def _fleet(folder: Path) -> None:
-    head = (FLEETS / "default.toml").read_text(encoding="utf-8").split(MARK)[0]
-    units = load_fleet("default", arm()).units
-    (folder / "mine.toml").write_text(head + MARK + to_toml(arm(), units), encoding="utf-8")
+    head = (FLEETS / "easy.toml").read_text(encoding="utf-8").split(MARK)[0]
+    fleet = load_fleet("easy", arm())
+    (folder / "mine.toml").write_text(head + MARK + to_toml(arm(), fleet.units, fleet.distributions), encoding="utf-8")
 
 
 def _use_fleet(source: Path, out: Path) -> None:
     for name, unit in load_fleet(source / "mine.toml", arm()).units.items():
         for field, value in vars(unit).items():
-            if np.isnan(value).any() or (np.isinf(value).any() and field not in ("motor_constant", "supply_voltage")):
+            if np.isnan(value).any() or (
+                np.isinf(value).any() and field not in ("motor_constant", "supply_voltage", "no_load_speed")
+            ):
                 raise AbsurdError(f"{name}: {field} is {value}")
 
 

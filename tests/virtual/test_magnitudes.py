@@ -1,4 +1,4 @@
-"""How large the default fleet's gap is: what a user sees on an H1-2, and growing with the payload."""
+"""How large the easy fleet's gap is: what a user sees on an H1-2, and growing with the payload."""
 
 import itertools
 
@@ -30,7 +30,7 @@ def played():
     robot = load_robot("h1_2")
     library, locked = Library(robot), idle_joints(robot, robot.operated)
     free = robot.index([name for name in robot.joint_names if name not in locked])
-    unit = load_fleet("default", robot).unit("virtual-1")
+    unit = load_fleet("easy", robot).unit("virtual-1")
     motions = [library.make(name).sample(robot.dt)[:450] for name in MOTIONS]
     rows = max(len(m) for m in motions)
     ctrl = np.stack([np.concatenate([m, np.repeat(m[-1:], rows - len(m), axis=0)]) for m in motions], axis=1)

@@ -8,11 +8,13 @@ import pytest
 from gaponet.virtual.motor import (
     COPPER,
     Backlash,
+    Bristles,
     CommandLink,
     Thermal,
     cogging_torque,
     friction_limit,
     supply_share,
+    torque_share,
 )
 from gaponet.virtual.physics import Physics, neutral, stack
 
@@ -50,6 +52,50 @@ def test_a_gear_loses_less_when_driving_than_when_driven():
     p = one(efficiency=0.8)
     assert limit(p, qvel=1.0, torque=10.0, nominal=0.0) == pytest.approx(2.0)  # (1 − 0.8) · 10
     assert limit(p, qvel=-1.0, torque=10.0, nominal=0.0) == pytest.approx(2.5)  # (1/0.8 − 1) · 10
+
+
+def test_warmth_takes_from_dry_friction_and_not_from_the_gears_part():
+    p = one(friction=1.0, efficiency=0.8)
+    value = friction_limit(p, np.array([0.2]), *(np.array([[x]]) for x in (1.0, 10.0, 0.0)), np.array([[0.5]]))
+    assert float(value[0, 0]) == pytest.approx(0.5 * 1.2 + 2.0)
+    thermal = Thermal(one(thinning=0.01))
+    thermal.reset(np.array([[45.0]]))
+    assert float(thermal.thinned()[0, 0]) == pytest.approx(np.exp(-0.2))  # 20 K: 82 % is left
+
+
+def slide(bristles, path, g=1.2, h=1e-3):
+    """Torque of bristles after a joint has followed speeds, one a millisecond."""
+    for v in path:
+        bristles.step(np.array([[g]]), np.array([[v]]), h)
+    return float(bristles.torque[0, 0])
+
+
+def test_bristles_bend_as_the_exponential_of_dahl():
+    # σ = (0.2 + 1.0) / 2 mrad = 600 N·m/rad; after 2 mrad one way 1 − 1/e of the limit, after 20 mrad all of it
+    p, cold = one(friction=1.0, presliding=0.002), np.array([[0.0]])
+    bristles = Bristles(p, np.array([0.2]))
+    bristles.reset(cold, np.array([[1.2]]))
+    assert slide(bristles, [0.01] * 200) == pytest.approx(1.2 * (1 - np.exp(-1)))
+    assert slide(bristles, [0.01] * 1800) == pytest.approx(1.2, rel=1e-3)
+    # back by 2 mrad: from +1.2 towards −1.2, 1 − 1/e of the way
+    assert slide(bristles, [-0.01] * 200) == pytest.approx(-1.2 + 2.4 * np.exp(-1), rel=1e-3)
+
+
+def test_bristles_keep_their_torque_at_rest_and_start_with_what_they_are_given():
+    bristles = Bristles(one(friction=1.0, presliding=0.002), np.array([0.2]))
+    bristles.reset(np.array([[0.7]]), np.array([[1.2]]))
+    assert slide(bristles, [0.0] * 1000) == 0.7
+    bristles.reset(np.array([[-9.0]]), np.array([[1.2]]))
+    assert slide(bristles, []) == -1.2
+    assert not Bristles(one(friction=1.0), np.array([0.2])).any
+
+
+def test_torque_falls_from_the_corner_to_the_no_load_speed():
+    p = one(no_load_speed=10.0, corner=0.6)
+    share = lambda v: float(torque_share(p, np.array([[v]]))[0, 0])  # noqa: E731
+    assert [share(v) for v in (-20.0, 0.0, 6.0, 10.0, 12.0)] == pytest.approx([1.0, 1.0, 1.0, 0.0, 0.0])
+    assert share(8.0) == pytest.approx(0.5)
+    assert float(torque_share(one(), np.array([[1e3]]))[0, 0]) == 1.0
 
 
 def test_backlash_is_crossed_in_the_time_of_a_free_rotor():

@@ -1,6 +1,6 @@
 """A virtual robot as a whole: with all effects off it is the nominal simulator, and each effect shows its signature."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -10,10 +10,11 @@ from gaponet.sim.batch import BatchSim
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.virtual.fleet import load_fleet
-from gaponet.virtual.physics import EFFECTS, neutral
+from gaponet.virtual.physics import EFFECTS, Physics, neutral
 from gaponet.virtual.unit import VirtualRobot
 
 KP = 20.0  # of both joints of the test arm
+FIELDS = {e: [f.name for f in fields(Physics) if f.metadata["effect"] == e] for e in EFFECTS}
 
 
 def unit(n=2, **values):
@@ -61,7 +62,7 @@ def test_standing_legs_change_nothing_for_the_arms():
     time = np.arange(100)[:, None] * robot.dt
     ctrl = np.zeros((100, 27))
     ctrl[:, robot.operated_index] = 0.3 * np.sin(2 * time + np.arange(10)) - 0.3 * np.sin(np.arange(10))
-    physics = load_fleet("default", robot).unit("virtual-1")
+    physics = load_fleet("easy", robot).unit("virtual-1")
     whole, _ = run(robot, [physics], ctrl, 3.0)
     upper, _ = run(robot, [physics], ctrl, 3.0, locked=locked)
     assert len(locked) == 12
@@ -69,7 +70,7 @@ def test_standing_legs_change_nothing_for_the_arms():
 
 
 def test_a_row_does_not_depend_on_its_company(arm):
-    fleet = load_fleet("default", arm)
+    fleet = load_fleet("easy", arm)
     ctrl = hold(0.3) + 0.3 * np.sin(np.linspace(0, 9, 50))[:, None]
     alone, _ = run(arm, [fleet.unit("virtual-1")], ctrl, 0.2)
     among, _ = run(arm, [fleet.unit(f"virtual-{k}") for k in (1, 2, 3, 4)], ctrl, 0.2)
@@ -102,6 +103,75 @@ def test_friction_opens_a_hysteresis_loop_of_twice_its_torque(arm):
 def test_a_stuck_joint_does_not_creep(arm):
     path, _ = run(arm, [unit(friction=0.5)], hold(0.4, seconds=20.0), start=np.array([0.42, 0.01]))
     assert np.abs(path[-1] - path[50]).max() < 5e-4  # friction is a stiff constraint, not a rigid one: 20 µrad/s
+
+
+HANGING = np.array([1.4, np.pi / 2 - 1.4])  # no weight on the elbow
+
+
+def pushed(elbow, seconds=0.4, dt=0.02):
+    return np.repeat(HANGING[None] + [[0.0, elbow]], round(seconds / dt), axis=0)
+
+
+def test_bristles_give_way_like_a_spring_and_come_back(arm):
+    slowly = np.concatenate([np.linspace(0, 0.02, 50), np.linspace(0.02, 0, 50)])
+    ctrl = HANGING + np.stack([0 * slowly, slowly], axis=1)
+    path, _ = run(arm, [unit(friction=1.0, presliding=0.02), unit(friction=1.0)], ctrl, start=HANGING)
+    q = path[:, :, 1] - HANGING[1]
+    # 20 (0.02 − x) = 1.05 (1 − exp(−x / 0.02)) at 6.15 mrad; back, −20 x = −1.05 + 1.33 exp(−(6.15 mrad − x) / 0.02)
+    assert q[49, 0] == pytest.approx(6.15e-3, rel=0.03)
+    assert q[-1, 0] == pytest.approx(0.85e-3, abs=0.2e-3)
+    assert np.abs(q[:, 1]).max() < 1e-4  # rigid friction holds
+
+
+def test_a_robot_at_rest_stays_there_under_bristles(arm):
+    path, _ = run(arm, [unit(friction=1.0, presliding=0.002)], hold(0.4, 0.3, 20.0))
+    assert np.abs(path[-1] - path[0]).max() < 1e-5
+
+
+def test_a_compliant_joint_hangs_below_what_its_encoder_says(arm):
+    # 0.883 N·m at the shoulder through 0.1 rad at 5 N·m: 17.7 mrad that the encoder does not see
+    path, robots = run(arm, [unit(windup=0.1), unit()], hold(0.0, seconds=3.0))
+    seen = robots.read().qpos
+    twist = seen[:, 0] - path[-1, :, 0]
+    load = static_torque(build_model(arm), path[-1, :1])[0, 0]
+    assert abs(load) == pytest.approx(0.883, rel=0.05)
+    assert twist[0] == pytest.approx(0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0)  # less what friction carries
+    assert twist[1] == 0.0
+    assert seen[0, 0] == pytest.approx(seen[1, 0], abs=0.006)  # the drive holds its own side as well as ever
+
+
+def test_the_current_loop_delays_by_its_time_constant(arm):
+    given = []
+    for time in (0.0, 0.05):
+        _, robots = run(arm, [unit(current_time=time, friction=9.0)], pushed(0.0), start=HANGING)
+        force = robots.batch.bind("actuator_force")  # of the call after this
+        robots.step(pushed(0.1)[:1])
+        given.append(force[0, 1])
+    assert given[0] == pytest.approx(0.1 * KP, rel=0.01)
+    assert given[1] == pytest.approx(0.1 * KP * (1 - np.exp(-0.02 / 0.05)), rel=0.02)
+
+
+def test_a_joint_does_not_reach_its_no_load_speed(arm):
+    fastest = []
+    for limit in (np.inf, 2.0):
+        path, _ = run(arm, [unit(no_load_speed=limit, corner=0.5)], pushed(1.2), start=HANGING)
+        fastest.append(np.diff(path[:, 0, 1]).max() / 0.02)
+    assert fastest[0] > 3.0
+    # where 5 N·m · (1 − v/2) / 0.5 is what damping and friction take, 0.5 v + 0.05: v = 1.8
+    assert fastest[1] == pytest.approx(1.8, abs=0.05)
+
+
+def test_a_warm_joint_has_less_friction(arm):
+    ramp = np.stack([np.full(220, HANGING[0]), HANGING[1] + np.minimum(np.arange(220) / 1000, 0.2)], axis=1)
+    short = []
+    for warmth in (0.0, 50.0):
+        robots = VirtualRobot(arm, [unit(friction=1.0, thinning=0.014)], [(0.0, "both")])
+        robots.reset(ramp[:1], [0], warmth, start=HANGING[None])
+        for row in ramp:
+            robots.step(row[None])
+        short.append(ramp[-1, 1] - robots.true_qpos()[0, 1])
+    # it stops short by its friction over kp: 1.05 / 20 cold, exp(−0.7) of that 50 K warmer
+    assert short == pytest.approx([1.05 / KP, 1.05 / KP * np.exp(-0.7)], rel=0.1)
 
 
 def test_load_friction_widens_with_the_payload(arm):
@@ -203,7 +273,7 @@ def test_readings_are_quantised_shifted_and_noisy_but_the_robot_is_not(arm):
 
 
 def test_reading_twice_gives_the_same(arm):
-    _, robots = run(arm, [load_fleet("default", arm).unit("virtual-1")], hold(0.5))
+    _, robots = run(arm, [load_fleet("easy", arm).unit("virtual-1")], hold(0.5))
     assert np.array_equal(robots.read().qpos, robots.read().qpos)
 
 
@@ -217,7 +287,7 @@ def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
 
 def test_repetitions_differ_far_less_than_the_gap():
     robot = load_robot("h1_2")
-    physics = load_fleet("default", robot).unit("virtual-2")
+    physics = load_fleet("easy", robot).unit("virtual-2")
     time = np.arange(150)[:, None] * robot.dt
     ctrl = np.zeros((150, 27))
     ctrl[:, robot.operated_index] = 0.4 * (1 - np.cos(1.5 * time)) * np.resize([-1.0, 0.5], 10)
@@ -234,13 +304,18 @@ def test_repetitions_differ_far_less_than_the_gap():
 def test_every_effect_has_a_switch_that_matters(arm, effect):
     """With one effect switched on, something that is seen differs from the robot without any."""
     physics = load_fleet("shifted", arm).unit("virtual-1").only([effect])
+    if effect in ("presliding", "thinning", "compliance", "current_loop", "torque_speed"):  # not in that fleet
+        physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
+        physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
+    if effect == "stribeck":
+        physics = replace(physics, friction=np.full(2, 0.5))
     if effect == "backlash":
         physics = replace(physics, backlash=np.full(2, 0.03))
     if effect == "supply":
         physics = replace(physics, motor_constant=np.full(2, 0.3))
     ctrl = hold(0.2, 0.1, 2.0) + 0.6 * np.sin(np.linspace(0, 25, 100))[:, None]
     seen = []
-    for u in (physics, unit()):
+    for u in (physics, replace(physics, **{f: getattr(unit(), f) for f in FIELDS[effect]})):
         robots = VirtualRobot(arm, [u], [(0.3, "both")])
         robots.reset(ctrl[:1], [0], 12.0, start=ctrl[:1])
         for row in ctrl:

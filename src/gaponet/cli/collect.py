@@ -14,7 +14,7 @@ from gaponet.progress import bar
 def collect(
     out: Path,
     robot: str = "h1_2",
-    fleet: str = "default",
+    fleet: str = "hard",
     recipe: str = "small",
     payloads: tuple[float, ...] = (),
     units: tuple[str, ...] = (),
@@ -29,7 +29,7 @@ def collect(
     Args:
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
-        fleet: Virtual units: default, shifted, or a .toml file.
+        fleet: Virtual units: hard, easy, shifted, or a .toml file.
         recipe: demo (under a minute), small (about two), simlifter (an hour), arm (any robot), or a .toml file.
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.

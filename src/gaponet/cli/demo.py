@@ -76,5 +76,5 @@ def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tup
     from gaponet.cli.collect import collect
 
     screen.say("No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones.")
-    collect(robot=robot, fleet="default", recipe="demo", out=path)
+    collect(robot=robot, fleet="easy", recipe="demo", out=path)
     return ("virtual-4",)

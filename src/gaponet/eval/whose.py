@@ -18,4 +18,6 @@ def label(dataset: Dataset) -> str:
     if not any(virtual):
         return f"Recordings of a real {dataset.robot_name}."
     some = "" if all(virtual) else "Partly "
-    return f"{some}VIRTUAL {dataset.robot_name}: these numbers say nothing about real hardware."
+    fleets = sorted({e.meta.source for e in dataset.entries if e.meta.virtual and "fleet" in e.meta.source})
+    named = f" ({', '.join(fleets)})" if fleets else ""
+    return f"{some}VIRTUAL {dataset.robot_name}{named}: these numbers say nothing about real hardware."

@@ -12,7 +12,7 @@ from gaponet.errors import UsageError
 from gaponet.files import write_text
 from gaponet.robot import load_robot
 from gaponet.structure import validated
-from gaponet.virtual.fleet import FLEETS, UNITS, FleetTable, complete, draw, to_toml
+from gaponet.virtual.fleet import FLEETS, UNITS, FleetTable, draw, known, to_toml
 
 MARK = "\n# ---- drawn units ----\n"
 
@@ -22,10 +22,10 @@ def main(fleet: str, robot_name: str) -> None:
     path = FLEETS / f"{fleet}.toml"
     head = path.read_text(encoding="utf-8").split(MARK)[0]
     table = validated(FleetTable, tomllib.loads(head), path, UsageError)
-    seed, laws = table["seed"], complete(table["distribution"], path)
+    seed, laws = table["seed"], known(table["distribution"], path)
     robot = load_robot(robot_name)
     units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
-    write_text(path, head + MARK + to_toml(robot, units))
+    write_text(path, head + MARK + to_toml(robot, units, laws))
 
 
 if __name__ == "__main__":

@@ -1,15 +1,15 @@
 """Fleets: virtual units drawn once from written-down distributions, and kept as data.
 
-A fleet file (fleets/*.toml) holds a seed, one [[distribution]] per hidden parameter with its source, and the drawn
-units. All units of a type share what the type has (type_spread, from joint to joint) and differ by what production
-leaves open (unit_spread for the whole unit, joint_spread for each joint of it). For a robot whose units are not in the
-file they are drawn when the fleet is loaded, by the same rule.
+A fleet file (fleets/*.toml) holds a seed, one [[distribution]] with its source per hidden parameter that does something
+in it, and the drawn units. All units of a type share what the type has (type_spread, from joint to joint) and differ by
+what production leaves open (unit_spread for the whole unit, joint_spread for each joint of it). For a robot whose units
+are not in the file they are drawn when the fleet is loaded, by the same rule.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, NotRequired
 
@@ -20,7 +20,7 @@ from typing_extensions import TypedDict
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.structure import Extended, Name, load_toml, validated
-from gaponet.virtual.physics import Physics
+from gaponet.virtual.physics import Physics, neutral
 
 Array = np.ndarray
 
@@ -94,31 +94,29 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
     """
     path, loaded = load_toml("fleet", FLEETS, name_or_path)
     table = validated(FleetTable, loaded, path, UsageError)
-    seed, laws = table["seed"], complete(table["distribution"], path)
+    seed, laws = table["seed"], known(table["distribution"], path)
     saved = table.get("robot", {}).get(robot.name)
     if saved is None:
         units = {f"virtual-{k}": draw(robot, laws, seed, k) for k in range(1, UNITS + 1)}
         for unit_id, unit in units.items():
             _require_possible(unit, f"{path}: unit '{unit_id}', drawn from the distributions")
     else:
-        units = {unit_id: _physics(unit_id, unit, robot, path) for unit_id, unit in saved.items()}
+        drawn = {law.name for law in laws}
+        units = {unit_id: _physics(unit_id, unit, drawn, robot, path) for unit_id, unit in saved.items()}
     return Fleet(table.get("name", path.stem), robot.name, seed, laws, units)
 
 
-def complete(laws: tuple[Distribution, ...], path: Path) -> tuple[Distribution, ...]:
-    """The same; refuses a parameter that is unknown, missing or there twice. path is for messages."""
-    known, named = [f.name for f in fields(Physics)], [law.name for law in laws]
+def known(laws: tuple[Distribution, ...], path: Path) -> tuple[Distribution, ...]:
+    """The same; refuses a parameter that does not exist or is there twice. path is for messages."""
+    parameters, named = [f.name for f in fields(Physics)], [law.name for law in laws]
     for name in named:
-        if name not in known or named.count(name) > 1:
-            raise UsageError(f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(known)}")
-    missing = set(known) - set(named)
-    if missing:
-        raise UsageError(f"{path}: no [[distribution]] for {', '.join(sorted(missing))}")
+        if name not in parameters or named.count(name) > 1:
+            raise UsageError(f"{path}: [[distribution]] names '{name}' twice, or not one of {', '.join(parameters)}")
     return laws
 
 
 def draw(robot: RobotSpec, laws: tuple[Distribution, ...], seed: int, unit: int) -> Physics:
-    """Unit number `unit` (from 1); the type's own deviations come from the seed alone.
+    """Unit number `unit` (from 1); the type's own deviations come from the seed alone. No distribution, no effect.
 
     Every parameter has its own stream, so that adding one leaves the others as they were.
     """
@@ -138,13 +136,13 @@ def draw(robot: RobotSpec, laws: tuple[Distribution, ...], seed: int, unit: int)
         if law.of_effort:
             value = value * robot.effort_limit
         values[law.name] = np.array([float(f"{v:.{DIGITS}g}") for v in value])
-    return Physics(**values)
+    return replace(neutral(n), **values)
 
 
-def _physics(unit_id: str, unit: UnitTable, robot: RobotSpec, path: Path) -> Physics:
+def _physics(unit_id: str, unit: UnitTable, drawn: set[str], robot: RobotSpec, path: Path) -> Physics:
     joints = unit.get("joint", {})
     values = {}
-    for f in fields(Physics):
+    for f in (f for f in fields(Physics) if f.name in drawn):
         try:
             if f.metadata["scope"] == "unit":
                 values[f.name] = np.array([float(unit[f.name])])  # type: ignore[arg-type]
@@ -152,7 +150,7 @@ def _physics(unit_id: str, unit: UnitTable, robot: RobotSpec, path: Path) -> Phy
                 values[f.name] = np.array([joints[name][f.name] for name in robot.joint_names])  # type: ignore[index]
         except (KeyError, TypeError) as error:
             raise UsageError(f"{path}: unit '{unit_id}': {f.name}: {error} is missing; draw the fleet again") from None
-    physics = Physics(**values)
+    physics = replace(neutral(len(robot.joint_names)), **values)
     _require_possible(physics, f"{path}: unit '{unit_id}'")
     return physics
 
@@ -163,16 +161,19 @@ def _require_possible(unit: Physics, where: str) -> None:
         value = getattr(unit, f.name)
         most = LATEST if f.name in ("delay", "jitter", "drop") else LARGEST
         good = (value <= most) & (value >= (-most if f.name in SIGNED else 0.0))
+        if f.name == "corner":
+            good &= value < 1.0
         if not (good | ((value == np.inf) & (f.metadata["neutral"] == np.inf))).all():
             raise UsageError(f"{where}: {f.name} is {value.tolist()}; draw the fleet again")
 
 
-def to_toml(robot: RobotSpec, units: dict[str, Physics]) -> str:
+def to_toml(robot: RobotSpec, units: dict[str, Physics], laws: tuple[Distribution, ...]) -> str:
     """The drawn units as the part of a fleet file that follows its distributions."""
+    scope = {f.name: f.metadata["scope"] for f in fields(Physics)}
+    scopes = {law.name: scope[law.name] for law in laws}
     lines = []
     for unit_id, unit in units.items():
         lines.append(f"\n[robot.{robot.name}.{unit_id}]")
-        scopes = {f.name: f.metadata["scope"] for f in fields(Physics)}
         lines += [f"{name} = {float(getattr(unit, name)[0])!r}" for name, s in scopes.items() if s == "unit"]
         lines.append(f"[robot.{robot.name}.{unit_id}.joint]")
         for i, joint in enumerate(robot.joint_names):

@@ -18,7 +18,9 @@ KT_TEMPERATURE = 25.0  # °C at which kt_scale holds
 COPPER = 0.00393  # 1/K: resistance of copper, IEC 60028
 
 
-def friction_limit(physics: Physics, nominal: Array, qvel: Array, torque: Array, push: Array) -> Array:
+def friction_limit(
+    physics: Physics, nominal: Array, qvel: Array, torque: Array, push: Array, thinned: Array | float = 1.0
+) -> Array:
     """The largest torque that friction can take, (N, n), N·m.
 
     Coulomb friction with a Lorentzian Stribeck peak (Hess & Soom 1990, J. Tribology 112), more of it in one direction,
@@ -31,6 +33,7 @@ def friction_limit(physics: Physics, nominal: Array, qvel: Array, torque: Array,
         qvel: rad/s.
         torque: Motor torque at the joint, N·m.
         push: Torque that friction held back in the last step, N·m: the way a stuck joint would go.
+        thinned: What warmth leaves of friction, apart from the gear's part.
     """
     still = np.abs(qvel) < STILL
     way = np.sign(np.where(still, push, qvel))
@@ -38,7 +41,39 @@ def friction_limit(physics: Physics, nominal: Array, qvel: Array, torque: Array,
     dry = physics.friction * (1.0 + physics.friction_asymmetry * way + physics.stribeck / (1.0 + slip * slip))
     loss = 1.0 - physics.efficiency
     backdriven = torque * way < 0
-    return nominal + dry + loss * np.abs(torque) / np.where(backdriven, physics.efficiency, 1.0)
+    return (nominal + dry) * thinned + loss * np.abs(torque) / np.where(backdriven, physics.efficiency, 1.0)
+
+
+class Bristles:
+    """Pre-sliding: friction is a spring of bristles that bend, and slip as they near its limit g.
+
+    The model of LuGre (Canudas de Wit, Olsson, Åström & Lischinsky 1995, IEEE Trans. Automatic Control 40) without
+    damping of its own; at a constant g Dahl's (1968): Ḟ = σ·v − σ·|v|·F/g. σ lets the friction of an unloaded joint
+    build up over physics.presliding. Where that is zero, MuJoCo's rigid friction stays.
+    """
+
+    def __init__(self, physics: Physics, nominal: Array) -> None:
+        self.soft = physics.presliding > 0
+        self.any = bool(self.soft.any())
+        rest = nominal + physics.friction * (1.0 + physics.stribeck)
+        self.stiffness = np.where(self.soft, rest / np.where(self.soft, physics.presliding, 1.0), 0.0)
+        self.torque = np.zeros_like(rest)  # against the motion, N·m
+
+    def reset(self, held: Array, limit: Array) -> None:
+        """A joint at rest: its bristles hold this torque (N, n) N·m, as far as they can."""
+        self.torque = np.where(self.soft, np.clip(held, -limit, limit), 0.0)
+
+    def step(self, limit: Array, qvel: Array, h: float) -> Array:
+        """Advance h s at a speed and a limit; returns the torque, (N, n) N·m. Exact where both are constant."""
+        end = np.copysign(limit, qvel)
+        slipped = np.exp(-self.stiffness * np.abs(qvel) * h / np.maximum(limit, 1e-9))
+        self.torque = np.where(self.soft, end + (self.torque - end) * slipped, 0.0)
+        return self.torque
+
+
+def torque_share(physics: Physics, speed: Array) -> Array:
+    """What the voltage leaves of the torque limit at a speed (N, n) rad/s in the torque's direction, 0 to 1."""
+    return np.clip((1.0 - speed / physics.no_load_speed) / (1.0 - physics.corner), 0.0, 1.0)
 
 
 def cogging_torque(physics: Physics, qpos: Array) -> Array:
@@ -114,6 +149,10 @@ class Thermal:
     def kt(self) -> Array:
         """Torque per rated current over the datasheet's, (N, n)."""
         return self.p.kt_scale * (1.0 - self.p.kt_drift * (self.winding - KT_TEMPERATURE))
+
+    def thinned(self) -> Array:
+        """What the housing's warmth leaves of friction and damping, (N, n)."""
+        return np.exp(-self.p.thinning * (self.housing - KT_TEMPERATURE))
 
 
 def supply_share(physics: Physics, power: Array) -> Array:

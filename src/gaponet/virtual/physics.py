@@ -42,17 +42,31 @@ class Physics:
     winding_time: Array = field(metadata=_joint("thermal", 30.0, "s"))
     housing_resistance: Array = field(metadata=_joint("thermal", 1.0, "K/W"))
     housing_time: Array = field(metadata=_joint("thermal", 600.0, "s"))
-    # Friction beyond the nominal model's, Stribeck peak over it, and how much more it is one way than the other.
+    # Above ambient when a recording starts, after those before it: mean, and spread from recording to recording.
+    warmth: Array = field(metadata=_unit("thermal", 0.0, "K"))
+    warmth_spread: Array = field(metadata=_unit("thermal", 0.0, "K"))
+    # Friction beyond the nominal model's, and how much more it is one way than the other; Stribeck peak over it.
     friction: Array = field(metadata=_joint("friction", 0.0, "N·m"))
-    stribeck: Array = field(metadata=_joint("friction", 0.0, "1"))
-    stribeck_speed: Array = field(metadata=_joint("friction", 0.1, "rad/s"))
     friction_asymmetry: Array = field(metadata=_joint("friction", 0.0, "1"))
+    stribeck: Array = field(metadata=_joint("stribeck", 0.0, "1"))
+    stribeck_speed: Array = field(metadata=_joint("stribeck", 0.1, "rad/s"))
+    # Pre-sliding: the angle that an unloaded joint turns while its friction builds up.
+    presliding: Array = field(metadata=_joint("presliding", 0.0, "rad"))
+    # Friction and damping lost per kelvin of the housing.
+    thinning: Array = field(metadata=_joint("thinning", 0.0, "1/K"))
     # Load friction: gear efficiency.
     efficiency: Array = field(metadata=_joint("load_friction", 1.0, "1"))
     # Viscous damping beyond the nominal model's.
     damping: Array = field(metadata=_joint("damping", 0.0, "N·m·s/rad"))
     # Backlash between motor and link.
     backlash: Array = field(metadata=_joint("backlash", 0.0, "rad"))
+    # Compliance of gear and link behind the encoder: how far they twist at the torque limit.
+    windup: Array = field(metadata=_joint("compliance", 0.0, "rad"))
+    # Current loop: time constant of the torque.
+    current_time: Array = field(metadata=_joint("current_loop", 0.0, "s"))
+    # Torque against speed: no-load speed, and the share of it up to which the whole torque is there.
+    no_load_speed: Array = field(metadata=_joint("torque_speed", np.inf, "rad/s"))
+    corner: Array = field(metadata=_joint("torque_speed", 0.0, "1"))
     # Command link: constant delay; jitter (uniform up to this) and lost packets.
     delay: Array = field(metadata=_unit("delay", 0.0, "s"))
     jitter: Array = field(metadata=_unit("jitter", 0.0, "s"))

@@ -16,11 +16,10 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import equivalent_torque
 from gaponet.sim.model import build_model, idle_joints
 from gaponet.virtual.fleet import Fleet
+from gaponet.virtual.physics import Physics
 from gaponet.virtual.unit import UnitEvent, VirtualRobot
 
 Array = np.ndarray
-
-WARMTH = (12.0, 2.0)  # K above ambient at the start of a recording: mean, spread from one repetition to the next
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
     payloads = [(t.payload, job.recipe.payload_side) for t in group]
     robots = VirtualRobot(job.robot, [job.fleet.unit(t.unit) for t in group], payloads, dt, locked=locked)
     seeds = [t.seed(job.seed) for t in group]
-    warmth = WARMTH[0] + WARMTH[1] * np.array([np.random.default_rng([s, 1]).standard_normal() for s in seeds])
+    warmth = np.array([_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)])
     robots.reset(targets[0], seeds, warmth)
     seen = np.empty((4, *targets.shape), np.float32)
     for t in range(longest):  # row t: the state at t·dt, then the command of [t·dt, (t+1)·dt)
@@ -97,6 +96,12 @@ def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: t
         meta = _meta(job, take, motions[take.motion].level, notes)
         sequences.append(Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature))
     return sequences
+
+
+def _warmth(unit: Physics, seed: int) -> float:
+    """K above ambient at the start of a recording."""
+    drawn = np.random.default_rng([seed, 1]).standard_normal()
+    return max(0.0, float(unit.warmth[0] + unit.warmth_spread[0] * drawn))
 
 
 def _events(seen: list[UnitEvent], end: float) -> list[dict[str, Any]]:

@@ -15,13 +15,22 @@ from mujoco.batch import Batch
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
-from gaponet.virtual.motor import Backlash, CommandLink, Thermal, cogging_torque, friction_limit, supply_share
+from gaponet.virtual.motor import (
+    Backlash,
+    Bristles,
+    CommandLink,
+    Thermal,
+    cogging_torque,
+    friction_limit,
+    supply_share,
+    torque_share,
+)
 from gaponet.virtual.physics import Physics, stack
 
 Array = np.ndarray
 
 PHYSICS_STEP = 0.001  # s, at most
-LAW_PERIOD = 0.002  # s, at most: how often the hidden laws are evaluated
+LAW_PERIOD = 0.002  # s, at most: how often the hidden laws are evaluated; bristles and currents at every step
 NOISE_ROWS = 50  # control periods of noise drawn at a time
 HOT = 80.0  # °C: winding temperature from which a unit reports it
 
@@ -72,9 +81,10 @@ class VirtualRobot:
         self.dt = robot.dt if dt is None else dt
         self.decimation = int(np.ceil(self.dt / PHYSICS_STEP - 1e-9)) if timestep is None else round(self.dt / timestep)
         self.timestep = self.dt / self.decimation
-        self.substeps = next(k for k in range(self.decimation, 0, -1) if _divides(k, self.decimation, self.timestep))
         self.active = np.array([i for i, name in enumerate(robot.joint_names) if name not in locked])
         self.physics = stack(units, self.active)
+        stiff = bool((self.physics.presliding > 0).any() or (self.physics.current_time > 0).any())
+        self.substeps = 1 if stiff else _substeps(self.decimation, self.timestep)
         self.everywhere = stack(units, np.arange(len(robot.joint_names)))
         models = _models(robot, units, payloads, self.dt, self.timestep, locked)
         self.batch = Batch(models[0], nsim=len(units), nthread=nthread)
@@ -89,15 +99,20 @@ class VirtualRobot:
         self._constraint = b.bind("qfrc_constraint")
         self._gain, self._bias = b.expand("actuator_gainprm"), b.expand("actuator_biasprm")
         self._range, self._frictionloss = b.expand("actuator_forcerange"), b.expand("dof_frictionloss")
-        self._applied = b.bind("qfrc_applied")
-        self._cogs = bool((p.cogging != 0).any())
+        self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
+        self._cogs, self._fast = bool((p.cogging != 0).any()), bool(np.isfinite(p.no_load_speed).any())
+        self._thins, self._lags = bool((p.thinning != 0).any()), bool((p.current_time > 0).any())
+        self._damping = b.expand("dof_damping")
+        self._cold_damping, self._thinned = self._damping.copy(), np.ones((1, 1))
         self._nominal_friction = model.dof_frictionloss.copy()
         self._kp = robot.kp[self.active] * p.kp_scale
         self._kd = robot.kd[self.active] * p.kd_scale
         self._added = np.zeros_like(self._kp)
         self._effort = robot.effort_limit[self.active]
+        self._compliance, self._twists = p.windup / self._effort, bool((p.windup > 0).any())  # rad per N·m
         self._limits = qpos_range(model)
         self.backlash = Backlash(p, model.dof_armature)
+        self.bristles = Bristles(p, self._nominal_friction)
         self.thermal = Thermal(p)
         self.link = CommandLink(p, self.dt)
         self._supply = np.ones((self.num_envs, 1))
@@ -125,7 +140,11 @@ class VirtualRobot:
             self._settle(target)
         else:
             self._qpos[:] = np.asarray(start)[:, self.active]
-        self._push = np.zeros_like(target)
+        load = self._load()
+        self._twist = self._compliance * load
+        self._ctrl[:] -= self._twist
+        self._push, self._passed = np.zeros_like(target), self._motor_torque() * self.thermal.kt()
+        self.bristles.reset(self._passed - load, self._friction_limit(self._passed))
         self.backlash.reset(self._motor_torque())
         self._squares = np.zeros_like(target)
         self.events: list[list[UnitEvent]] = [[] for _ in seeds]
@@ -151,15 +170,22 @@ class VirtualRobot:
     def _settle(self, target: Array) -> None:
         """Where PD and gravity balance, and a little off it: friction keeps a joint where it happened to stop."""
         stiffness = self._kp * self.thermal.kt()
-        bias, passive = self.batch.bind("qfrc_bias"), self.batch.bind("qfrc_passive")
         self._qpos[:] = target
         for _ in range(40):  # contracts by gravity stiffness / kp, 0.4 at worst on H1-2
-            self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-            self._qpos[:] = target + (passive - bias) / stiffness
+            self._qpos[:] = target - self._load() * (1.0 / stiffness + self._compliance)
             np.clip(self._qpos, *self._limits.T, out=self._qpos)
         rest = np.stack([rng.standard_normal(self.n) for rng in self._rng])[:, self.active]
         band = (self._nominal_friction + self.physics.friction) / stiffness
         self._qpos += REST_SPREAD * band * np.clip(rest, -3, 3)
+
+    def _load(self) -> Array:
+        """What gravity and cables take from a joint at rest, (N, active), N·m."""
+        self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+        return self.batch.bind("qfrc_bias") - self.batch.bind("qfrc_passive")
+
+    def _friction_limit(self, torque: Array) -> Array:
+        """What friction can take now, under a motor torque at the joint, (N, active), N·m."""
+        return friction_limit(self.physics, self._nominal_friction, self._qvel, torque, self._push, self._thinned)
 
     def _motor_torque(self) -> Array:
         """What the drive asks of the motor at the rated torque constant, (N, active), N·m."""
@@ -180,14 +206,22 @@ class VirtualRobot:
         self._squares[:] = 0.0
         kt = self.thermal.kt()
         share = kt * self._gain_share()
-        self._range[:, :, 1] = self._effort * kt * np.minimum(self._supply, 1.0)
-        self._range[:, :, 0] = -self._range[:, :, 1]
+        self._most = self._effort * kt * np.minimum(self._supply, 1.0)
+        self._range[:, :, 1], self._range[:, :, 0] = self._most, -self._most
+        if self._thins:
+            self._thinned = self.thermal.thinned()
+            self._damping[:] = self._cold_damping * self._thinned
         kp, kd, added = self._kp * share, self._kd * share, self._added * share
         for k in range(count):
-            self._ctrl[:] = self.link.read(self._now + k * period)
+            self._ctrl[:] = self.link.read(self._now + k * period) - self._twist
             self._laws(kp, kd, added, kt, period)
             self.batch.step(rows, nstep=self.substeps)
             self._push = -self._constraint
+            if self.bristles.any:
+                self._push = np.where(self.bristles.soft, self.bristles.torque, self._push)
+            if self._lags or self._twists:
+                self._passed = self._force.copy()
+                self._twist = self._compliance * (self._passed - self._push)
         self._slow_laws(count)
         self._report(range(self.num_envs) if rows is None else rows.tolist())
         self._now += self.dt
@@ -197,6 +231,9 @@ class VirtualRobot:
         torque = self._motor_torque()
         self._squares += torque * torque
         joint_torque = torque * kt
+        if self._lags:
+            lag = np.exp(-period / np.maximum(self.physics.current_time, 1e-9))
+            kp, kd, added = kp * (1.0 - lag), kd * (1.0 - lag), added * (1.0 - lag) + lag * self._passed
         if self.backlash.any:
             engaged = self.backlash.step(joint_torque, period)
             kp, kd, added = kp * engaged, kd * engaged, added * engaged
@@ -204,11 +241,21 @@ class VirtualRobot:
         self._bias[:, :, 0] = added
         self._bias[:, :, 1] = -kp
         self._bias[:, :, 2] = -kd
+        if self._fast:
+            self._range[:, :, 1] = self._most * torque_share(self.physics, self._qvel)
+            self._range[:, :, 0] = -self._most * torque_share(self.physics, -self._qvel)
+        self._friction(joint_torque, period)
+
+    def _friction(self, joint_torque: Array, period: float) -> None:
+        limit = self._friction_limit(joint_torque)
+        ripple = cogging_torque(self.physics, self._qpos) if self._cogs else 0.0
+        if self.bristles.any:
+            self._applied[:] = ripple - self.bristles.step(limit, self._qvel, period)
+            self._frictionloss[:] = np.where(self.bristles.soft, 0.0, limit)
+            return
+        self._frictionloss[:] = limit
         if self._cogs:
-            self._applied[:] = cogging_torque(self.physics, self._qpos)
-        self._frictionloss[:] = friction_limit(
-            self.physics, self._nominal_friction, self._qvel, joint_torque, self._push
-        )
+            self._applied[:] = ripple
 
     def _slow_laws(self, count: int) -> None:
         squares = self._squares / count
@@ -241,7 +288,7 @@ class VirtualRobot:
         if self._row == NOISE_ROWS:
             self._draw()
         p, noise = self.everywhere, self._noise[:, self._row]
-        true = self._full(self._qpos, self.robot.qpos_home)
+        true = self._full(self._qpos + self._twist, self.robot.qpos_home)  # the encoder sits on the motor's side
         qpos = true + p.zero_offset + p.encoder_noise * noise[:, 0]
         step = np.where(p.encoder_step > 0, p.encoder_step, 1.0)
         qpos = np.where(p.encoder_step > 0, np.round(qpos / step) * step, qpos)
@@ -265,8 +312,10 @@ class VirtualRobot:
 REST_SPREAD = 0.1  # of the friction band (σ): a robot that always arrives the same way stops in nearly the same place
 
 
-def _divides(k: int, decimation: int, timestep: float) -> bool:
-    return decimation % k == 0 and (k == 1 or k * timestep <= LAW_PERIOD + 1e-9)
+def _substeps(decimation: int, timestep: float) -> int:
+    """Most physics steps that laws may hold for, of those that divide a control period."""
+    most = max(1, int(LAW_PERIOD / timestep + 1e-6))
+    return next(k for k in range(min(most, decimation), 0, -1) if decimation % k == 0)
 
 
 def _models(

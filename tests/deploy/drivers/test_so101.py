@@ -383,7 +383,7 @@ class Alive(Wire):
 
 @pytest.fixture
 def arm(so101: RobotSpec) -> Iterator[VirtualSO101]:
-    arm = VirtualSO101(so101, load_fleet("default", so101).unit("virtual-1"))
+    arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"))
     yield arm
     arm.close()
 

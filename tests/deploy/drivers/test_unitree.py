@@ -24,7 +24,7 @@ def robot() -> RobotSpec:
 
 @pytest.fixture(scope="module")
 def served(robot: RobotSpec) -> VirtualH12:
-    return VirtualH12(robot, load_fleet("default", robot).unit("virtual-4"), domain=180 + os.getpid() % 40, rate=100.0)
+    return VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), domain=180 + os.getpid() % 40, rate=100.0)
 
 
 def message(motors: int = 27, machine: int = 6) -> np.ndarray:

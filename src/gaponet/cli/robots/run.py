@@ -43,8 +43,8 @@ class Reach:
     counts where no file is given."""
     unit: str = "4"
     """virtual: number or name in the fleet."""
-    fleet: str = "default"
-    """virtual: default, shifted, or a .toml file."""
+    fleet: str = "hard"
+    """virtual: hard, easy, shifted, or a .toml file."""
     fast: tyro.conf.FlagCreatePairsOff[bool] = False
     """virtual: as fast as this machine can, not in real time."""
 

@@ -19,7 +19,7 @@ def virtual(
     payload_mass: float = 0.0,
     payload_side: str = "both",
     transport: Literal["dds", "serial"] | None = None,
-    fleet: str = "default",
+    fleet: str = "hard",
     domain: int = 0,
     interface: str = "lo",
     rate: float = 500.0,
@@ -54,7 +54,7 @@ def virtual(
         payload_mass: kg in each hand named by payload_side.
         payload_side: both, or one hand.
         transport: dds for h1_2, serial for so101; default the robot's.
-        fleet: Virtual units: default, shifted, or a .toml file.
+        fleet: Virtual units: hard, easy, shifted, or a .toml file.
         domain: DDS domain.
         interface: Network interface; lo reaches this machine only.
         rate: States per second (DDS).

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from gaponet.collect import fleet_of
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.eval.whose import label
@@ -35,8 +36,8 @@ class Playing:
     here, in OUT/cells."""
     unit: str = ""
     """Unit of the fleet that plays; by default one that no model was trained on."""
-    fleet: str = "default"
-    """Virtual units: default, shifted, or a .toml file."""
+    fleet: str = ""
+    """Virtual units: hard, easy, shifted, or a .toml file; by default the fleet that was recorded."""
     payloads: tuple[float, ...] = ()
     """kg in each hand; default those trained on, with --quick the lightest and the heaviest of them."""
 
@@ -94,6 +95,11 @@ class Session:
         """Where what each method did is kept."""
         return self.out / "parts"
 
+    @property
+    def fleet(self) -> str:
+        """Name or file of the fleet that plays."""
+        return self.asked.fleet or fleet_of(self.whole)
+
     @cached_property
     def known_units(self) -> set[str]:
         """Units that any model was trained on."""
@@ -102,7 +108,7 @@ class Session:
     @cached_property
     def cast(self) -> tuple[str, Physics, tuple[float, ...]]:
         """Name and physics of the unit, and payloads, kg."""
-        fleet, asked = load_fleet(self.asked.fleet, self.robot), self.asked
+        fleet, asked = load_fleet(self.fleet, self.robot), self.asked
         who = asked.unit or next((u for u in reversed(fleet.units) if u not in self.known_units), list(fleet.units)[-1])
         seen = sorted({float(p) for t in self.trained for p in t.model.card["payload_seen"]})
         return who, fleet.unit(who), asked.payloads or tuple({seen[0]: 0, seen[-1]: 0} if self.quick else seen)
@@ -113,7 +119,7 @@ class Session:
     ) -> Result:  # fmt: skip
         """Everything together, with what it takes to repeat it; config as the unit was driven by, if it was played."""
         told = {} if config is None else {
-            "unit": self.cast[0], "fleet": Path(self.asked.fleet).stem,
+            "unit": self.cast[0], "fleet": Path(self.fleet).stem,
             "payloads": [f"{p:g} kg" for p in self.cast[2]],
             "compensator": ", ".join(f"{k} {v}" for k, v in asdict(config).items()),
         }  # fmt: skip
