@@ -258,6 +258,27 @@ def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot,
     assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
 
 
+def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, robot, trained, monkeypatch):
+    seen = []
+
+    def error(trainer, net):
+        seen.append((trainer.stage, net is not None and bool(net.trunk[-1].weight.any())))
+        return 0.6 if trainer.stage == "warm start" else 0.5
+
+    monkeypatch.setattr(Trainer, "validate", error)
+    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=9, patience=2), validate_every=1,
+                     ppo=replace(SMALL.ppo, critic_warmup=3))  # fmt: skip
+    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
+    rounds, updates = [s for s in seen if s[0] == "warm start"], [s for s in seen if s[0] == "ppo"]
+    assert rounds == [("warm start", True)] * 2
+    assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
+    assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
+    assert how_trained(model.card) == (
+        f"2 of 9 rounds of the supervised start, worse than no correction; {len(updates) - 1} updates of PPO from the "
+        "untrained network"
+    )
+
+
 def test_recordings_with_two_stiffnesses_are_mixed_only_when_told(robot, tmp_path):
     data = Dataset.create(tmp_path / "data", robot)
     for i, sequence in enumerate(recordings(robot, 8)):

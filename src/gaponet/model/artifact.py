@@ -76,6 +76,8 @@ def how_trained(card: dict[str, Any]) -> str:
     warm = (
         f"{done} of {planned} rounds of the supervised start" if done < planned else f"supervised start ({done} rounds)"
     )
+    if card["stages"].get("ppo_anew"):
+        return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
     return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
 
 
@@ -94,10 +96,11 @@ class SensorR2(TypedDict):
 
 
 class Stages(TypedDict):
-    """What training got to: rounds of the warm start, done and planned; updates of PPO."""
+    """What training got to: rounds of the warm start, done and planned; updates of PPO, and whether it began anew."""
 
     warm_start_rounds: tuple[int, int]
     ppo_updates: int
+    ppo_anew: NotRequired[bool]
 
 
 class Card(TypedDict):

@@ -27,6 +27,8 @@ class WarmStartConfig:
 
     rounds: Annotated[int, Interval(ge=0, le=100000)] = 10
     """Roll-outs of the present policy; 0 starts PPO from an untrained network."""
+    patience: Annotated[int, Interval(ge=1, le=100000)] = 3
+    """Rounds after which PPO takes over if none was better than no correction, as from an identified simulator."""
     num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations per round."""
     steps: Annotated[int, Interval(ge=1, le=10000000)] = 400
@@ -64,7 +66,7 @@ class PPOConfig:
     """Start value of the actor's step size; adapts to desired_kl."""
     critic_learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
     """The critic's own; with the actor's it would learn nothing in time."""
-    desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
+    desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.005
     """The actor's step size goes up or down by half to stay near this KL per joint."""
     gamma: Annotated[float, Interval(gt=0, lt=1)] = 0.95
     """Discount per control period; a correction acts within the lag, and a longer view only adds variance."""
@@ -76,7 +78,7 @@ class PPOConfig:
     """Updates of the critic alone, before the actor moves."""
     explained: Annotated[float, Interval(le=1)] = 0.5
     """Share of the returns' variance that the critic must explain before the actor moves."""
-    std: Annotated[float, Interval(gt=0, le=1e6)] = 0.004
+    std: Annotated[float, Interval(gt=0, le=1e6)] = 0.0025
     """Exploration σ, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
     and the best noisy policy is not the best policy."""
     noise_time: Annotated[float, Interval(ge=0, le=1e6)] = 0.2

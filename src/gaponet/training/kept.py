@@ -34,6 +34,8 @@ class Kept:
     """Trained up to the last checkpoint."""
     rounds_done: int = 0
     updates: int = 0
+    anew: bool = False
+    """Whether PPO began from the untrained network, the warm start having been worse than no correction."""
     sensor_r2: Report | None = None
     learner: State | None = None
     """Of PPO: its critic and optimisers."""

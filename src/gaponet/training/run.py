@@ -138,7 +138,7 @@ class Trainer:
         try:
             if not np.isfinite(self.kept.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
-            if recipe(self.config).rounds > self.kept.rounds_done:
+            if self.kept.learner is None and recipe(self.config).rounds > self.kept.rounds_done:
                 self._warm_start()
             elif not recipe(self.config).rounds and self.kept.learner is None:
                 self._cold_start()
@@ -173,7 +173,9 @@ class Trainer:
             rounds = self.kept.warm["rounds"]
             restore_warm(warm, self.kept.warm)
             torch.set_rng_state(self.rng)
-        while warm.done < config.rounds and self._spent() < 1:
+        while (
+            warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
+        ):
             before = round_state(warm)
             warm.round(self._tick)
             warm.refresh_sensors()
@@ -224,10 +226,15 @@ class Trainer:
     def _ppo_start(self) -> State:
         """The best of the warm start or, where that is worse than no correction, the untrained network beside it."""
         best = self.kept.trained_state
-        if self.kept.trained <= self.kept.progress[0]["val_mpjae"] or not recipe(self.config).rounds:
+        self.kept.anew = bool(recipe(self.config).rounds) and self._in_vain()
+        if not self.kept.anew:
             return best
         fitted_before = ("predictor.", "points.", "features.", "answers.")
         return {k: v if k.startswith(fitted_before) else self.untrained[k] for k, v in best.items()}
+
+    def _in_vain(self) -> bool:
+        """Whether nothing that was fitted is better than no correction."""
+        return self.kept.trained > self.kept.progress[0]["val_mpjae"]
 
     def _shrink(self) -> None:
         """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
@@ -365,6 +372,7 @@ class Trainer:
             stages={
                 "warm_start_rounds": [self.kept.rounds_done, recipe(self.config).rounds],
                 "ppo_updates": self.kept.updates,
+                "ppo_anew": self.kept.anew,
             },
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
