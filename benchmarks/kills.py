@@ -124,7 +124,7 @@ def cases(given: Path) -> dict[str, Case]:
     return {
         "import": Case(lambda out: ["import", log, *robot, "--out", str(out)], entries),
         "collect": Case(lambda out: ["collect", *robot, *recipe, "--out", str(out)], entries),
-        "pair": Case(lambda out: ["pair", str(out)], entries, given / "bare"),
+        "gap": Case(lambda out: ["gap", str(out)], entries, given / "bare"),
         "train": Case(train, trained),
         "export": Case(lambda out: ["data", "export", data, "--out", str(out)], digests, done=2),
         "artifact": Case(lambda out: ["export", run, "--out", str(out)], names),

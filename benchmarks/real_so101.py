@@ -81,7 +81,7 @@ def main() -> None:
         if gaponet(["import", str(args.logs), *given]):
             raise SystemExit(2)
     study = Study(Dataset(data), load_robot("so101"), args.work, TrainConfig(WIDE), args.budget, args.seeds)
-    study = replace(study, identified=identified(study, lambda done, total, rms: None))
+    study = identified(study, lambda done, total, rms: None)
     result = answer(RealSO101(identified_budget=args.identified_budget), study, say)
     publish(replace(result, name="real_so101"), args.work / "results")
 

@@ -24,7 +24,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
-from gaponet.bench.training import Turn, bench_train, recordings
+from gaponet.bench.training import bench_train, recordings
+from gaponet.bench.turns import Turn
 from gaponet.data.sequence import Sequence
 from gaponet.model.baselines.mlp import matched_hidden
 from gaponet.model.config import ModelConfig

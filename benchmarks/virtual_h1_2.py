@@ -34,6 +34,7 @@ from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.plot.charts import bars
 from gaponet.plot.methods import palette, title
+from gaponet.plot.table import Spread, Table, compared
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
 from gaponet.study.compare import Compare, identified
@@ -41,7 +42,6 @@ from gaponet.study.found import Found, answer
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table, compared
 from gaponet.training.config import TrainConfig, WarmStartConfig
 
 RECIPE = Path(__file__).with_suffix(".toml")
@@ -189,7 +189,7 @@ def main() -> None:
     data = collected(args.work / "default", args.recipe, "default")
     out = args.work / "compare"
     study = Study(data, load_robot("h1_2"), out, TRAINING, args.budget, args.seeds, question.holdout_units)
-    study = replace(study, identified=identified(study, lambda done, total, rms: None))
+    study = identified(study, lambda done, total, rms: None)
     publish(answer(question, study, say), args.work / "results")
 
 

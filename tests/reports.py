@@ -24,13 +24,13 @@ CONFIG = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std
           "dataset": "../data", "dataset_hash": "0123", "command": "gaponet train data --out run"}  # fmt: skip
 
 
-def evaluated_run(arm: RobotSpec, data: Dataset, folder: Path) -> Path:
+def evaluated_run(arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotSpec | None = None) -> Path:
     """Evaluated on motions in which only the elbow moves; 3 of 10 rounds of its supervised start are done."""
     for sequence in recordings(arm, 4, rows=160, kp=0.5):
         ctrl = sequence.ctrl * [0.0, 1.0]
         data.append(replace(sequence, ctrl=ctrl.astype(np.float32)))
     motions = sorted({e.meta.motion for e in data.entries})
-    untrained(folder, arm, data, train=motions[:1], val=motions[1:2], test=motions[2:])
+    untrained(folder, simulator or arm, data, train=motions[:1], val=motions[1:2], test=motions[2:])
     amend(folder, **FACTS, stages={"warm_start_rounds": [3, 10], "ppo_updates": 0})
     (folder / "config.json").write_text(json.dumps(CONFIG))
     (folder / "progress.jsonl").write_text(json.dumps(LINE) + "\n")

@@ -5,6 +5,7 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -114,22 +115,29 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> in
 
 
 def gap(
-    dataset: Dataset | Place, robot: RobotSpec | Place | None = None, motions: tuple[str, ...] = ()
+    dataset: Dataset | Place,
+    robot: RobotSpec | Place | None = None,
+    motions: tuple[str, ...] = (),
+    run: GapModel | Place | None = None,
 ) -> dict[str, Any]:
-    """Measure how far the nominal simulator is from the robot, in whole-motion free run.
+    """Measure how far the nominal simulator is from the robot, in whole-motion free run, and with a run, why.
 
     Args:
         dataset: Sequences without a twin are replayed first.
         robot: Another robot than the one that the dataset keeps.
         motions: Only these.
+        run: A run of train: what delay, offset, each cause that was identified and the model remove, and the floor, on
+            motions that it never saw; kept as gap.json, .svg and .png in the run, whose report shows them.
 
     Returns:
         methods → nominal → metrics (mpjae rad, …), and by_joint, by_payload, by_unit, by_motion, by_horizon the same;
-        dataset, sequences, hours, virtual, robot, simulator_hash.
+        dataset, sequences, hours, virtual, robot, simulator_hash. With a run: as eval.gap.gap_by_step.
     """
     from gaponet.metrics import runs, summary
     from gaponet.sim.model import model_hash
 
+    if run is not None:
+        return _gap_by_step(_run(run), dataset, robot, motions)
     data, spec = open_dataset(dataset, robot)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
@@ -143,6 +151,23 @@ def gap(
         "robot": spec.name,
         "simulator_hash": simulator,
     }
+
+
+def _gap_by_step(
+    run: Path, dataset: Dataset | Place, robot: RobotSpec | Place | None, motions: tuple[str, ...]
+) -> dict[str, Any]:
+    from gaponet.eval.gap import gap_by_step
+    from gaponet.eval.gap_figure import waterfall
+    from gaponet.files import write_text, writing
+    from gaponet.plot.style import save
+
+    data, spec = open_dataset(dataset, robot, run)
+    with bar("gap") as update:
+        found = gap_by_step(run, data, spec, motions, lambda step, done, total: update(done, total, step))
+    with writing(run, "run"):
+        write_text(run / "gap.json", json.dumps(found, indent=1) + "\n")
+        save(waterfall(found), run / "gap")
+    return found
 
 
 @dataclass(frozen=True)
@@ -188,7 +213,7 @@ def identify(
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
         terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
-        table: Look for a table under the robot's tips; kept in the same way.
+        table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
         threads: For the table, 0 for all cores.
 
     Raises:

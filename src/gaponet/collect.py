@@ -48,7 +48,7 @@ ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small,
 class Collected:
     """What a call to collect did."""
 
-    out: str
+    dataset: str
     written: int
     present: int  # takes that were there before
     hours: float  # recorded now

@@ -12,15 +12,16 @@ import difflib
 import functools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import JointMismatchError, RobotError
+from gaponet.robot_table import PayloadMount, RobotTable, Table, Tip
+from gaponet.structure import read_toml
 
-if TYPE_CHECKING:
-    from gaponet.robot_table import RobotTable
+__all__ = ["PayloadMount", "RobotSpec", "Table", "Tip", "available", "load_robot"]
 
 BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
@@ -31,33 +32,6 @@ IDENTIFIED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SERVO = ("kp", "effort_limit", *IDENTIFIED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
-
-
-@dataclass(frozen=True)
-class PayloadMount:
-    """Where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`."""
-
-    side: str
-    body: str
-    pos: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Tip:
-    """Part of a robot that may touch the table: a sphere of `radius` (m) at `pos` (m) in the frame of MJCF `body`."""
-
-    body: str
-    pos: tuple[float, float, float]
-    radius: float
-
-
-@dataclass(frozen=True)
-class Table:
-    """A level surface at `height` (m, MJCF world): its friction coefficient, and its stiffness under a tip, N/m."""
-
-    height: float
-    friction: float
-    stiffness: float
 
 
 @dataclass(frozen=True)
@@ -257,9 +231,6 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
     Raises:
         RobotError: With the folder, the field and what to write there.
     """
-    from gaponet.robot_table import RobotTable
-    from gaponet.structure import read_toml
-
     folder = _folder(name_or_path)
     toml = folder / "robot.toml"
     if not toml.is_file():
@@ -303,11 +274,11 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         qpos_home=np.array([j.home for j in joints]),
         log_units=tuple(j.log_unit for j in joints),
         aliases={alias: j.name for j in joints for alias in j.aliases},
-        payload_mounts=tuple(PayloadMount(m.side, m.body, m.pos) for m in table.payload_mount),
+        payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
-        tips=tuple(Tip(t.body, t.pos, t.radius) for t in table.tip),
-        table=None if table.table is None else Table(**vars(table.table)),
+        tips=table.tip,
+        table=table.table,
     )
     found = table.identified_table
     if (robot.table or found) and not robot.tips:
@@ -321,5 +292,5 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     }
     identified = robot.with_servos(servos) if servos else robot
     if found is not None:
-        identified = dataclasses.replace(identified, table=Table(**vars(found)), nominal=robot)
+        identified = dataclasses.replace(identified, table=found, nominal=robot)
     return identified

@@ -29,8 +29,8 @@ class Joint:
 
 
 @dataclass(frozen=True)
-class Mount:
-    """One [[payload_mount]]; pos in the frame of the body."""
+class PayloadMount:
+    """One [[payload_mount]], where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`."""
 
     side: Name
     body: str
@@ -61,20 +61,20 @@ class Servo:
 
 @dataclass(frozen=True)
 class Tip:
-    """One [[tip]]: a sphere that may touch the table; pos in the frame of the body."""
+    """One [[tip]], a sphere of `radius` (m) that may touch the table, at `pos` (m) in the frame of MJCF body `body`."""
 
     body: str
     pos: tuple[Metres, Metres, Metres]
-    radius: Annotated[float, Interval(ge=1e-4, le=1)] = 1e-3  # m
+    radius: Annotated[float, Interval(ge=1e-4, le=1)] = 1e-3
 
 
 @dataclass(frozen=True)
 class Table:
-    """[table]: a level surface that the tips may touch."""
+    """[table], a level plane at `height` (m, MJCF world); its friction coefficient, its stiffness under a tip, N/m."""
 
     height: Metres
     friction: Annotated[float, Interval(ge=0, le=10)] = 0.3
-    stiffness: Annotated[float, Interval(ge=1, le=1e7)] = 2000.0  # N/m
+    stiffness: Annotated[float, Interval(ge=1, le=1e7)] = 2000.0
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class RobotTable:
     dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
     joint: Annotated[tuple[Joint, ...], Len(1, 500)]
-    payload_mount: Annotated[tuple[Mount, ...], Len(0, 20)] = ()
+    payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None
     identified: dict[str, Servo] = field(default_factory=dict)

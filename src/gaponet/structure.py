@@ -108,13 +108,13 @@ def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError
     return validated(kind, table, path, error, hint, more=True)
 
 
-def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
+def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "") -> T:
     """A TOML file as a value of type `kind`; arguments and error as of `validated`."""
     try:
         table = tomllib.loads(_content(path, error, hint).decode())
     except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
         raise error(_line(path, f"not valid TOML: {found}", hint)) from None
-    return validated(kind, table, path, error, hint, more)
+    return validated(kind, table, path, error, hint)
 
 
 def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, dict[str, Any]]:

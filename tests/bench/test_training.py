@@ -8,6 +8,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.bench import training as bench
+from gaponet.bench import turns
 from gaponet.model.config import ModelConfig
 from gaponet.sim.replay import replay
 from gaponet.training.config import PPOConfig, TrainConfig
@@ -20,11 +21,11 @@ SMALL = TrainConfig(
 
 
 def test_the_fastest_turn_counts_and_the_first_does_not(monkeypatch):
-    turns = [0.0, 1.0, 1.0, 6.0, 6.0, 9.0]  # of 1, 5 and 3 s
-    clock = iter(2 * turns)
-    monkeypatch.setattr(bench.time, "perf_counter", lambda: next(clock))
-    assert bench.take_turns({"a": lambda: None}, 2) == {"a": 3.0}
-    assert bench.take_turns({"a": lambda: None}, 2, bench.median) == {"a": 4.0}
+    seconds = [0.0, 1.0, 1.0, 6.0, 6.0, 9.0]  # of 1, 5 and 3 s
+    clock = iter(2 * seconds)
+    monkeypatch.setattr(turns.time, "perf_counter", lambda: next(clock))
+    assert turns.take_turns({"a": lambda: None}, 2) == {"a": 3.0}
+    assert turns.take_turns({"a": lambda: None}, 2, bench.median) == {"a": 4.0}
 
 
 def test_every_part_of_training_takes_its_turn(arm):

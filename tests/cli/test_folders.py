@@ -13,7 +13,7 @@ COMMANDS = [
     ["collect", "--robot", "so101", "--recipe", "arm", "--out"],
     ["train", "nowhere", "--out"],
     ["identify", "nowhere", "--out"],
-    ["compare", "nowhere", "--out"],
+    ["experiment", "compare", "nowhere", "--out"],
     ["experiment", "ablation", "nowhere", "--out"],
     ["experiment", "payload", "nowhere", "--out"],
     ["experiment", "unit", "nowhere", "--out"],

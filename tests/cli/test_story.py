@@ -85,9 +85,9 @@ def test_runs_lists_both_with_the_best_first(place, capsys):
     assert "no run here or below" in capsys.readouterr().err
 
 
-def test_the_budget_says_what_each_step_removes(place, capsys):
+def test_the_gap_with_a_run_says_what_each_step_removes(place, capsys):
     """The virtual arm is late and soft: delay and model remove error, and what is left is what eval finds."""
-    found, err = run(place, capsys, "budget", str(place / "gaponet"), str(place / "data"))
+    found, err = run(place, capsys, "gap", str(place / "data"), "--run", str(place / "gaponet"))
     evaluated, _ = run(place, capsys, "eval", str(place / "gaponet"), str(place / "data"))
     assert list(found["left"]) == ["nominal", "delay", "offset", "gaponet"]
     assert found["left"]["delay"] < found["left"]["nominal"]
@@ -96,11 +96,21 @@ def test_the_budget_says_what_each_step_removes(place, capsys):
     assert found["floor"]["both"] is None  # its readings are continuous, and no motion was recorded twice
     assert "–" in err
     assert "VIRTUAL" in err
-    assert (place / "gaponet" / "budget.png").stat().st_size > 10_000
+    assert (place / "gaponet" / "gap.png").stat().st_size > 10_000
 
 
 def test_compare_puts_models_and_seeds_into_one_table_and_keeps_what_is_there(place, capsys):
-    words = ["compare", str(place / "data"), "--out", str(place / "compared"), "--seeds", "2", "--models", "mlp"]
+    words = [
+        "experiment",
+        "compare",
+        str(place / "data"),
+        "--out",
+        str(place / "compared"),
+        "--seeds",
+        "2",
+        "--models",
+        "mlp",
+    ]
     words += [*TRAIN, "--budget", "900", "--warm-start.rounds", "1", "--identify"]
     result, err = run(place, capsys, *words)
     totals = {row[0]: row[2] for row in result["tables"]["totals"]["rows"]}
@@ -159,13 +169,13 @@ def test_the_report_is_one_offline_page(place, capsys):
         (["gap", "{}/nowhere"], "not a dataset"),
         (["gap", "{}/data", "--motions", "dance"], "no motion 'dance'"),
         (["eval", "{}/data", "{}/data"], "give a run folder"),
-        (["eval", "{}/gaponet", "{}/data", "--also", "{}/gaponet"], "a second gaponet model"),
+        (["eval", "{}/gaponet", "{}/data", "--also", "{}/gaponet"], "a second run of GAPONet"),
         (["train", "{}/data", "--out", "{}/gaponet"], "--resume"),
         (["train", "{}/data", "--out", "{}/new", "--budget", "soon"], "--budget soon"),
         (["train", "{}/data", "--out", "{}/new", "--resume"], "nothing to resume"),
         (["report", "{}/data"], "give a run folder"),
-        (["compare", "{}/data", "--out", "{}/new", "--models", "lstm"], "no model 'lstm'; there are"),
-        (["compare", "{}/data", "--out", "{}/new", "--models", "identified+mlp"], "add --identify"),
+        (["experiment", "compare", "{}/data", "--out", "{}/new", "--models", "lstm"], "no model 'lstm'; there are"),
+        (["experiment", "compare", "{}/data", "--out", "{}/new", "--models", "identified+mlp"], "add --identify"),
         (["calibrate", "{}/gaponet", "{}/data", "--unit", "nobody"], "holds units"),
         (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
     ],

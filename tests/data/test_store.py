@@ -147,7 +147,7 @@ def test_a_twin_belongs_to_one_simulator(dataset, sequence):
     dataset.write_twin(entry, twin)
     assert dataset.has_twin(entry, "abc")
     assert np.array_equal(dataset.pair(entry, "abc").sim.tau, sequence.tau)
-    with pytest.raises(DatasetError, match="has no twin for simulator xyz; run gaponet pair"):
+    with pytest.raises(DatasetError, match="has no twin for simulator xyz; run gaponet gap"):
         dataset.pair(entry, "xyz")
 
 

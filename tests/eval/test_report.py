@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from reports import amend, evaluated_run
 
+import gaponet as gp
+from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.eval import figures
+from gaponet.eval.gap_figure import waterfall
 from gaponet.eval.report import _r2, write_report
+from gaponet.eval.run_files import read_gap
 
 
 @pytest.fixture
@@ -28,6 +32,22 @@ def test_the_page_is_one_offline_file_that_says_what_a_visitor_asks(run):
         "prefers-color-scheme: dark", "width=device-width", "command",
     ):  # fmt: skip
         assert text in page, text
+
+
+def test_a_model_that_corrects_an_identified_simulator_is_called_so_in_every_table_and_figure(arm, tmp_path, capsys):
+    data, fitted = Dataset.create(tmp_path / "data", arm), arm.with_servos({"elbow": {"kp": 11.0}})
+    run = evaluated_run(arm, data, tmp_path / "run", fitted)
+    page = write_report(run).read_text()  # the figures are SVG with their words in it
+    assert page.count("identification + GAPONet") > 10
+    assert not re.findall(r"(?<!identification \+ )GAPONet", page)
+    assert list(gp.gap(data, arm, run=run)["left"]) == ["nominal", "delay", "offset", "gain", "identified+gaponet"]
+    assert "cation\n+\nGAPONet" in waterfall(read_gap(run)).axes[1].get_xticklabels()[4].get_text()
+    assert "Where the gap comes from" in write_report(run).read_text()
+    for words in (["runs", str(tmp_path)], ["eval", str(run), str(data.path)]):
+        assert main(words) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "GAPONet" in said
+        assert not re.findall(r"(?<!identification \+ )GAPONet", said)
 
 
 def test_a_trained_run_is_not_called_undertrained(run):
@@ -57,7 +77,7 @@ def test_the_robot_is_pictured_or_a_sentence_says_why_not(run):
 def test_an_evaluation_of_before_is_refused_with_what_to_do(run, absent):
     metrics = json.loads((run / "metrics.json").read_text())
     (run / "metrics.json").write_text(json.dumps({k: v for k, v in metrics.items() if k != absent}))
-    with pytest.raises(ModelError, match=r"evaluation of gaponet is missing; .* or evaluate again"):
+    with pytest.raises(ModelError, match=r"evaluation of GAPONet is missing; .* or evaluate again"):
         write_report(run)
 
 
@@ -80,11 +100,7 @@ def test_trajectories_show_the_command_and_errors_on_one_scale_moving_joints_fir
     assert np.ptp(axes[0].get_ylim()) >= 0.06
 
 
-@pytest.mark.parametrize(
-    ("found", "text"),
-    [(None, "–"), (0.925, "0.925 on held-out states"),
-     ({"mean": 0.9, "by_joint": {"elbow": 0.8, "wrist": 1.0}}, "0.900 on held-out states (elbow 0.80, wrist 1.00)")],
-    ids=["no predictor", "a card of before", "by joint"],
-)  # fmt: skip
-def test_the_sensor_predictor_is_said_by_joint_where_the_card_knows(found, text):
-    assert _r2(found) == text
+def test_the_sensor_predictor_is_said_by_joint():
+    assert _r2(None) == "–"
+    said = "0.900 on held-out states (elbow 0.80, wrist 1.00)"
+    assert _r2({"mean": 0.9, "by_joint": {"elbow": 0.8, "wrist": 1.0}}) == said

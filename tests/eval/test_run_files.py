@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gaponet.errors import ModelError
-from gaponet.eval.run_files import read_budget, read_config, read_metrics, read_progress, read_trajectories
+from gaponet.eval.run_files import read_config, read_gap, read_metrics, read_progress, read_trajectories
 
 PART = {"mpjae": 0.01}
 JOINT = PART | {"static": 0.01, "dynamic": 0.01}
@@ -85,11 +85,11 @@ def test_a_validation_cut_short_by_a_crash_is_none(tmp_path):
         read_progress(tmp_path)
 
 
-def test_a_config_and_a_budget_of_another_kind_are_refused(tmp_path):
+def test_a_config_and_a_gap_of_another_kind_are_refused(tmp_path):
     (tmp_path / "config.json").write_text('{"model": {"kind": "gaponet"}, "seed": 0}')
     with pytest.raises(ModelError, match=r"config\.json: ppo: is missing"):
         read_config(tmp_path)
-    assert read_budget(tmp_path) is None
-    (tmp_path / "budget.json").write_text('{"left": {"<b>": 1}}')
-    with pytest.raises(ModelError, match=r"budget\.json: "):
-        read_budget(tmp_path)
+    assert read_gap(tmp_path) is None
+    (tmp_path / "gap.json").write_text('{"left": {"<b>": 1}}')
+    with pytest.raises(ModelError, match=r"gap\.json: "):
+        read_gap(tmp_path)

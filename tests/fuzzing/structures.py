@@ -133,12 +133,12 @@ def _evaluation(folder: Path) -> None:
     from eval.test_run_files import METRICS
 
     parts = {"left": {"nominal": 0.02, "gaponet": 0.01}, "floor": {"both": 0.001}}
-    budget = parts | {"by_joint": {"elbow": parts}, "virtual": False, "unseen": True, "sequences": 1, "robot": "arm"}
+    gap = parts | {"by_joint": {"elbow": parts}, "virtual": False, "unseen": True, "sequences": 1, "robot": "arm"}
     config = {"model": {"kind": "gaponet"}, "ppo": {"num_envs": 1, "epochs": 1, "std": 0.1}, "seed": 0,
               "robot": "arm", "dataset": "../set", "dataset_hash": "0123"}  # fmt: skip
     line = {"stage": "ppo", "steps": 1, "seconds": 0.5, "reward": None, "val_mpjae": 0.1, "nominal_mpjae": 0.2}
     delays = {"delay": {"shoulder": 0.02, "elbow": 0.02}, "offset": {"shoulder": 0.0, "elbow": 0.0}}
-    for name, content in (("metrics", METRICS), ("budget", budget), ("config", config), ("delay_offset", delays),
+    for name, content in (("metrics", METRICS), ("gap", gap), ("config", config), ("delay_offset", delays),
                           ("split", {"train": {"a": "0"}, "val": {"b": "1"}, "test": {"c": "2"}})):  # fmt: skip
         (folder / f"{name}.json").write_text(json.dumps(content, indent=1))
     (folder / "progress.jsonl").write_text(2 * (json.dumps(line) + "\n"))
@@ -161,7 +161,7 @@ def _use_model(source: Path, out: Path) -> None:
 def _use_run(source: Path, out: Path) -> None:
     metrics = run_files.read_metrics(source)
     run_files.read_trajectories(source, metrics, 2)
-    for read in (run_files.read_config, run_files.read_progress, run_files.read_budget, read_run_split):
+    for read in (run_files.read_config, run_files.read_progress, run_files.read_gap, read_run_split):
         read(source)
     fitted = DelayOffset.read(source).corrector(arm())
     if not np.isfinite(fitted.delay).all() or (fitted.delay < 0).any() or (fitted.delay > 1).any():
@@ -185,7 +185,7 @@ def _use_fleet(source: Path, out: Path) -> None:
 
 MODEL = ("card.json", "model.onnx", "weights.npz", "a.json")
 SAMPLES = (".parquet", "motion.json", "offsets.json", "collect.json")
-RUN = ("metrics.json", "budget.json", "config.json", "delay_offset.json", "split.json", "progress.jsonl", ".npz")
+RUN = ("metrics.json", "gap.json", "config.json", "delay_offset.json", "split.json", "progress.jsonl", ".npz")
 TARGETS = (
     Target("journal", written(_dataset), _open_dataset, 2.5, ("sequences.jsonl", "dataset.json")),
     Target("samples", written(_dataset), _open_dataset, 1.0, SAMPLES),

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from gaponet.plot.charts import bars, dots, lines
-from gaponet.plot.methods import COLOURS
-from gaponet.study.table import Spread
+from gaponet.plot.methods import colour
+from gaponet.plot.table import Spread
 
 
 def test_the_default_is_hollow_and_a_line_through_all_groups():
@@ -19,7 +19,7 @@ def test_the_default_is_hollow_and_a_line_through_all_groups():
     assert [t.get_text() for t in ax.get_yticklabels()] == ["2", "4", "4"]
     points = [line for line in ax.lines if line.get_marker() == "o"]
     assert [p.get_xdata()[0] for p in points] == [0.3, 0.2, 0.4]
-    assert [p.get_markerfacecolor() for p in points] == [COLOURS["gaponet"], "white", COLOURS["gaponet"]]
+    assert [p.get_markerfacecolor() for p in points] == [colour("gaponet"), "white", colour("gaponet")]
     assert ax.lines[-1].get_xdata()[0] == 0.2
     places = ax.get_yticks()
     assert places[2] - places[1] > places[1] - places[0]  # groups stand apart

@@ -10,9 +10,9 @@ from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, FolderError
 from gaponet.eval.whose import label
 from gaponet.plot.style import figure
+from gaponet.plot.table import Spread, Table, text
 from gaponet.study.page import write, write_report
 from gaponet.study.result import Result, command_line, facts
-from gaponet.study.table import Spread, Table, text
 
 
 def drawing():

@@ -1,4 +1,4 @@
-"""The supervised start: labels of held corrections, the baseline's recipe, the sensor predictor's refresh."""
+"""The supervised start: labels of held corrections, the baseline's recipe, the sensor predictor's features."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def fitted(tmp_path_factory):
     config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
     env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
-    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2, sensor_refresh=0.1)
+    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2)
     warm = WarmStart(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
     warm.begin()
     return warm
@@ -44,24 +44,3 @@ def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
     assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
-
-
-def test_a_predictor_that_no_longer_holds_is_fitted_again_beside_the_roll_outs(fitted):
-    warm, net, env, report = fitted, fitted.net, fitted.env, fitted.report
-    warm.round(lambda: 0.0)
-    warm.refresh_sensors()
-    good = warm.report
-    assert good["refits"] == 0
-    assert good["mean"] == report["mean"]
-    scale = net.predictor.outputs.std.clone()
-    net.predictor.net[-1].bias.data += 0.7
-    state, row, random = env.sim.qpos.copy(), env.row.copy(), env.rng.bit_generator.state
-    warm.refresh_sensors()
-    again = warm.report
-    assert again["refits"] == 1
-    assert again["visited"] > report["fitted"] - 0.1
-    assert torch.equal(net.predictor.outputs.std, scale)  # the branch knows the answers on this scale
-    assert not any(p.requires_grad for p in net.predictor.parameters())
-    np.testing.assert_array_equal(env.sim.qpos, state)
-    np.testing.assert_array_equal(env.row, row)
-    assert env.rng.bit_generator.state == random

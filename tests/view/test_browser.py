@@ -8,7 +8,7 @@ import pytest
 from arm import recordings
 
 from gaponet.data.store import Dataset
-from gaponet.plot.methods import COLOURS
+from gaponet.plot.methods import colour
 
 pytestmark = pytest.mark.browser
 OFF = 60  # |difference| of one channel, of 255, by which a pixel is another
@@ -55,7 +55,7 @@ def moved(a, b):
 def test_the_canvas_shows_the_robot_and_it_moves_when_played_and_stands_when_not(web):
     from browser import Browser, wait
 
-    assert COLOURS["gaponet"] == "#c8102e"
+    assert colour("gaponet") == "#c8102e"
     with Browser() as page:
         page.ask("Page.navigate", url=web.url)
         wait(lambda: page.value("!!document.querySelector('canvas')"))

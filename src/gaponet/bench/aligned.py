@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-
 import numpy as np
 
+from gaponet.bench.turns import take_turns
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
@@ -45,11 +43,5 @@ def bench_aligned(
         for target in targets:
             aligned.step(target)
 
-    turns: dict[str, Callable[[], None]] = {"nominal": run_nominal, "aligned": run_aligned}
-    seconds: dict[str, list[float]] = {name: [] for name in turns}
-    for _ in range(rounds + 1):
-        for name, turn in turns.items():
-            start = time.perf_counter()
-            turn()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: num_envs * steps / min(s[1:]) for name, s in seconds.items()}
+    seconds = take_turns({"nominal": run_nominal, "aligned": run_aligned}, rounds)
+    return {name: num_envs * steps / best for name, best in seconds.items()}

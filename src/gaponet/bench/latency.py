@@ -40,7 +40,7 @@ def in_own_process(run: Path, calls: int, threads: int) -> str:
     return done.stdout.strip().splitlines()[-1]
 
 
-def measure(run: Path, calls: int = 3000, threads: int = 1) -> dict[str, Any]:
+def measure(run: Path, calls: int, threads: int) -> dict[str, Any]:
     """Microseconds per call, p50, p99 and max, and corrections per second in batches.
 
     Args:

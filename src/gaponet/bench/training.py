@@ -8,7 +8,6 @@ median does: the parts' fastest turns add up to less than the whole's (bench_tra
 from __future__ import annotations
 
 import resource
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from statistics import median
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gaponet.bench.turns import Turn, take_turns
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
@@ -28,7 +28,6 @@ from gaponet.training.config import RewardConfig, TrainConfig, fast
 from gaponet.training.env import DeltaEnv
 from gaponet.training.ppo import Learner
 
-Turn = Callable[[], object]
 Speeds = dict[str, dict[str, float]]
 Others = Callable[[DeltaEnv, TrainConfig], dict[str, tuple[Turn, int]]]  # name → a turn, its control steps
 
@@ -117,17 +116,6 @@ def _for_envs(config: TrainConfig, num_envs: int) -> TrainConfig:
     ppo = config.ppo
     parts = max(1, ppo.mini_batches * num_envs // ppo.num_envs)
     return replace(config, ppo=replace(ppo, num_envs=num_envs, mini_batches=parts))
-
-
-def take_turns(turns: dict[str, Turn], rounds: int, of: Callable[[list[float]], float] = min) -> dict[str, float]:
-    """Seconds of each one's fastest turn (or median, …), in `rounds` rounds after one that does not count."""
-    seconds: dict[str, list[float]] = {name: [] for name in turns}
-    for _ in range(rounds + 1):
-        for name, turn in turns.items():
-            start = time.perf_counter()
-            turn()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: of(s[1:]) for name, s in seconds.items()}
 
 
 def _speeds(done: dict[str, tuple[int, float]], base: str) -> Speeds:

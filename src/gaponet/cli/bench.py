@@ -8,6 +8,7 @@ from typing import Literal
 
 import tyro
 
+from gaponet.cli.options import Folder, Json
 from gaponet.cli.out import Out
 from gaponet.robot import load_robot
 from gaponet.robot_folder import kept_robot
@@ -17,12 +18,12 @@ CALLS = 3000  # of each runtime, with latency
 
 def bench(
     what: tyro.conf.Positional[Literal["sim", "train", "latency", "aligned"]],
-    run: tyro.conf.Positional[Path] = Path("."),
+    run: Folder = Path("."),
     robot: str = "so101",
     model: Literal["gaponet", "mlp"] = "gaponet",
     num_envs: int | None = None,
     rounds: int | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Measure speed; of control steps per second the ratio is what counts, machines differ.
 
@@ -34,7 +35,6 @@ def bench(
         model: Network that is trained.
         num_envs: Simulations side by side; default 512, 1024 with train.
         rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
-        json: One JSON object on stdout.
     """
     out = Out(json)
     if what == "latency":

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
-import tyro
-
+from gaponet.cli.options import Json
 from gaponet.cli.out import Out
 from gaponet.progress import bar
 
@@ -20,7 +19,7 @@ def collect(
     units: tuple[str, ...] = (),
     seed: int = 0,
     nproc: int = 0,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset, each with its nominal twin.
 
@@ -35,7 +34,6 @@ def collect(
         units: Units of the fleet instead of the recipe's.
         seed: Seed of motions, noise and start states.
         nproc: Processes; 0 for one per core.
-        json: Print one JSON object on stdout.
     """
     import gaponet.collect as recording
     from gaponet.robot import load_robot
@@ -56,7 +54,7 @@ def collect(
         )
     screen.table(
         f"VIRTUAL recordings, fleet {fleet}",
-        ["dataset", done.out],
+        ["dataset", done.dataset],
         [
             ["sequences written", str(done.written)],
             ["already there", str(done.present)],
@@ -64,14 +62,4 @@ def collect(
             ["wall time", f"{done.wall_s:.0f} s ({done.times_real_time:.0f} × real time)"],
         ],
     )
-    screen.result(
-        {
-            "dataset": done.out,
-            "virtual": True,
-            "written": done.written,
-            "present": done.present,
-            "hours": done.hours,
-            "wall_s": done.wall_s,
-            "times_real_time": done.times_real_time,
-        }
-    )
+    screen.result({"virtual": True, "times_real_time": done.times_real_time} | asdict(done))

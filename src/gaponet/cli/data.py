@@ -7,24 +7,23 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.progress import bar
 
 
 def card(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     licence: str | None = None,
     source: str | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Count and measure what a dataset holds; writes card.json and CARD.md into it.
 
     Args:
-        dataset: Dataset folder.
         licence: Record this licence in dataset.json, e.g. CC-BY-4.0; "" takes it away.
         source: Record where the data come from: a paper, a laboratory, an address.
-        json: One JSON object on stdout.
     """
     from gaponet.data.card import make_card, write_card
     from gaponet.data.card_text import card_text
@@ -42,18 +41,16 @@ def card(
 
 
 def split(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     by: Literal["motion", "unit", "payload"],
     holdout: tuple[str, ...] = (),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
 
     Args:
-        dataset: Dataset folder.
         by: What the test part has and the others have not.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
-        json: One JSON object on stdout.
     """
     from gaponet.data.card import count
     from gaponet.data.split import make_split, require_distinct_samples, write_split
@@ -76,20 +73,17 @@ def split(
 
 
 def figures(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     out: Path,
-    robot: str | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    robot: Robot = None,
+    json: Json = False,
 ) -> None:
     """Draw the dataset: joint ranges, composition, torque and temperature, real against twin, gap against payload.
 
     Sequences without a twin that a figure needs are replayed first.
 
     Args:
-        dataset: Dataset folder.
         out: Folder for the pictures, each as SVG and PNG.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
     """
     from gaponet.eval.draw_dataset import draw_all
 
@@ -105,18 +99,16 @@ def figures(
 
 
 def export(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     out: Path,
     format: Literal["lerobot"] = "lerobot",
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Write a dataset in another format; gaponet import reads it back without loss.
 
     Args:
-        dataset: Dataset folder.
         out: New folder.
         format: lerobot: LeRobotDataset v3.0, one set for each rate and choice of channels.
-        json: One JSON object on stdout.
     """
     from gaponet.data.formats.lerobot_export import export_lerobot
 
@@ -146,14 +138,11 @@ def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Acti
 def show_card(out: Out, made: dict[str, Any]) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
     from gaponet.data.card import NOT_STATED
-    from gaponet.data.card_text import TITLES, headline, number
+    from gaponet.data.card_text import TITLES, headline, number, shares
 
     out.say("", headline(made))
-    for name, shares in made["shares"].items():
-        out.table("", [TITLES[name], "sequences", "hours", "frames", "motions"], [
-            [key, f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", str(c["motions"])]
-            for key, c in shares.items()
-        ])  # fmt: skip
+    for name in TITLES:
+        out.show("", shares(made, name))
     repeated = made["repeatability"]
     if repeated["channels"]:
         spread = ", ".join(f"{name} {number(c['mean'])} {c['unit']}" for name, c in repeated["channels"].items())

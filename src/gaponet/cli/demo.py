@@ -7,10 +7,9 @@ import sys
 import time
 from pathlib import Path
 
-import tyro
-
 from gaponet import api
 from gaponet.cli.gap import gap
+from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.cli.train import evaluate
 from gaponet.errors import UsageError
@@ -29,7 +28,7 @@ def demo(
     out: Path = Path("demo_run"),
     budget: str = "210s",
     mlp_budget: str = "60s",
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Show the whole way in minutes: on your logs, or on an embedded VIRTUAL robot where there are none.
 
@@ -39,7 +38,6 @@ def demo(
         out: Folder for dataset, runs and report; a demo that was interrupted there is finished.
         budget: Training time of GAPONet.
         mlp_budget: Training time of the MLP baseline.
-        json: One JSON object on stdout.
     """
     from gaponet.data.store import Dataset
     from gaponet.view.portrait import portrait, prepare
@@ -51,7 +49,7 @@ def demo(
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         holdout = _make_dataset(out / "dataset", data, robot, screen)
         dataset = Dataset(out / "dataset")
-        gap(out / "dataset", robot)
+        gap(out / "dataset", robot=robot)
     for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
         run, resume = out / model.kind, (out / model.kind / "checkpoint.pt").is_file()
         config = TrainConfig(model, warm_start=QUICK)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from gaponet.cli.options import Json, Run
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 
@@ -17,10 +16,10 @@ INVERSE_SEED = 7  # of the motions it is fitted on; recipes have 0
 
 
 def export(
-    run: tyro.conf.Positional[Path],
+    run: Run,
     to: Literal["onnx", "torchscript", "inverse"] = "onnx",
     out: Path | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Write a run's model again: as ONNX with the weights for numpy, as TorchScript, or inverted.
 
@@ -29,7 +28,6 @@ def export(
         to: onnx: model.onnx, weights.npz and card.json. torchscript: delta.pt, with history and limits inside.
             inverse: a network fitted to the compensator's fixed point, beside the model; a minute or two.
         out: Folder for onnx, file for torchscript; default the run's model folder. Not for inverse.
-        json: One JSON object on stdout.
     """
     from gaponet.model.artifact import CARD, GapModel, read_card
     from gaponet.model.export import drawn_states, trained_network

@@ -1,83 +1,69 @@
-"""gaponet pair, gaponet gap."""
+"""gaponet gap, and how errors are shown."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from gaponet import api
+from gaponet.cli.options import Data, Json, Motions, Robot, like
 from gaponet.cli.out import Out
+from gaponet.data.store import open_dataset
+from gaponet.eval.tables import by_group, mrad, totals
 from gaponet.plot.methods import title
-from gaponet.robot import RobotSpec
+
+UNITS = {"payload": ", kg", "horizon": ", s"}
 
 
-def pair(
-    dataset: tyro.conf.Positional[Path], robot: str | None = None, json: tyro.conf.FlagCreatePairsOff[bool] = False
-) -> None:
-    """Replay every sequence in the nominal simulator and keep the twin beside it.
+@like(api.gap)
+def gap(dataset: Data, run: Path | None = None, motions: Motions = (), robot: Robot = None, json: Json = False) -> None:
+    """How far the simulator is from the robot, by joint, payload, …; with --run what each step up to its model removes.
 
-    Args:
-        dataset: Dataset folder.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
-    """
-    from gaponet.sim.model import model_hash
-
-    out = Out(json)
-    data, spec = api.open_dataset(dataset, robot)
-    made = api.pair(data, spec)
-    out.say(f"{made} twins made, {len(data) - made} were there; simulator {model_hash(spec)} in {dataset}")
-    out.result({"made": made, "sequences": len(data), "simulator_hash": model_hash(spec)})
-
-
-def gap(
-    dataset: tyro.conf.Positional[Path],
-    robot: str | None = None,
-    motions: tuple[str, ...] = (),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
-) -> None:
-    """How far the nominal simulator is from the robot, per joint, payload, unit, motion and horizon.
-
-    Args:
-        dataset: Dataset folder; sequences without a twin are replayed first.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        motions: Only these.
-        json: One JSON object on stdout.
+    Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
     """
     out = Out(json)
-    data, spec = api.open_dataset(dataset, robot)
-    result = api.gap(data, spec, motions)
-    show_methods(out, result, spec)
-    out.result(result)
+    data, spec = open_dataset(dataset, robot, run)
+    found = api.gap(data, spec, motions, run)
+    if run is None:
+        show_methods(out, found)
+    else:
+        _show_steps(out, found)
+        out.say(f"figure: {run / 'gap.png'}")
+    out.result(found)
 
 
-def show_methods(out: Out, result: dict[str, Any], robot: RobotSpec) -> None:
+def show_methods(out: Out, result: dict[str, Any]) -> None:
     """The tables of gap and eval: totals by method, then by joint, payload, unit, horizon and motion."""
-    methods = result["methods"]
-    kind = "VIRTUAL robot" if result["virtual"] else "real robot"
+    methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
     out.say(
         f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
         result["robot"],
     )
-    base = methods["nominal"]["mpjae"]
-    columns = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "Q_dis, rad·s", "static", "dynamic", "≥ 0.05 rad"]
-    out.table("Totals", columns, [
-        [title(name), mrad(m["mpjae"]), f"{m['mpjae'] / base:.2f}" if base else "–", mrad(m["rmse"]),
-         f"{m['q_dis']:.3f}", mrad(m["static"]), mrad(m["dynamic"]), f"{m['large_0.05'] * 100:.1f} %"]
-        for name, m in methods.items()
+    out.show("Totals", totals(methods))
+    for group in ("joint", "payload", "unit", "horizon", "motion"):
+        if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
+            out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))
+
+
+def _show_steps(out: Out, found: dict[str, Any]) -> None:
+    """What is left after each step, and in brackets what the step removes."""
+    steps = list(found["left"])
+    who = "VIRTUAL robot" if found["virtual"] else "real robot"
+    kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
+    panels = {"all joints": found} | found["by_joint"]
+    out.table(f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
+              ["", *map(title, steps), "floor"], [
+        *([j, *(_left(v, s) for s in steps), mrad(v["floor"]["both"])] for j, v in panels.items()),
+        *([f"{p} kg", *(mrad(v[s]) for s in steps), ""] for p, v in found["by_payload"].items()),
     ])  # fmt: skip
-    for group, heading in (("joint", "joint"), ("payload", "payload, kg"), ("unit", "unit"), ("horizon", "horizon, s"),
-                         ("motion", "motion")):  # fmt: skip
-        keys = list(methods["nominal"][f"by_{group}"])
-        if group in ("payload", "unit") and len(keys) < 2:
-            continue
-        out.table(f"MPJAE, mrad by {group}", [heading, *map(title, methods)], [
-            [key, *(mrad(m[f"by_{group}"][key]["mpjae"]) for m in methods.values())] for key in keys
-        ])  # fmt: skip
+    out.say("in brackets: what the step removes ± its standard error over motions")
+    if found["floor"]["repeatability"] is None:
+        rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
+        out.say(f"floor: {rest}; no motion was recorded twice, so repeatability is unknown")
 
 
-def mrad(value: float) -> str:
-    """rad → milliradian text."""
-    return f"{value * 1e3:.2f}"
+def _left(panel: dict[str, Any], step: str) -> str:
+    if step not in panel["removed"]:
+        return mrad(panel["left"][step])
+    less, error = panel["removed"][step]
+    return f"{mrad(panel['left'][step])} ({mrad(less)} ± {mrad(error)})"

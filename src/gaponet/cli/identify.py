@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import tyro
 
 from gaponet import api
-from gaponet.cli.gap import mrad
+from gaponet.cli.options import Data, Json, Robot, like
 from gaponet.cli.out import Out, writes
+from gaponet.eval.tables import mrad
 from gaponet.metrics import standard_error
 
 if TYPE_CHECKING:
@@ -39,33 +39,25 @@ WIDE = 4  # columns of a table
 
 
 @writes("robot")
+@like(api.identify)
 def identify(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     out: Path,
     windows: int = 40,
     terms: tuple[Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"], ...] = ("stribeck", "load"),
     table: bool = True,
     threads: int = 0,
-    robot: str | None = None,
+    robot: Robot = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
 
     The result is a robot folder: use it with --robot, e.g. gaponet train DATASET --robot OUT --out RUN.
 
     Args:
-        dataset: Dataset folder.
-        out: Robot folder to write.
-        windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
         terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
-        table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
-        threads: For the table; 0 for all cores.
-        robot: Robot name or folder to start from, if not the one that the dataset keeps.
-        units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
-        holdout_units: Units to leave out, as in gaponet train.
-        json: One JSON object on stdout.
     """
     screen = Out(json)
     made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, threads)

@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 
 from gaponet import api
+from gaponet.cli.options import Data, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
@@ -24,8 +25,9 @@ COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold re
 MAX_ROWS = 60
 
 
+@like(api.import_logs)
 def import_logs(
-    src: tyro.conf.Positional[Path],
+    src: Folder,
     robot: str,
     out: Path,
     unit_id: str | None = None,
@@ -39,16 +41,12 @@ def import_logs(
     level: Literal["joint", "upper_body", "whole_body"] | None = None,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
 
     Args:
-        src: SAGE folder, LeRobot set (v3.0), BAM logs (JSON), or a table (CSV, Parquet) or a folder of tables.
         robot: Robot name or folder.
-        out: Dataset folder; appended to where it exists.
-        unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
-        payload_mass: kg in each hand; 0 when empty. Needed unless the format states it.
         payload_side: Which hand carries it: both (default), or the side of one payload mount.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
         format: Format of the logs; default by looking.
@@ -60,7 +58,6 @@ def import_logs(
         kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
             states, else the robot's.
         kd: The same of the damping gain, N·m·s/rad.
-        json: One JSON object on stdout.
     """
     spec = load_robot(robot)
     report = api.import_logs(
@@ -70,15 +67,11 @@ def import_logs(
     show_import(Out(json), report, spec)
 
 
-def doctor(
-    dataset: tyro.conf.Positional[Path], robot: str | None = None, json: tyro.conf.FlagCreatePairsOff[bool] = False
-) -> None:
+def doctor(dataset: Data, robot: str | None = None, json: Json = False) -> None:
     """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
 
     Args:
-        dataset: Dataset folder.
         robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
     """
     from gaponet.data.doctor import inventory
 
@@ -143,8 +136,12 @@ def show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Join
     for name, found in lags.items():
         median = f"{np.median(found) * 1e3:.0f}" if found else "–"
         joint = offsets.get(name)
-        at_rest = [mrad(joint.static_error, joint.stiction_band), mrad(joint.tracking_offset)] if joint else ["–", "–"]
-        zero = mrad(joint.zero_offset, joint.zero_std) if joint else "–"
+        at_rest = (
+            [signed_mrad(joint.static_error, joint.stiction_band), signed_mrad(joint.tracking_offset)]
+            if joint
+            else ["–", "–"]
+        )
+        zero = signed_mrad(joint.zero_offset, joint.zero_std) if joint else "–"
         rows.append([name, median, *at_rest, zero if joint and joint.identifiable else f"({zero})"])
     out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset", "zero"], rows)
     if not offsets:
@@ -173,7 +170,7 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
     columns = ["joint", "commanded, rad", "lag", "at rest", "rests"]
     out.table("Joints; fast lag in ms, error at rest ± stiction in mrad", columns, [
         [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), lag(r["lag_s"]),
-         mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
+         signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
         for r in diagnosis.joints
     ])  # fmt: skip
     for finding in diagnosis.findings:
@@ -202,7 +199,7 @@ def span(seconds: list[float]) -> str:
     return low if low == high else f"{low}–{high}"
 
 
-def mrad(value: float | None, band: float | None = None) -> str:
+def signed_mrad(value: float | None, band: float | None = None) -> str:
     """0.037, 0.031 → "+37 ± 31"."""
     if value is None:
         return "–"

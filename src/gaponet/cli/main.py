@@ -29,9 +29,7 @@ TASKS = {
         "robot": "gaponet.cli.robots.robot:robot",
     },
     "The gap": {
-        "pair": "gaponet.cli.gap:pair",
         "gap": "gaponet.cli.gap:gap",
-        "budget": "gaponet.cli.budget:budget",
         "view": "gaponet.cli.view:view",
     },
     "Closing it": {
@@ -44,7 +42,6 @@ TASKS = {
         "eval": "gaponet.cli.train:evaluate",
         "report": "gaponet.cli.train:report",
         "runs": "gaponet.cli.studies.runs:runs",
-        "compare": "gaponet.cli.studies.compare:compare",
         "experiment": "gaponet.cli.studies.experiment:experiment",
     },
     "On a robot, real or virtual": {

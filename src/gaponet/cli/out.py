@@ -17,6 +17,7 @@ from rich.text import Text
 
 from gaponet.data.json_file import finite
 from gaponet.files import writing
+from gaponet.plot.table import Table as ResultTable
 from gaponet.text import plain
 
 if TYPE_CHECKING:
@@ -63,6 +64,10 @@ class Out:
             table.add_row(*map(Text, line))
         self.console.print(table)
 
+    def show(self, title: str, table: ResultTable) -> None:
+        """A table of numbers, as `table`."""
+        self.table(title, list(table.columns), table.texts())
+
     def result(self, value: dict[str, Any]) -> None:
         """The command's result as one JSON object; nothing without --json."""
         if self.as_json:
@@ -78,7 +83,7 @@ def show_result(result: Result, out: Path, screen: Out) -> None:
     screen.say("", result.title)
     screen.say(result.virtual)
     for table in (t for t in result.tables if t.shown):
-        screen.table("", list(table.columns), table.texts())
+        screen.show("", table)
         if table.caption:
             screen.say(table.caption)
     for sentence in result.sentences:

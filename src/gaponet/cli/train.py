@@ -3,52 +3,44 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from gaponet import api
-from gaponet.cli.gap import mrad, show_methods
+from gaponet.cli.gap import show_methods
+from gaponet.cli.options import Data, Flag, Folder, Json, Motions, Robot, Run, like
 from gaponet.cli.out import Out, writes
+from gaponet.eval.tables import mrad
 from gaponet.model.config import Kind
 from gaponet.progress import bar
 from gaponet.training.config import TrainConfig
 from gaponet.training.config import fast as fast_preset
 
-if TYPE_CHECKING:
-    pass
-
 
 @writes("run")
+@like(api.train)
 def train(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     out: Path,
     model: Kind = "gaponet",
     budget: str = "10m",
-    resume: tyro.conf.FlagCreatePairsOff[bool] = False,
-    fast: tyro.conf.FlagCreatePairsOff[bool] = False,
-    robot: str | None = None,
+    resume: Flag = False,
+    fast: Flag = False,
+    robot: Robot = None,
     holdout_units: tuple[str, ...] = (),
     log: tuple[Literal["tensorboard", "wandb"], ...] = (),
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
 
     Ctrl-C ends training and leaves a usable run.
 
     Args:
-        dataset: Dataset folder.
-        out: Run folder.
-        model: gaponet, or a baseline: mlp, transformer, fno, inverse.
-        budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
-        resume: Go on with the run in out.
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
-        robot: Robot name or folder, if not the one that the dataset keeps.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
-        holdout_units: Units never trained on; their test motions stay in the test part.
         config: Everything else.
-        json: One JSON object on stdout.
     """
     from gaponet.model.artifact import how_trained
 
@@ -68,24 +60,16 @@ def train(
     screen.result({k: card[k] for k in shown})
 
 
+@like(api.evaluate)
 def evaluate(
-    run: tyro.conf.Positional[Path],
-    dataset: tyro.conf.Positional[Path],
+    run: Run,
+    dataset: Folder,
     also: tuple[Path, ...] = (),
-    motions: tuple[str, ...] = (),
-    robot: str | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    motions: Motions = (),
+    robot: Robot = None,
+    json: Json = False,
 ) -> None:
-    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it.
-
-    Args:
-        run: Run folder of gaponet train.
-        dataset: The dataset trained on (its test motions are used) or another.
-        also: Further runs to compare, e.g. the MLP's.
-        motions: Only these.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
-    """
+    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it."""
     out = Out(json)
     data, spec = api.open_dataset(dataset, robot, run)
     evaluation = api.evaluate(run, data, also, motions, spec)
@@ -93,25 +77,18 @@ def evaluate(
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
         )
-    show_methods(out, evaluation.result, spec)
+    show_methods(out, evaluation.result)
     out.result(evaluation.result)
 
 
 def report(
-    run: tyro.conf.Positional[Path],
-    dataset: Path | None = None,
-    also: tuple[Path, ...] = (),
-    robot: str | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    run: Run, dataset: Path | None = None, also: tuple[Path, ...] = (), robot: Robot = None, json: Json = False
 ) -> None:
     """Write one self-contained offline HTML page about a run.
 
     Args:
-        run: Run folder of gaponet train.
         dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.
         also: Further runs to compare, e.g. the MLP's.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
     """
     from gaponet.view.portrait import portrait, prepare
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
-from gaponet.cli.gap import mrad
+from gaponet.cli.options import Data, Flag, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.data.store import open_dataset
+from gaponet.eval.tables import mrad
 from gaponet.progress import bar
 
 if TYPE_CHECKING:
@@ -18,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def view(
-    dataset: tyro.conf.Positional[Path],
+    dataset: Data,
     model: tuple[Path, ...] = (),
     motion: str = "",
     unit: str = "",
     payload_mass: float | None = None,
     show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
     render: Path | None = None,
-    web: tyro.conf.FlagCreatePairsOff[bool] = False,
+    web: Flag = False,
     port: int = 8080,
     start: float | None = None,
     duration: float = 8.0,
@@ -38,13 +37,12 @@ def view(
     course: bool = True,
     azimuth: float = 145.0,
     elevation: float = -14.0,
-    robot: str | None = None,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    robot: Robot = None,
+    json: Json = False,
 ) -> None:
     """Watch one recording: target, simulator without and with a model, robot. --render, --web need no display.
 
     Args:
-        dataset: Dataset folder.
         model: Run folders of gaponet train; each gives a copy of the robot in the simulator that it aligns.
         motion: Which motion; default: one that the model was not trained on, where there is one.
         unit: Which unit's recording, where there are several.
@@ -64,8 +62,6 @@ def view(
         course: Draw the error against time below a picture.
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
-        robot: Robot name or folder, if not the one that the dataset keeps.
-        json: One JSON object on stdout.
     """
     from gaponet.errors import UsageError
     from gaponet.view.gl import choose_gl, has_display

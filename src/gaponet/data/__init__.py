@@ -1,1 +1,1 @@
-"""Logs to datasets: Log → Sequence → Pair → PairedDataset, and the folder they live in."""
+"""Logs to datasets: Log → Sequence → Pair, and the folder they live in."""

@@ -11,9 +11,10 @@ import numpy as np
 
 from gaponet import __version__
 from gaponet.arrays import Array
+from gaponet.data.log import UNITS
 from gaponet.data.repeatability import Repetitions, summary
 from gaponet.data.sequence import ARRAYS
-from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
+from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
 from gaponet.structure import read_json

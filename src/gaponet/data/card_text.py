@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from gaponet.data.card import NOT_STATED
+from gaponet.plot.table import Table
 from gaponet.text import markdown
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}
@@ -45,15 +46,15 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     yield ""
 
 
+def shares(card: dict[str, Any], by: str) -> Table:
+    """How much there is, by one of TITLES."""
+    rows = tuple((key, c["sequences"], c["hours"], c["frames"], c["motions"]) for key, c in card["shares"][by].items())
+    return Table(by, (TITLES[by], "sequences", "hours", "frames", "motions"), rows)
+
+
 def _shares(card: dict[str, Any]) -> Iterator[str]:
-    for name, title in TITLES.items():
-        yield from _table(
-            [title, "sequences", "hours", "frames", "motions"],
-            [
-                [key, f"{c['sequences']:,}", f"{c['hours']:.2f}", f"{c['frames']:,}", f"{c['motions']:,}"]
-                for key, c in card["shares"][name].items()
-            ],
-        )
+    for name in TITLES:
+        yield from (shares(card, name).markdown(), "")
 
 
 def _repeatability(card: dict[str, Any]) -> Iterator[str]:
@@ -73,9 +74,10 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     yield ""
     channels = found["channels"]
     joints = dict.fromkeys(j for c in channels.values() for j in c["joints"])
-    rows = [[joint, *(number(c["joints"].get(joint)) for c in channels.values())] for joint in joints]
-    mean = ["mean", *(number(c["mean"]) for c in channels.values())]
-    yield from _table(["joint", *(f"{name}, {c['unit']}" for name, c in channels.items())], [*rows, mean])
+    rows = [(joint, *(number(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
+    mean = ("mean", *(number(c["mean"]) for c in channels.values()))
+    heads = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
+    yield from (Table("repeatability", heads, (*rows, mean)).markdown(), "")
 
 
 def _signals(card: dict[str, Any]) -> Iterator[str]:
@@ -84,18 +86,9 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
     for name, signal in card["signals"].items():
         yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)"
         yield ""
-        yield from _table(
-            ["joint", "least", "1 %", "mean", "99 %", "greatest", "std"],
-            [[joint, *(number(v) for v in values.values())] for joint, values in signal["joints"].items()],
-        )
-
-
-def _table(columns: list[str], rows: list[list[str]]) -> Iterator[str]:
-    yield f"| {' | '.join(map(markdown, columns))} |"
-    yield "| --- |" + " ---: |" * (len(columns) - 1)
-    for row in rows:
-        yield f"| {' | '.join(map(markdown, row))} |"
-    yield ""
+        rows = tuple((joint, *map(number, values.values())) for joint, values in signal["joints"].items())
+        heads = ("joint", "least", "1 %", "mean", "99 %", "greatest", "std")
+        yield from (Table(name, heads, rows).markdown(), "")
 
 
 def number(value: float | None) -> str:

@@ -50,12 +50,7 @@ class Diagnosis:
 
     def as_dict(self) -> dict[str, Any]:
         """The diagnosis as a dictionary that JSON can hold."""
-        return {
-            "verdict": self.verdict,
-            "findings": [asdict(f) for f in self.findings],
-            "sequences": self.sequences,
-            "joints": self.joints,
-        }
+        return {"verdict": self.verdict} | asdict(self)
 
 
 def diagnose(

@@ -14,6 +14,7 @@ from gaponet.errors import LogError
 CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
 # What others computed from these; kept where a format states it (an exported dataset), never looked for elsewhere.
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
+UNITS = {"time": "s"} | CHANNELS | DERIVED
 REQUIRED = ("ctrl", "qpos")
 
 
@@ -55,7 +56,7 @@ class Log:
             self._check(name, np.asarray(time), np.asarray(values))
 
     def _check(self, name: str, time: Array, values: Array) -> None:
-        if name not in CHANNELS | DERIVED:
+        if name not in UNITS:
             raise LogError(f"{self.source}: unknown channel '{name}'; known are {', '.join(CHANNELS | DERIVED)}")
         if values.shape != (len(time), len(self.joint_names)):
             raise LogError(

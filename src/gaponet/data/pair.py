@@ -1,4 +1,4 @@
-"""Pair: a recording and its simulated twin, row by row; PairedDataset: pairs and how to split them."""
+"""Pair: a recording and its simulated twin, row by row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError
 
 
 @dataclass(frozen=True)
@@ -41,35 +41,13 @@ class Pair:
         if self.sim.qpos.shape != self.real.qpos.shape:
             raise DatasetError(
                 f"twin of '{self.real.meta.motion}' has shape {self.sim.qpos.shape}, recording {self.real.qpos.shape}; "
-                "run gaponet pair again"
+                "run gaponet gap again"
             )
 
     @property
     def gap(self) -> Array:
         """real.qpos − sim.qpos, (T, n), rad."""
         return self.real.qpos - self.sim.qpos
-
-
-@dataclass(frozen=True)
-class Split:
-    """Motions for training, validation (choosing) and test (reporting); disjoint by construction and by content."""
-
-    train: tuple[str, ...]
-    val: tuple[str, ...]
-    test: tuple[str, ...]
-
-
-def split_by_motion(motions: list[str], test_share: float = 0.25, val_share: float = 0.125) -> Split:
-    """A fixed rule without a seed: motions in the order of the SHA-256 of their names, test first, then validation.
-
-    Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
-    """
-    names = hash_order(motions)
-    if len(names) < 3:
-        raise UsageError(f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more")
-    test = max(1, round(len(names) * test_share))
-    val = max(1, round(len(names) * val_share))
-    return Split(tuple(names[test + val :]), tuple(names[test : test + val]), tuple(names[:test]))
 
 
 def hash_order(names: Iterable[str]) -> list[str]:

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
+from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 
 SAME_COMMAND = 1e-3  # rad; repetitions whose commands differ by more somewhere were not asked for the same thing
 MOVED = 0.02  # rad; joints commanded to move by less say nothing
-CHANNELS = {"qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}
+REPEATED = ("qpos", "qvel", "tau", "temperature")
 
 
 class Repetitions:
@@ -29,7 +30,7 @@ class Repetitions:
 
     def add(self, sequence: Sequence) -> None:
         """Take in a repetition (Welford's update, so that nothing but sums is kept)."""
-        arrays = {c: x.astype(float) for c in CHANNELS if (x := getattr(sequence, c)) is not None}
+        arrays = {c: x.astype(float) for c in REPEATED if (x := getattr(sequence, c)) is not None}
         if self.count == 0:
             self.count, self._ctrl, self._mean = 1, sequence.ctrl, arrays
             self._squares = {c: np.zeros_like(x) for c, x in arrays.items()}
@@ -70,7 +71,7 @@ def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str
     """
     moved = np.array([g.moved for g in groups]).reshape(-1, len(joint_names))
     channels = {}
-    for name, unit in CHANNELS.items():
+    for name in REPEATED:
         variances = [(g.variance(name), m) for g, m in zip(groups, moved, strict=True)]
         found = [(np.where(m, v, np.nan)) for v, m in variances if v is not None]
         values = {}
@@ -79,7 +80,7 @@ def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str
             if np.isfinite(column).any():
                 values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
         if values:
-            channels[name] = {"unit": unit, "mean": float(np.mean(list(values.values()))), "joints": values}
+            channels[name] = {"unit": UNITS[name], "mean": float(np.mean(list(values.values()))), "joints": values}
     return {
         "groups": len(groups),
         "sequences": sum(g.count for g in groups),

@@ -11,14 +11,14 @@ import hashlib
 import itertools
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from pathlib import Path
 from typing import Any
 
 from typing_extensions import TypedDict
 
-from gaponet.data.pair import hash_order, split_by_motion
+from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text
@@ -85,9 +85,8 @@ def split_entries(
     if not 0 < train_share <= 1:
         raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
     away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
-    split = split_by_motion([e.meta.motion for e in dataset.entries])
-    motions = {"train": split.train[: max(1, round(train_share * len(split.train)))], "val": split.val,
-               "test": split.test}  # fmt: skip
+    motions = split_by_motion(e.meta.motion for e in dataset.entries)
+    motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
     entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
     parts = {
         part: [e for e in entries_at if e.meta.motion in motions[part] and (part == "test" or not away(e.meta))]
@@ -112,6 +111,17 @@ def spread(entries: ListOf[Entry], most: int) -> list[Entry]:
     turned = [g[i % len(g) :] + g[: i % len(g)] for i, g in enumerate(groups.values())]
     found = [e.id for turn in itertools.zip_longest(*turned) for e in turn if e is not None][:most]
     return [e for e in entries if e.id in found]
+
+
+def split_by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
+    """The motions of each part by a fixed rule without a seed: in the order of the SHA-256 of their names, test first,
+    then validation. Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
+    """
+    names = hash_order(motions)
+    if len(names) < 3:
+        raise UsageError(f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more")
+    test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
+    return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
 
 
 def _same_rate(a: float, b: float) -> bool:

@@ -31,6 +31,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
@@ -42,10 +43,6 @@ from gaponet.structure import Name, parse_json, read_format
 FORMAT = 1
 MEND = "restore the file or import the log again"
 KIND, JOURNAL = "dataset", "sequences.jsonl"
-UNITS = {
-    "time": "s", "ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "qacc": "rad/s²", "tau": "N·m", "tau_eq": "N·m",
-    "temperature": "°C",
-}  # fmt: skip
 
 
 class Header(TypedDict):
@@ -244,7 +241,7 @@ class Dataset:
         file = self._twin_file(entry, model)
         if not file.is_file():
             raise DatasetError(
-                f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet pair {self.path}"
+                f"{self.path}: '{entry.id}' has no twin for simulator {model}; run gaponet gap {self.path}"
             )
         arrays = _read_table(file, ("qpos", "qvel", "tau"), entry.rows, len(self.joint_names))
         return Pair(self.read(entry), Twin(model, **arrays))

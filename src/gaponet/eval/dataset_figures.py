@@ -12,7 +12,7 @@ from matplotlib.ticker import MultipleLocator
 from gaponet.arrays import Array
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
-from gaponet.plot.methods import COLOURS
+from gaponet.plot.methods import colour
 from gaponet.plot.style import figure, joint_label, legend, styled
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
@@ -39,17 +39,17 @@ def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, flo
     ax = fig.subplots()
     rng = np.random.default_rng(0)
     for row, (joint, values) in enumerate(positions.items()):
-        y, colour = -row, SIDES[next((s for s in ("left", "right") if joint.startswith(s)), "")]
+        y, tint = -row, SIDES[next((s for s in ("left", "right") if joint.startswith(s)), "")]
         if np.isfinite(limits[joint]).all():
             ax.barh(y, np.ptp(limits[joint]), 0.86, limits[joint][0], color="#000000", alpha=0.05, lw=0)
         x, density = _density(values)
-        ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=colour, alpha=0.75, lw=0)
+        ax.fill_between(x, y + 0.06, y + 0.06 + 0.36 * density, color=tint, alpha=0.75, lw=0)
         low, q1, middle, q3, high = np.percentile(values, [1, 25, 50, 75, 99])
-        ax.plot([low, high], [y, y], color=colour, lw=1)
-        ax.plot([q1, q3], [y, y], color=colour, lw=4, solid_capstyle="butt")
-        ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=colour, mew=1)
+        ax.plot([low, high], [y, y], color=tint, lw=1)
+        ax.plot([q1, q3], [y, y], color=tint, lw=4, solid_capstyle="butt")
+        ax.plot(middle, y, "o", ms=3.2, mfc="white", mec=tint, mew=1)
         rain = rng.choice(values, min(RAIN, len(values)), replace=False)
-        ax.plot(rain, y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)), ".", ms=1.6, mew=0, color=colour, alpha=0.5)
+        ax.plot(rain, y - 0.23 + rng.uniform(-0.12, 0.12, len(rain)), ".", ms=1.6, mew=0, color=tint, alpha=0.5)
     ax.set_yticks(-np.arange(len(positions)), [joint_label(j, wrapped=False) for j in positions])
     ax.tick_params(axis="y", length=0)
     ax.grid(axis="y", visible=False)
@@ -171,12 +171,12 @@ def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> 
         j = real.joint_names.index(joint)
         top, low = axes[:, column]
         top.plot(time, real.ctrl[:, j], color="#d99000", lw=0.8, ls=(0, (3, 1.5)), label="command")
-        top.plot(time, twin_qpos[:, j], color=COLOURS["nominal"], lw=1.4, label="simulated twin")
-        top.plot(time, real.qpos[:, j], color=COLOURS["recorded"], lw=1.0, label="recorded")
+        top.plot(time, twin_qpos[:, j], color=colour("nominal"), lw=1.4, label="simulated twin")
+        top.plot(time, real.qpos[:, j], color=colour("recorded"), lw=1.0, label="recorded")
         gap = (real.qpos[:, j] - twin_qpos[:, j]) * 1e3
         low.axhline(0, color="#111111", lw=0.6)
-        low.fill_between(time, gap, 0, color=COLOURS["gaponet"], alpha=0.25, lw=0)
-        low.plot(time, gap, color=COLOURS["gaponet"], lw=0.9)
+        low.fill_between(time, gap, 0, color=colour("gaponet"), alpha=0.25, lw=0)
+        low.plot(time, gap, color=colour("gaponet"), lw=0.9)
         top.set_title(joint_label(joint, wrapped=False))
         low.set_xlabel("time, s")
         top.margins(x=0.01)

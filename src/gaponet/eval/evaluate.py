@@ -27,6 +27,7 @@ from gaponet.metrics import Run, runs, summary
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
+from gaponet.plot.methods import IDENTIFIED, method, title
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of, require_kept
 from gaponet.sim.model import model_hash
@@ -76,17 +77,18 @@ def evaluate(
     """
     dataset.require_robot(robot)
     models: dict[str, GapModel] = {}
+    robots: dict[str, RobotSpec] = {}
     for path in runs_dirs:
-        model = GapModel.load(path)
-        if model.config.kind in models:
-            raise UsageError(f"{path}: a second {model.config.kind} model; give runs of different kinds")
-        models[model.config.kind] = model
-    robots = {kind: corrected_robot(path, robot) for kind, path in zip(models, runs_dirs, strict=True)}
+        model, corrected = GapModel.load(path), corrected_robot(path, robot)
+        name = method(model.config.kind, corrected)
+        if name in models:
+            raise UsageError(f"{path}: a second run of {title(name)}; give runs of different methods")
+        models[name], robots[name] = model, corrected
     nominal = nominal_of(next(iter(robots.values())))
     entries, unseen = choose(runs_dirs, dataset, motions)
     sequences = dataset.sequences(entries)
-    for (kind, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
-        model.require(robots[kind], dt)
+    for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
+        model.require(robots[name], dt)
     done_runs: dict[str, list[Run]] = {}
     deltas: dict[str, list[Array]] = {}
     op = robot.operated_index
@@ -99,8 +101,8 @@ def evaluate(
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
     calibrated = calibration.load(runs_dirs[0], next(iter(models.values())).weights_hash())
     if any(s.meta.unit_id in calibrated for s in sequences):
-        kind = next(iter(models))
-        twins = _by_unit(sequences, models[kind], robots[kind], calibrated, partial(progress, "calibrated"))
+        name = next(iter(models))
+        twins = _by_unit(sequences, models[name], robots[name], calibrated, partial(progress, "calibrated"))
         done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
     result = {
         "methods": {name: summary(part, robot) for name, part in done_runs.items()},
@@ -231,8 +233,8 @@ def _methods(
         raise UsageError("the runs start from different identified simulators; compare those of one identification")
     for robot in identified.values():
         yield "identified", robot, None
-    for kind in sorted(models, key=ORDER.index):
-        yield kind, robots[kind], models[kind].corrector(robots[kind])
+    for name in sorted(models, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
+        yield name, robots[name], models[name].corrector(robots[name])
 
 
 def _by_unit(

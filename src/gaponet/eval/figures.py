@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 
 from gaponet.arrays import Array
 from gaponet.data.repeatability import MOVED
-from gaponet.plot.charts import Course, Once, against, bars, lines
-from gaponet.plot.methods import COLOURS, colour, title
+from gaponet.plot.charts import Course, against, bars, lines
+from gaponet.plot.methods import colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
+from gaponet.plot.table import Spread
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:
@@ -27,7 +28,7 @@ def by_payload(methods: dict[str, Any]) -> Figure:
 
 def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[str], str]) -> Figure:
     keys = list(methods["nominal"][group])
-    values = {title(n): (colour(n), [Once(1e3 * m[group][k]["mpjae"]) for k in keys]) for n, m in methods.items()}
+    values = {title(n): (colour(n), [Spread.of([m[group][k]["mpjae"]], 1e3) for k in keys]) for n, m in methods.items()}
     return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
 
 
@@ -40,7 +41,7 @@ def by_horizon(methods: dict[str, Any]) -> Figure:
         title(n): (
             colour(n),
             [at for at, _ in ticks],
-            [Once(1e3 * m["by_horizon"][k]["mpjae"]) for k in (*keys, "whole")],
+            [Spread.of([m["by_horizon"][k]["mpjae"]], 1e3) for k in (*keys, "whole")],
         )
         for n, m in methods.items()
     }
@@ -65,15 +66,15 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
     steps = np.array([p["steps"] for p in progress]) / 1e6
     value = np.array([p["val_mpjae"] for p in progress]) * 1e3
     ax.plot(steps, value, "-", color="#555555", lw=0.8)
-    for stage, tint, label in (("warm start", COLOURS["mlp"], "warm start"), ("ppo", COLOURS["gaponet"], "PPO")):
+    for stage, tint, label in (("warm start", colour("mlp"), "warm start"), ("ppo", colour("gaponet"), "PPO")):
         at = [i for i, p in enumerate(progress) if p["stage"] == stage]
         if at:
             ax.plot(steps[at], value[at], "o", ms=3.5, color=tint, label=label)
     best = int(value.argmin())
     ax.plot(steps[best], value[best], "o", ms=9, mfc="none", mec="#111111", label="kept")
-    ax.axhline(progress[0]["nominal_mpjae"] * 1e3, color=COLOURS["nominal"], ls="--", lw=1)
+    ax.axhline(progress[0]["nominal_mpjae"] * 1e3, color=colour("nominal"), ls="--", lw=1)
     ax.annotate("nominal", (1, progress[0]["nominal_mpjae"] * 1e3), xycoords=("axes fraction", "data"), ha="right",
-                va="bottom", color=COLOURS["nominal"])  # fmt: skip
+                va="bottom", color=colour("nominal"))  # fmt: skip
     ax.set_ylim(bottom=0)
     ax.set_xlabel("control steps, million")
     ax.set_ylabel("validation MPJAE, mrad")

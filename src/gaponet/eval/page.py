@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
@@ -78,7 +79,7 @@ def facts_table(rows: list[list[str]]) -> Markup:
     return element("table", *(element("tr", *(element("td", c) for c in row)) for row in rows), css="facts")
 
 
-def table(head: list[str], rows: list[list[str]], best: int | None = None) -> Markup:
+def table(head: Sequence[str], rows: list[list[str]], best: int | None = None) -> Markup:
     """The first column is text, the others are numbers; the row of the best in bold."""
     body = (
         element("tr", *(element("td", c) for c in row), css="best" if i == best else "") for i, row in enumerate(rows)

@@ -16,10 +16,12 @@ from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.eval.page import element, facts_table, figure, page, table, tag
 from gaponet.eval.page import picture as image
-from gaponet.eval.run_files import MEND, read_budget, read_config, read_metrics, read_progress, read_trajectories
+from gaponet.eval.run_files import MEND, read_config, read_gap, read_metrics, read_progress, read_trajectories
+from gaponet.eval.tables import by_group, mrad, totals
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel, how_trained
-from gaponet.plot.methods import title
+from gaponet.plot.methods import method, title
+from gaponet.plot.table import Table
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
@@ -54,12 +56,13 @@ def write_report(
         _evaluate(run, dataset, also, asked, progress)
     metrics = read_metrics(run)
     arrays = read_trajectories(run, metrics, len(spec.operated))
-    config, curve, budget = read_config(run), read_progress(run), read_budget(run)
-    _require_complete(model, metrics, curve, spec)
+    config, curve, gap = read_config(run), read_progress(run), read_gap(run)
+    own = method(model.config.kind, spec)
+    _require_complete(model, own, metrics, curve, spec)
     progress("drawing", 0, 1)
     commands = [config.get("command", ""), metrics["command"], shlex.join(["gaponet", "report", str(run)])]
-    photo = () if picture is None else _photo(picture, arrays, metrics, spec, model.config.kind)
-    text = _page(model.card, config, metrics, arrays, curve, spec, budget, photo, commands)
+    photo = () if picture is None else _photo(picture, arrays, metrics, spec, own)
+    text = _page(model.card, own, config, metrics, arrays, curve, spec, gap, photo, commands)
     path = run / "report.html"
     write_text(path, text)
     progress("drawing", 1, 1)
@@ -78,7 +81,9 @@ def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: Ro
     save(evaluate([run, *also], data, robot, progress=progress), run)
 
 
-def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict[str, Any]], robot: RobotSpec) -> None:
+def _require_complete(
+    model: GapModel, own: str, metrics: dict[str, Any], curve: list[dict[str, Any]], robot: RobotSpec
+) -> None:
     """Refuse a run of which something that a report says is not known."""
     told = ("dt", "payload_seen", "units", "hours", "steps", "seconds", "seed", "excess_delay", "parity_rad", "motions")
     missing = [name for name in (*told, "versions", "dataset_hash") if name not in model.card]
@@ -86,7 +91,7 @@ def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict
     whole = parts <= metrics.keys() and set(methods["nominal"]["by_joint"]) == set(metrics["moves"]) == set(
         robot.operated
     )
-    missing += [] if model.config.kind in methods and whole else [f"a whole evaluation of {model.config.kind}"]
+    missing += [] if own in methods and whole else [f"a whole evaluation of {title(own)}"]
     missing += [] if curve else ["progress.jsonl"]
     if missing or {"train", "val"} - set(model.card["motions"]):
         raise ModelError(f"{model.path}: {', '.join(missing) or 'motions'} is missing; {MEND}")
@@ -94,21 +99,21 @@ def _require_complete(model: GapModel, metrics: dict[str, Any], curve: list[dict
 
 def _page(
     card: dict[str, Any],
+    own: str,
     config: dict[str, Any],
     metrics: dict[str, Any],
     arrays: dict[str, Array],
     curve: list[dict[str, Any]],
     robot: RobotSpec,
-    budget: dict[str, Any] | None,
+    gap: dict[str, Any] | None,
     photo: Iterable[Markup],
     commands: list[str],
 ) -> str:
-    from gaponet.eval import budget_figure as draw_budget
     from gaponet.eval import figures as draw
+    from gaponet.eval.gap_figure import waterfall
 
-    methods, kind = metrics["methods"], card["model"]["kind"]
-    name = title(kind)
-    ratio = metrics["ratio_to_nominal"]
+    methods, ratio, name = metrics["methods"], metrics["ratio_to_nominal"], title(own)
+    best = int(np.argmin([m["mpjae"] for m in methods.values()]))
     held_out = "on held-out recordings" if metrics["unseen"] else "(some recordings were used in training)"
     bars = [
         figure(draw.by_joint(methods), "Mean |q_sim − q_robot| of each operated joint."),
@@ -119,25 +124,26 @@ def _page(
     body = [
         element("h1", f"{robot.description}: {name}"),
         element("p", tag(metrics["virtual"]), " ", *_facts_line(card, metrics)),
-        element("p", _verdict(kind, methods, ratio), css="lead"),
-        *(element("div", text, css="warn") for text in warnings(card, metrics)),
+        element("p", _verdict(own, methods, ratio), css="lead"),
+        *(element("div", text, css="warn") for text in warnings(card, own, metrics)),
         *photo,
-        element("h2", f"Errors, whole-motion free run {held_out}"), _totals(methods, ratio), _explained(methods),
-        element("h2", "By joint"), _by_joint(methods, kind, metrics),
+        element("h2", f"Errors, whole-motion free run {held_out}"), _table(totals(methods, _both), best),
+        _explained(methods),
+        element("h2", "By joint"), _by_joint(methods, own, metrics),
         element("div", *bars, css="row"),
         element("h2", "Trajectories"), *_trajectories(arrays, metrics, robot),
     ]  # fmt: skip
-    if budget is not None:
+    if gap is not None:
         body += [
             element("h2", "Where the gap comes from"),
-            figure(draw_budget.waterfall(budget), "What each step removes of the mean |error| (hollow: adds to it)."),
+            figure(waterfall(gap), "What each step removes of the mean |error| (hollow: adds to it)."),
         ]
     curve_figure = figure(
         draw.training_curve(curve), "Free run over whole validation motions; the circled model was kept."
     )
     body += [
         element("h2", "Training"), element("div", curve_figure, _training_table(card, config), css="row"),
-        element("h2", "By motion"), _by_motion(methods),
+        element("h2", "By motion"), _table(by_group(methods, "motion", _both)),
         element("h2", "What exactly"), _facts(card, metrics),
         element("h2", "Do it again"), *(element("p", element("code", line)) for line in commands if line),
     ]  # fmt: skip
@@ -165,7 +171,7 @@ def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: Robo
 
 
 def _photo(
-    draw: Picture, arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec, kind: str
+    draw: Picture, arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec, own: str
 ) -> Iterator[Markup]:
     """The robot in the motion with most travel, or a sentence that says why it is not seen."""
     travel = [np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in range(len(metrics["shown"]))]
@@ -176,7 +182,7 @@ def _photo(
     meta = SequenceMeta(
         robot.name, facts["unit_id"], facts["motion"], facts["payload_mass"], virtual=metrics["virtual"]
     )
-    shown = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", kind, "recorded"))}
+    shown = {n: arrays[f"{row}/{n}"] for n in dict.fromkeys(("command", "nominal", own, "recorded"))}
     shown["command"] = np.roll(shown["command"], 1, axis=0)  # a command of row t says where to be at t + 1
     shown["command"][0] = shown["recorded"][0]
     try:
@@ -188,17 +194,16 @@ def _photo(
     yield element("figure", element("div", image(png, "image/png"), css="photo"), element("figcaption", caption))
 
 
-def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
-    """What a careful colleague would say about these numbers."""
-    out, methods, kind = [], metrics["methods"], card["model"]["kind"]
-    own = methods[kind]["mpjae"]
+def warnings(card: dict[str, Any], own: str, metrics: dict[str, Any]) -> list[str]:
+    """What a careful colleague would say about these numbers; own is the model's method."""
+    out, methods = [], metrics["methods"]
     if metrics["virtual"]:
         out.append("The recordings come from a virtual robot: these numbers say nothing about real hardware.")
     if not metrics["unseen"]:
         out.append("Some recordings were used in training or for choosing the model: not a held-out result.")
-    better = [n for n, m in methods.items() if n not in (kind, "calibrated") and m["mpjae"] <= own]
+    better = [n for n, m in methods.items() if n not in (own, "calibrated") and m["mpjae"] <= methods[own]["mpjae"]]
     if better:
-        out.append(f"The model does not beat {', '.join(better).replace('_', ' + ')}: do not use it.")
+        out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
     seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
     outside = [p for p in asked if not min(seen) <= p <= max(seen)]
     if outside:
@@ -221,17 +226,17 @@ def warnings(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
         )
     if card.get("interrupted"):
         out.append("Training was interrupted before its budget was out.")
-    worse = [j for j, m in methods[kind]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
+    worse = [j for j, m in methods[own]["by_joint"].items() if m["mpjae"] > methods["nominal"]["by_joint"][j]["mpjae"]]
     if worse:
         out.append(f"Worse than the nominal simulator on: {', '.join(worse)}.")
     return out
 
 
-def _verdict(kind: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
-    own, base = methods[kind]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
-    change = f"{abs(1 - ratio[kind]) * 100:.0f} % {'less' if ratio[kind] <= 1 else 'MORE'} error"
-    text = f"{title(kind)} leaves {own:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
-    others = [f"{title(n)} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (kind, "nominal")]
+def _verdict(own: str, methods: dict[str, Any], ratio: dict[str, float]) -> str:
+    left, base = methods[own]["mpjae"] * 1e3, methods["nominal"]["mpjae"] * 1e3
+    change = f"{abs(1 - ratio[own]) * 100:.0f} % {'less' if ratio[own] <= 1 else 'MORE'} error"
+    text = f"{title(own)} leaves {left:.1f} mrad of the nominal simulator's {base:.1f} mrad: {change}"
+    others = [f"{title(n)} {m['mpjae'] * 1e3:.1f}" for n, m in methods.items() if n not in (own, "nominal")]
     return text + (f" ({', '.join(others)} mrad)." if others else ".")
 
 
@@ -247,19 +252,7 @@ def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
 
 def _both(value: float) -> str:
     """rad → mrad and degrees."""
-    return f"{value * 1e3:.2f} ({np.degrees(value):.2f}°)"
-
-
-def _totals(methods: dict[str, Any], ratio: dict[str, float]) -> Markup:
-    head = ["method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad",
-            "Q_dis, rad·s", "≥ 0.05 rad", "≥ 0.1 rad", "correlation"]  # fmt: skip
-    rows = [
-        [title(n), _both(m["mpjae"]), f"{ratio[n]:.2f}", f"{m['rmse'] * 1e3:.2f}", f"{m['static'] * 1e3:.2f}",
-         f"{m['dynamic'] * 1e3:.2f}", f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %",
-         f"{m['large_0.1'] * 100:.2f} %", f"{m['correlation']:.4f}"]
-        for n, m in methods.items()
-    ]  # fmt: skip
-    return table(head, rows, int(np.argmin([m["mpjae"] for m in methods.values()])))
+    return f"{mrad(value)} ({np.degrees(value):.2f}°)"
 
 
 def _explained(methods: dict[str, Any]) -> Markup:
@@ -278,21 +271,18 @@ def _explained(methods: dict[str, Any]) -> Markup:
     return element("div", facts_table([[k, v] for k, v in text.items()]), css="small")
 
 
-def _by_joint(methods: dict[str, Any], kind: str, metrics: dict[str, Any]) -> Markup:
-    own = methods[kind]["by_joint"]
-    head = ["MPJAE, mrad", *(title(n) for n in methods), f"{title(kind)} static", f"{title(kind)} dynamic", "moves in"]
+def _by_joint(methods: dict[str, Any], own: str, metrics: dict[str, Any]) -> Markup:
+    mean, joints = by_group(methods, "joint", _both), methods[own]["by_joint"]
     rows = []
-    for joint, moving in metrics["moves"].items():
+    for joint, *errors in mean.texts():
+        moving = metrics["moves"][joint]
         moves = f"{moving} of {metrics['sequences']}" if moving else "none: stands still"
-        parts = [f"{own[joint][k] * 1e3:.2f}" for k in ("static", "dynamic")]
-        rows.append([joint, *(_both(m["by_joint"][joint]["mpjae"]) for m in methods.values()), *parts, moves])
-    return table(head, rows)
+        rows.append([joint, *errors, *(mrad(joints[joint][k]) for k in ("static", "dynamic")), moves])
+    return table([*mean.columns, f"{title(own)} static", f"{title(own)} dynamic", "moves in"], rows)
 
 
-def _by_motion(methods: dict[str, Any]) -> Markup:
-    head = ["MPJAE, mrad", *(title(n) for n in methods)]
-    keys = methods["nominal"]["by_motion"]
-    return table(head, [[k, *(_both(m["by_motion"][k]["mpjae"]) for m in methods.values())] for k in keys])
+def _table(made: Table, best: int | None = None) -> Markup:
+    return table(made.columns, made.texts(), best)
 
 
 def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
@@ -314,10 +304,10 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
     return facts_table(rows)
 
 
-def _r2(found: dict[str, Any] | float | None) -> str:
-    """Held-out R² of the sensor predictor; older cards hold the mean alone."""
-    if not isinstance(found, dict):
-        return "–" if found is None else f"{found:.3f} on held-out states"
+def _r2(found: dict[str, Any] | None) -> str:
+    """Held-out R² of the sensor predictor."""
+    if found is None:
+        return "–"
     joints = ", ".join(f"{j} {v:.2f}" for j, v in found["by_joint"].items())
     return f"{found['mean']:.3f} on held-out states ({joints})"
 

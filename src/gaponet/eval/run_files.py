@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired
+from typing import Annotated, Any, NotRequired
 
 import numpy as np
-from annotated_types import Interval, Len
+from annotated_types import Interval, Len, Predicate
 from typing_extensions import TypedDict
 
 from gaponet.arrays import Array
 from gaponet.errors import ModelError
+from gaponet.plot.methods import IDENTIFIED, METHODS
 from gaponet.structure import Count, Json, Number, parse_json, read_json, read_npz
 
 MEND = "give a complete run folder of gaponet train, or evaluate again"
-Method = Literal[
-    "nominal", "delay_offset", "identified", "inverse", "mlp", "transformer", "fno", "gaponet", "calibrated"
-]
+Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]
 GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
 
@@ -179,9 +178,6 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     ]
 
 
-Step = Literal["nominal", "delay", "offset", "identified", "inverse", "mlp", "transformer", "fno", "gaponet"]
-
-
 class Floor(TypedDict):
     """The error that encoder and repeatability hide together, rad."""
 
@@ -191,12 +187,12 @@ class Floor(TypedDict):
 class Panel(TypedDict):
     """What is left of the error after each step, and what no simulator can remove; rad."""
 
-    left: dict[Step, Number]
+    left: dict[Method, Number]
     floor: Floor
 
 
-class BudgetFile(Panel):
-    """budget.json."""
+class Gap(Panel):
+    """gap.json."""
 
     by_joint: dict[str, Panel]
     virtual: bool
@@ -205,16 +201,16 @@ class BudgetFile(Panel):
     robot: str
 
 
-def read_budget(run: Path) -> dict[str, Any] | None:
-    """budget.json of a run; None where there is none."""
-    file = run / "budget.json"
+def read_gap(run: Path) -> dict[str, Any] | None:
+    """gap.json of a run; None where there is none."""
+    file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
     if not file.is_file():
         return None
-    budget = read_json(BudgetFile, file, ModelError, "make it again with gaponet budget", more=True)
-    steps = list(budget["left"])
-    if not steps or any(list(panel["left"]) != steps for panel in budget["by_joint"].values()):
-        raise ModelError(f"{file}: by_joint: should have the steps of left; make it again with gaponet budget")
-    return dict(budget)
+    gap = read_json(Gap, file, ModelError, again, more=True)
+    steps = list(gap["left"])
+    if not steps or any(list(panel["left"]) != steps for panel in gap["by_joint"].values()):
+        raise ModelError(f"{file}: by_joint: should have the steps of left; {again}")
+    return dict(gap)
 
 
 def _is_number(text: str) -> bool:

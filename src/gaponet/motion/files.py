@@ -25,16 +25,12 @@ LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz
 SUFFIXES = (".txt", ".csv", ".npz")
 
 
-def read_motion(
-    path: str | Path, robot: RobotSpec, dt: float | None = None, extra: dict[str, str] | None = None
-) -> Motion:
+def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     """A motion from a file; joints that the file does not name stay at home.
 
     Args:
         path: .txt, .csv or .npz.
         robot: Decides names, order and home.
-        dt: Sample period, s, where the file does not say; 0.02 for SAGE txt by default.
-        extra: Joint names in the file → the robot's.
 
     Raises:
         LogError: Unreadable; with file, line and what is wrong.
@@ -48,10 +44,10 @@ def read_motion(
     if path.stat().st_size > LARGEST:
         raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
     names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
-    period = dt or period or SAGE_DT
+    period = period or SAGE_DT
     if not SHORTEST <= period <= LONGEST:
         raise LogError(f"{path}: its period is {period:g} s; expected {SHORTEST} to {LONGEST:g}")
-    joints = tuple(robot.resolve(name, str(path), extra) for name in names)
+    joints = tuple(robot.resolve(name, str(path)) for name in names)
     columns = robot.index(joints)
     if len(set(joints)) != len(joints):
         raise LogError(f"{path}: two columns are the same joint of {robot.name}; delete one")

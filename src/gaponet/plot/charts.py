@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.plot.methods import COLOURS
+from gaponet.plot.methods import colour as colour_of
 from gaponet.plot.style import DASHED, DOTTED, figure, legend, styled
+from gaponet.plot.table import Spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Interval(Protocol):
-    """One number measured several times (study.table)."""
-
-    @property
-    def mean(self) -> float: ...
-    @property
-    def std(self) -> float: ...
-
-
-@dataclass(frozen=True)
-class Once:
-    """A number measured once."""
-
-    mean: float
-    std: float = math.nan
-
-
-Bars = Mapping[str, tuple[str, ListOf[Interval]]]  # label → colour, value of each group
-Dot = tuple[str, str, Interval, bool]  # group, name, value, whether it is the default
+Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
+Dot = tuple[str, str, Spread, bool]  # group, name, value, whether it is the default
 GAP = 0.7  # between groups, rows
 LEAST = 0.06  # rad, of an axis of positions
 
@@ -65,7 +48,7 @@ def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = 
     ax.grid(axis="x", visible=False)
 
 
-def spreads(values: ListOf[Interval]) -> Array | None:
+def spreads(values: ListOf[Spread]) -> Array | None:
     """Lengths of error bars; None where nothing was measured twice."""
     std = np.array([v.std if v.std == v.std else 0.0 for v in values])
     return std if std.any() else None
@@ -181,17 +164,17 @@ def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
     for place, (_, _, value, default) in zip(where, rows, strict=True):
         if value.mean > limit:
             ax.annotate(f"{value.mean:.2f} ", (limit, place), (-8, 0), textcoords="offset points", va="center",
-                        ha="right", color=COLOURS["gaponet"])  # fmt: skip
-            ax.plot(limit, place, marker=">", ms=5, color=COLOURS["gaponet"], clip_on=False)
+                        ha="right", color=colour_of("gaponet"))  # fmt: skip
+            ax.plot(limit, place, marker=">", ms=5, color=colour_of("gaponet"), clip_on=False)
             continue
         error = value.std if value.std == value.std else 0.0
         ax.errorbar(
-            value.mean, place, xerr=error or None, fmt="o", ms=4.5, color=COLOURS["gaponet"], elinewidth=1,
-            mfc="white" if default else COLOURS["gaponet"],
+            value.mean, place, xerr=error or None, fmt="o", ms=4.5, color=colour_of("gaponet"), elinewidth=1,
+            mfc="white" if default else colour_of("gaponet"),
         )  # fmt: skip
     base = next((value.mean for _, _, value, default in rows if default), None)
     if base is not None:
-        ax.axvline(base, color=COLOURS["gaponet"], lw=0.8, ls=(0, (4, 3)), zorder=0)
+        ax.axvline(base, color=colour_of("gaponet"), lw=0.8, ls=(0, (4, 3)), zorder=0)
     ax.set_yticks(where, names)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(y + 0.8, -0.8)
@@ -217,7 +200,7 @@ def _limit(values: ListOf[float]) -> float:
 
 @styled
 def lines(
-    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Interval]]]]],
+    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
     axes: tuple[str, str],
     ticks: ListOf[tuple[float, str]] = (),
     log: bool = False,

@@ -1,79 +1,63 @@
 """One name and one colour per method, in every figure, table and scene.
 
-A method is a key of NAMES or COLOURS, or a word of study.variant: [identified+]KIND[:FIELD=VALUE]…
+A method is a key of METHODS, or a word of study.variant: [identified+]KIND[:FIELD=VALUE]…
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-NAMES = {
-    "target": "target",
-    "command": "command",
-    "recorded": "recorded",
-    "nominal": "nominal simulator",
-    "delay_offset": "delay + offset",
-    "identified": "identification",
-    "inverse": "inverse labels",
-    "mlp": "MLP",
-    "transformer": "Transformer",
-    "fno": "FNO",
-    "gaponet": "GAPONet",
-    "calibrated": "calibrated to the unit",
-    "delay": "delay",
-    "offset": "offset",
-    "gain": "gains, inertia, delay",
-    "friction": "friction",
-    "stribeck": "friction at rest",
-    "load": "friction by load",
-    "servo": "least torque, encoder",
-    "contact": "table, stops, zeros",
-    "raw": "raw targets",
-    "feedforward": "nominal model's feed-forward alone",
-    "identified feedforward": "identified model's feed-forward alone",
-}
-COLOURS = {
-    "target": "#00838f",
-    "command": "#00838f",
-    "recorded": "#111111",
-    "nominal": "#8c8c8c",
-    "delay_offset": "#d99000",
-    "identified": "#2a9d6f",
-    "inverse": "#12465b",
-    "mlp": "#3b7dd8",
-    "transformer": "#56c1e8",
-    "fno": "#ded06a",
-    "gaponet": "#c8102e",
-    "calibrated": "#6a1b9a",
-    "delay": "#d99000",
-    "offset": "#b36b00",
-    "gain": "#2a9d6f",
-    "friction": "#24845d",
-    "stribeck": "#1d6b4c",
-    "load": "#17543c",
-    "servo": "#113f2d",
-    "contact": "#6b4f2a",
-    "raw": "#5c5c5c",
-    "feedforward": "#c9b28f",
-    "identified feedforward": "#2a9d6f",
+if TYPE_CHECKING:
+    from gaponet.robot import RobotSpec
+
+METHODS = {  # name, colour
+    "target": ("target", "#00838f"),
+    "command": ("command", "#00838f"),
+    "recorded": ("recorded", "#111111"),
+    "nominal": ("nominal simulator", "#8c8c8c"),
+    "delay_offset": ("delay + offset", "#d99000"),
+    "identified": ("identification", "#2a9d6f"),
+    "inverse": ("inverse labels", "#12465b"),
+    "mlp": ("MLP", "#3b7dd8"),
+    "transformer": ("Transformer", "#56c1e8"),
+    "fno": ("FNO", "#ded06a"),
+    "gaponet": ("GAPONet", "#c8102e"),
+    "calibrated": ("calibrated to the unit", "#6a1b9a"),
+    "delay": ("delay", "#d99000"),
+    "offset": ("offset", "#b36b00"),
+    "gain": ("gains, inertia, delay", "#2a9d6f"),
+    "friction": ("friction", "#24845d"),
+    "stribeck": ("friction at rest", "#1d6b4c"),
+    "load": ("friction by load", "#17543c"),
+    "servo": ("least torque, encoder", "#113f2d"),
+    "contact": ("table, stops, zeros", "#6b4f2a"),
+    "raw": ("raw targets", "#5c5c5c"),
+    "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
+    "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),
 }
 OTHER = "#777777"
 SAID = {"mlp_match=on": "as many weights", "payload_input=off": "mass not told"}
 IDENTIFIED = "identified+"  # in front of the kind of a model that corrects an identified simulator
 
 
+def method(kind: str, simulator: RobotSpec) -> str:
+    """The method that a model of this kind is: identified+KIND where it corrects an identified simulator."""
+    return (IDENTIFIED if simulator.nominal is not None else "") + kind
+
+
 def title(method: str) -> str:
     """The method's name for people: identification + MLP, as many weights (history 8)."""
     kind, *changes = method.removeprefix(IDENTIFIED).split(":")
-    start = f"{NAMES['identified']} + " if method.startswith(IDENTIFIED) else ""
-    name = ", ".join([start + NAMES.get(kind, kind), *(SAID[c] for c in changes if c in SAID)])
+    start = f"{METHODS['identified'][0]} + " if method.startswith(IDENTIFIED) else ""
+    name = ", ".join([start + METHODS.get(kind, (kind,))[0], *(SAID[c] for c in changes if c in SAID)])
     others = ", ".join(c.replace("=", " ") for c in changes if c not in SAID)
     return f"{name} ({others})" if others else name
 
 
 def colour(method: str) -> str:
     """The colour of the method's kind, #rrggbb, darker where it corrects an identified simulator."""
-    base = COLOURS.get(method.removeprefix(IDENTIFIED).split(":")[0], OTHER)
+    base = METHODS.get(method.removeprefix(IDENTIFIED).split(":")[0], ("", OTHER))[1]
     return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
 
 

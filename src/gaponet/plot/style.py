@@ -80,14 +80,14 @@ def _printable(fig: Figure) -> Figure:
     return fig
 
 
-def legend(fig: Figure, title: str = "", below: bool = False) -> None:
+def legend(fig: Figure, title: str = "") -> None:
     """Each label of all axes once, in as many columns as fit, never over the data; with a title, one for the figure."""
     found: dict[str, Any] = {}
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
     fig.legend(
-        list(found.values()), list(found), loc="outside lower left" if below else "outside upper left",
+        list(found.values()), list(found), loc="outside upper left",
         ncols=max(1, min(len(found), int(fig.get_figwidth() / ENTRY))), columnspacing=1.1, handlelength=1.4,
         title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
     )  # fmt: skip

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from gaponet.plot.charts import dots
+from gaponet.plot.table import Spread, Table, compared_by_seed
 from gaponet.study.found import Found, spread
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study, rates_of
-from gaponet.study.table import Spread, Table, compared_by_seed
 from gaponet.study.variant import parse_variant
 from gaponet.training.config import TrainConfig
 

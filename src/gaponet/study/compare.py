@@ -6,15 +6,18 @@ Every number is that of the shipped artifact in free run. Units held out from tr
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import tyro
 
 from gaponet.data.split import split_entries
 from gaponet.eval.evaluate import choose
 from gaponet.plot.charts import bars
 from gaponet.plot.methods import palette, title
 from gaponet.plot.style import joint_label
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.plot.table import Spread, Table, text
+from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import identify
 from gaponet.study.found import Found
@@ -22,7 +25,6 @@ from gaponet.study.found import spread as over
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table, text
 
 MEASURES = ("mpjae", "rmse", "q_dis", "static", "dynamic", "large_0.05")
 BASELINES = ("nominal", "delay_offset", "identified")
@@ -30,13 +32,18 @@ BASELINES = ("nominal", "delay_offset", "identified")
 
 @dataclass(frozen=True)
 class Compare:
-    """Several models with several seeds in one table and one figure, baselines beside them."""
+    """Several models with several seeds in one table and one figure, baselines beside them.
+
+    The same command again goes on where it was; more seeds or models may be added to it.
+    """
 
     models: tuple[str, ...] = ("gaponet", "mlp")
     """Kinds, each with changed fields where wanted: mlp:mlp_hidden=256,128 or gaponet:sensors=off:history=8.
     identified+KIND trains in the identified simulator (with --identify)."""
     holdout_units: tuple[str, ...] = ()
     """Units never trained on; shown as a group of their own."""
+    identify: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Identify the simulator first, on the training motions, and show it beside; kept in OUT/identified."""
 
     def cells(self, study: Study) -> list[Cell]:
         """Every model with every seed."""
@@ -65,14 +72,14 @@ class Compare:
                             motions=motions, unseen=unseen, sequences=len(entries))  # fmt: skip
 
 
-def identified(study: Study, tell: Callable[[float, float, str], None]) -> RobotSpec:
-    """The simulator identified on the training motions, in OUT/identified; once."""
+def identified(study: Study, tell: Callable[[float, float, str], None]) -> Study:
+    """The study with the simulator identified on the training motions, in OUT/identified; once."""
     folder = study.out / "identified"
     if not (folder / "robot.toml").is_file():
         parts = split_entries(study.data, study.holdout_units)
         train, held = (study.data.sequences(parts[part]) for part in ("train", "val"))
         save_robot(identify(train, study.robot, held, progress=tell).robot, folder)
-    return load_robot(folder)
+    return replace(study, identified=load_robot(folder))
 
 
 Runs = dict[str, list[dict[str, Any]]]  # method → what each seed gave; a baseline has none

@@ -12,12 +12,12 @@ from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
 from gaponet.plot.charts import lines
 from gaponet.plot.methods import palette, title
+from gaponet.plot.table import Spread, Table
 from gaponet.study.found import Found
 from gaponet.study.options import MODELS
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table
 
 ENOUGH = 1.1  # of the error with all recordings
 BASELINES = ("nominal", "delay_offset")
@@ -28,7 +28,7 @@ class Data:
     """Error against hours of training data: how much must be recorded?"""
 
     models: tuple[str, ...] = MODELS
-    """Models, written as for gaponet compare."""
+    """Models, written as for compare."""
     shares: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
     """Parts of the training motions."""
     holdout_units: tuple[str, ...] = ()

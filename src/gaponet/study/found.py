@@ -13,12 +13,12 @@ from gaponet.data.json_file import read_kept, write_json
 from gaponet.errors import ModelError
 from gaponet.eval.evaluate import split_of_run
 from gaponet.eval.whose import label
+from gaponet.plot.table import Spread, Table
 from gaponet.sim.model import model_hash
 from gaponet.study.measure import Outcome, evaluate_baselines, train_and_evaluate
 from gaponet.study.pool import RESULT, Cell, Running, run_cells
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table
 
 Key = tuple[str, str]  # a model's word, and the unit left out or ""
 Show = Callable[[Running, int], None]

@@ -8,11 +8,11 @@ from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.plot.charts import lines
 from gaponet.plot.methods import colour, shade, title
+from gaponet.plot.table import Spread, Table, compared
 from gaponet.study.found import Found
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table, compared
 
 ALL, BLIND = "gaponet", ":payload_input=off"
 BASELINES = ("nominal", "delay_offset")

@@ -31,13 +31,12 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.study.variant import Variant
 from gaponet.training.budget import Budget
-from gaponet.training.config import TrainConfig
 
 Tell = Callable[[float, str], None]  # share done, what is going on
 Running = dict[str, tuple[float, str]]  # the same of each running cell, by name
 
 SETUP, RESULT = "setup.json", "cell.json"
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 TELL_EVERY = 0.3  # s
 PATIENCE = 60.0  # s; the cells of a comparison that was killed notice it at their next step
 
@@ -107,17 +106,10 @@ def plan(
         if not file.is_file():
             raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
         kept = read_kept(file)
-        kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig()))))
         if kept != wanted:
             changed = ", ".join(k for k in wanted if kept.get(k) != wanted[k])
             raise UsageError(f"{cell.folder}: kept from a comparison with another {changed}; choose another --out")
     return cells
-
-
-def _completed(kept: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
-    """A config written before some of today's fields existed, with their defaults."""
-    nested = {k: _completed(kept[k], v) for k, v in defaults.items() if isinstance(v, dict) and k in kept}
-    return defaults | kept | nested
 
 
 def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
@@ -276,8 +268,8 @@ def _interrupt(signum: int, frame: object) -> NoReturn:
 @contextmanager
 def _one_thread_each(threads: int) -> Iterator[None]:
     """What libraries read from the environment when a process starts."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, str(threads)))
+    before = {name: os.environ.get(name) for name in POOLS}
+    os.environ.update(dict.fromkeys(POOLS, str(threads)))
     try:
         yield
     finally:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.study.table import Table
+from gaponet.plot.table import Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,6 +11,7 @@ from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.eval.whose import who
+from gaponet.plot.methods import IDENTIFIED
 from gaponet.robot import RobotSpec
 from gaponet.study.options import (
     BUDGET,
@@ -25,7 +26,7 @@ from gaponet.study.options import (
 )
 from gaponet.study.pool import RESULT, Cell, plan
 from gaponet.study.rehearsal import rehearsal, take
-from gaponet.study.variant import IDENTIFIED, Variant, parse_variant
+from gaponet.study.variant import Variant, parse_variant
 from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig
 
@@ -101,8 +102,8 @@ class Study:
         """A model as written, on this configuration."""
         if word.startswith(IDENTIFIED) and self.identified is None:
             raise UsageError(
-                f"--models {word}: add --identify to gaponet compare, or give an identified robot with --robot, from "
-                "which all models then start"
+                f"--models {word}: add --identify to gaponet experiment compare, or give an identified robot with "
+                "--robot, from which all models then start"
             )
         return parse_variant(word, self.config)
 

@@ -10,12 +10,12 @@ from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.plot.charts import bars
 from gaponet.plot.methods import palette, shade, title
+from gaponet.plot.table import Spread, Table, text
 from gaponet.study.found import Found, spread
 from gaponet.study.options import MODELS
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.study.table import Spread, Table, text
 
 BASELINES = ("nominal", "delay_offset")
 
@@ -25,7 +25,7 @@ class Unit:
     """Leave one unit out, each in turn: how well is a unit served that training never saw?"""
 
     models: tuple[str, ...] = MODELS
-    """Models, written as for gaponet compare."""
+    """Models, written as for compare."""
     holdout_units: ClassVar[tuple[str, ...]] = ()
 
     def cells(self, study: Study) -> list[Cell]:

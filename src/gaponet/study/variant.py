@@ -11,10 +11,10 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
+from gaponet.plot.methods import IDENTIFIED
 from gaponet.training.config import TrainConfig
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
-IDENTIFIED = "identified+"
 OURS = ("kind", "model", "seed", "threads")  # said by the word itself, or by the comparison
 SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 

@@ -45,9 +45,6 @@ class WarmStartConfig:
     """AdamW weight decay."""
     sensor_states: Annotated[int, Interval(ge=1, le=10000000)] = 2048
     """States at which the simulator is asked, once for each probe, to fit the sensor predictor."""
-    sensor_refresh: float | None = None
-    """Ask after each round how well the sensor predictor explains the states that the policy visits, and fit it again
-    when its R² has fallen by more than this since the fit; None never asks."""
 
 
 @dataclass(frozen=True)

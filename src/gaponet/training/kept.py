@@ -12,9 +12,8 @@ import torch
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text
 from gaponet.model.layers import DeltaNet
-from gaponet.structure import parse_json
 from gaponet.training.checkpoint import State, write_state
-from gaponet.training.sensor_fit import Report, report_of
+from gaponet.training.sensor_fit import Report
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
 
@@ -80,8 +79,4 @@ class Kept:
             raise ModelError(f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})") from None
         if kept.dataset not in ("", dataset):
             raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
-        kept.sensor_r2 = report_of(kept.sensor_r2)
-        if not kept.progress:  # of a run from before checkpoints had it
-            lines = (out / PROGRESS).read_bytes().splitlines()
-            kept.progress = [parse_json(dict[str, Any], line, out / PROGRESS, ModelError) for line in lines]
         return kept, rng

@@ -178,7 +178,6 @@ class Trainer:
         ):
             before = round_state(warm)
             warm.round(self._tick)
-            warm.refresh_sensors()
             self.kept.sensor_r2 = warm.report
             rounds.append(before)
             self.kept.rounds_done, self.kept.warm = warm.done, warm_state(warm, rounds)

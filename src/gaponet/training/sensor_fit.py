@@ -23,9 +23,7 @@ from gaponet.sim.batch import Condition
 STEPS = 600
 BATCH = 256
 POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states is moved off the recorded ones by these
-# R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}; the mean on states as they are met, not
-# moved, at the fit ("fitted") and when last looked at ("visited"); how often it was fitted again ("refits").
-Report = dict[str, Any]
+Report = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
 
 
 @dataclass(frozen=True)
@@ -36,17 +34,15 @@ class Asked:
         features: Standardised, (k, dim).
         answers: (k, 2nm), or (k, m, 2n) where offsets are given.
         offsets: Targets of each state relative to q, (k, m, n) rad, where they are not the fixed probes.
-        moved: 0 where a state is as it was given, 1 near it, 2 anywhere, (k,).
     """
 
     features: Tensor
     answers: Tensor
     offsets: Tensor | None
-    moved: Tensor
 
     def __getitem__(self, rows: Any) -> Asked:
         offsets = None if self.offsets is None else self.offsets[rows]
-        return Asked(self.features[rows], self.answers[rows], offsets, self.moved[rows])
+        return Asked(self.features[rows], self.answers[rows], offsets)
 
     def predicted(self, net: DeltaNet) -> tuple[Tensor, Tensor]:
         """Mean and log-variance, standardised."""
@@ -63,7 +59,6 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
-    move: bool = True,
 ) -> Asked:
     """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
@@ -79,10 +74,9 @@ def sensor_labels(
         locked: Joints clamped in the simulator.
         seed: Seed of the perturbations.
         nthread: Threads of the simulator, 0 for all cores.
-        move: False leaves all states as they are.
     """
     rng = np.random.default_rng(seed)
-    third = rng.integers(0, 3 if move else 1, len(qpos))
+    third = rng.integers(0, 3, len(qpos))
     oracle, n, at = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n, net.features.layout
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
@@ -105,7 +99,6 @@ def sensor_labels(
         features.clone(),
         torch.from_numpy(answers if offsets is not None else answers.reshape(len(q), -1)),
         None if offsets is None else torch.from_numpy(offsets),
-        torch.from_numpy(third),
     )
 
 
@@ -119,18 +112,16 @@ def shift_positions(shift: Array, at: Layout) -> Array:
     return out
 
 
-def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: int, refit: bool = False) -> Report:
+def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: int) -> Report:
     """Gaussian likelihood on three quarters of the states; returns R² on the rest.
 
-    The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like. With
-    `refit` it starts from what it is and its outputs keep their scale, which is what the branch knows.
+    The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
     """
     predictor = net.predictor
     generator = torch.Generator().manual_seed(seed)
     held = len(asked.features) // 4
     train = asked[held:]
-    if not refit:
-        predictor.outputs.fit(train.answers.reshape(-1, len(predictor.outputs.mean)), floor=1e-6)
+    predictor.outputs.fit(train.answers.reshape(-1, len(predictor.outputs.mean)), floor=1e-6)
     target = predictor.outputs(train.answers)
     parameters = list(predictor.parameters())
     for p in parameters:
@@ -147,9 +138,7 @@ def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: in
         schedule.step()
     for p in parameters:
         p.requires_grad_(False)
-    rest = asked[:held]
-    visited = explained(net, rest[rest.moved == 0], joints)["mean"]
-    return explained(net, rest, joints) | {"fitted": visited, "visited": visited, "refits": 0}
+    return explained(net, asked[:held], joints)
 
 
 def explained(net: DeltaNet, asked: Asked, joints: tuple[str, ...]) -> Report:
@@ -161,14 +150,6 @@ def explained(net: DeltaNet, asked: Asked, joints: tuple[str, ...]) -> Report:
         r2 = (1 - residual / spread).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
         return {"mean": float(r2.mean()), "by_joint": by_joint, "by_probe": r2.mean((1, 2)).tolist()}
-
-
-def report_of(stored: Report | float | None) -> Report | None:
-    """The report of a checkpoint; older ones hold the mean alone, or not-a-number."""
-    if isinstance(stored, float):
-        whole = {"mean": stored, "by_joint": {}, "by_probe": [], "fitted": stored, "visited": stored, "refits": 0}
-        return whole if stored == stored else None
-    return stored
 
 
 def points_of(net: DeltaNet) -> Infer | None:

@@ -19,7 +19,7 @@ from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.sensor_fit import Asked, Report, explained, fit_predictor, points_of, sensor_labels
+from gaponet.training.sensor_fit import Report, fit_predictor, points_of, sensor_labels
 
 
 def recipe(config: TrainConfig) -> WarmStartConfig:
@@ -47,7 +47,6 @@ class WarmStart:
         self.net, self.env, self.labels, self.config = net, env, held_labels(labels, env.config.delta_hold), config
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
-        self.visited: list[tuple[Array, Array, Array]] = []  # x, qpos, qvel of all environments, now and then
         self.pool_x: list[torch.Tensor] = []
         self.pool_y: list[torch.Tensor] = []
         trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
@@ -67,14 +66,11 @@ class WarmStart:
         env.reset()
         net.eval()
         env.loop.points = points_of(net)
-        self.visited.clear()
         xs, ys = [], []
         disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
         hold = env.config.delta_hold
-        for step in range(0, self.config.steps, hold):
+        for _ in range(0, self.config.steps, hold):
             x = env.get_observations()["actor"]
-            if self.config.sensor_refresh is not None and step // hold % max(1, self.config.steps // hold // 8) == 0:
-                self.visited.append((x.numpy(), env.sim.qpos.copy(), env.sim.qvel.copy()))
             y = self.labels[env.row]
             xs.append(x)
             ys.append(torch.from_numpy(y))
@@ -104,32 +100,6 @@ class WarmStart:
         noise = slow + rng.normal(0, sigma, shape).astype(np.float32)
         noise[: len(noise) // 4] = 0.0
         return noise
-
-    def refresh_sensors(self) -> None:
-        """Look at the predictor's R² on states of the last round's roll-outs; fit it again where that fell too far.
-
-        Only copies of states are used: the roll-out environments are left as they are. `report` then has "visited" as
-        it is now, or is that of the new fit, with "refits" counted.
-        """
-        allowed, report = self.config.sensor_refresh, self.report
-        if allowed is None or report is None or not self.visited:
-            return
-        joints = self.env.robot.operated
-        found = explained(self.net, self._ask_visited(self.config.sensor_states // 4, move=False), joints)["mean"]
-        self.report = report | {"visited": found}
-        if found < report["fitted"] - allowed:
-            asked = self._ask_visited(self.config.sensor_states, move=True)
-            new = fit_predictor(self.net, asked, joints, self.seed + self.done, refit=True)
-            self.report = new | {"refits": report["refits"] + 1}
-
-    def _ask_visited(self, count: int, move: bool) -> Asked:
-        env, seed = self.env, self.seed + self.done
-        x, q, v = (np.concatenate(part) for part in zip(*self.visited, strict=True))
-        pick = np.random.default_rng(seed).permutation(len(x))[:count]
-        conditions = [env.conditions[g] for g in np.tile(env.group, len(self.visited))[pick]]
-        return sensor_labels(
-            self.net, env.robot, x[pick], q[pick], v[pick], conditions, env.locked, seed, self.nthread, move
-        )
 
     def round(self, tick: Callable[[], float]) -> float:
         """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad.

@@ -16,7 +16,7 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import Seen, corrected_robot
 from gaponet.model.artifact import GapModel
-from gaponet.plot.methods import colour, title
+from gaponet.plot.methods import colour, method, title
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
@@ -139,14 +139,15 @@ def side_by_side(
     for run in runs:
         model, simulator = GapModel.load(run), corrected_robot(run, robot)
         model.require(simulator, real.dt)
-        if model.config.kind in simulators:
-            raise UsageError(f"{run}: a second {model.config.kind} model; give runs of different kinds")
-        simulators[model.config.kind] = (simulator, model.corrector(simulator))
+        name = method(model.config.kind, simulator)
+        if name in simulators:
+            raise UsageError(f"{run}: a second run of {title(name)}; give runs of different methods")
+        simulators[name] = (simulator, model.corrector(simulator))
     target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
     shown = {"target": target}
-    for method, (simulator, corrector) in simulators.items():
-        told = partial(progress, method)
-        shown[method] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
+    for name, (simulator, corrector) in simulators.items():
+        told = partial(progress, name)
+        shown[name] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
     op = robot.operated_index
     motions = tuple(Played(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())

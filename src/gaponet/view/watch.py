@@ -77,7 +77,7 @@ def _aim(camera: mujoco.MjvCamera, scene: Scene) -> None:
 
 
 def _label(extra: mujoco.MjvScene, scene: Scene, now: float) -> None:
-    """Method and present error above each copy; one word, or neighbours overlap."""
+    """Method and present error above each copy; short, or neighbours overlap."""
     row = scene.row(now)
     above = scene.view.axes[1] * scene.box[3] + np.array([0, 0, 0.06 * (scene.box[3] - scene.box[2])])
     extra.ngeom = 0
@@ -87,7 +87,7 @@ def _label(extra: mujoco.MjvScene, scene: Scene, now: float) -> None:
             extra.geoms[extra.ngeom], mujoco.mjtGeom.mjGEOM_LABEL, np.zeros(3), base + above, np.eye(3).ravel(),
             np.array([0.1, 0.1, 0.1, 1.0], np.float32),
         )  # fmt: skip
-        extra.geoms[extra.ngeom].label = motion.name.split()[0] + error
+        extra.geoms[extra.ngeom].label = motion.name.removesuffix(" simulator") + error
         extra.ngeom += 1
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.cli.robots.run import Asked, Request, asked_robot, perform, tracking
 from gaponet.errors import DatasetError, UsageError
@@ -21,7 +22,7 @@ def record(
     repetitions: int = 1,
     seed: int = 0,
     asked: Annotated[Asked, tyro.conf.arg(name="")] = Asked(),  # noqa: B008
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Play a motion uncorrected and add what the robot did to a dataset, with unit, payload and gains.
 
@@ -33,7 +34,6 @@ def record(
         repetitions: How often each motion is played.
         seed: virtual: of the first recording's noise; later ones count on.
         asked: Robot and loop.
-        json: One JSON object on stdout.
     """
     from gaponet.data.importer import findings
     from gaponet.data.sequence import SequenceMeta, to_sequence

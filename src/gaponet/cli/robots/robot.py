@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
+from gaponet.cli.options import Json
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec, available, load_robot
@@ -20,7 +21,7 @@ def robot(
     interface: str = "lo",
     port: str = "/dev/ttyACM0",
     seconds: float = 5.0,
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """List the package's robots, say what is wrong with a robot folder, or listen to a robot without moving it.
 
@@ -32,7 +33,6 @@ def robot(
         interface: link, unitree: network interface to the robot.
         port: link, so101: serial port.
         seconds: link: how long to listen.
-        json: One JSON object on stdout.
     """
     out = Out(json)
     if action == "list":

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.deploy.phases import ControlConfig
@@ -45,7 +46,7 @@ class Reach:
     """virtual: number or name in the fleet."""
     fleet: str = "hard"
     """virtual: hard, easy, shifted, or a .toml file."""
-    fast: tyro.conf.FlagCreatePairsOff[bool] = False
+    fast: Flag = False
     """virtual: as fast as this machine can, not in real time."""
 
 
@@ -68,7 +69,7 @@ class Asked:
     """Timing."""
     safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
     """Limits and watchdogs."""
-    yes: tyro.conf.FlagCreatePairsOff[bool] = False
+    yes: Flag = False
     """Do not ask before a robot moves."""
 
 
@@ -84,9 +85,9 @@ class Request(Asked):
     """How commands are found, with a model."""
     unit_id: str = ""
     """Which unit this is, with a model; what gaponet calibrate found out about it is used."""
-    extrapolate: tyro.conf.FlagCreatePairsOff[bool] = False
+    extrapolate: Flag = False
     """Take payloads, with a model, and servo gains that its training data do not hold."""
-    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    dry_run: Flag = False
     """Connect, read and compute, send nothing, and say what would be sent."""
 
 
@@ -95,7 +96,7 @@ def run(
     motion: str,
     out: Path | None = None,
     asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    json: Json = False,
 ) -> None:
     """Play a motion on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
 
@@ -103,7 +104,6 @@ def run(
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz).
         out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npz.
         asked: Robot, loop and model.
-        json: One JSON object on stdout.
     """
     screen = Out(json)
     if asked.dry_run and out:

@@ -9,6 +9,7 @@ from typing import Literal
 import tyro
 
 from gaponet.cli.out import Out
+from gaponet.deploy.drivers.unitree_virtual import FaultKind, VirtualH12
 from gaponet.errors import UsageError
 
 
@@ -24,23 +25,7 @@ def virtual(
     interface: str = "lo",
     rate: float = 500.0,
     seconds: float | None = None,
-    fault: Literal[
-        "none",
-        "stop",
-        "freeze",
-        "repeat",
-        "nan",
-        "jump",
-        "hot",
-        "late",
-        "checksum",
-        "clock",
-        "encoder",
-        "motor",
-        "remote",
-        "fall",
-        "machine",
-    ] = "none",
+    fault: FaultKind = "none",
     fault_at: float = 2.0,
     heard: Path | None = None,
     link: Path | None = None,
@@ -79,8 +64,6 @@ def virtual(
         signal.signal(number, _interrupt)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
     if natural == "dds":
-        from gaponet.deploy.drivers.unitree_virtual import VirtualH12
-
         payload = (payload_mass, payload_side)
         served = VirtualH12(spec, physics, payload, domain, interface, rate, fault, fault_at)
         out.say(f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}; Ctrl-C ends it")

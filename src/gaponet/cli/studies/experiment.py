@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
+from gaponet.cli.options import Folder
 from gaponet.cli.out import Out, show_result, writes
 from gaponet.data.store import open_dataset
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar, bars
 from gaponet.study.ablation import Ablation
+from gaponet.study.compare import Compare, identified
 from gaponet.study.data import Data
 from gaponet.study.found import Question, answer, train_all
 from gaponet.study.options import MODELS, Options
@@ -22,6 +24,8 @@ from gaponet.study.played.session import Playing, Session, study_to_play
 from gaponet.study.played.tracking import Tracking
 from gaponet.study.study import Study, expected_s
 from gaponet.study.unit import Unit
+from gaponet.study.variant import parse_variant
+from gaponet.training.config import TrainConfig
 
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
@@ -31,15 +35,17 @@ if TYPE_CHECKING:
 FLAT = tyro.conf.arg(name="")
 Shared = Annotated[Options, FLAT]
 PLAYED = (Tracking, Delivery)
+DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
-def carry_out(question: Question, study: Study, json: bool) -> int:
-    """Say how long it will take, train, and show what came out; returns how many trainings failed."""
+def _carry_out(question: Question, study: Study, json: bool) -> None:
+    """Say how long it will take, train, and show what came out."""
     screen, cells = Out(json), question.cells(study)
     with _trainings(cells, study, screen) as show:
         result = answer(question, study, show)
     show_result(result, study.out, screen)
-    return sum(not c.done for c in cells)
+    if failed := sum(not c.done for c in cells):
+        raise ModelError(f"{failed} trainings failed; the tables are of the others. Run it again to retry")
 
 
 def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
@@ -57,8 +63,23 @@ def _ask(kind: type[Any], dataset: Path, out: Path, question: Any, options: Opti
     data, robot = open_dataset(dataset, options.robot)
     if kind in PLAYED:
         _play(question, data, robot, out, options)
-    else:
-        carry_out(question, Study.of(data, robot, out, options, question.holdout_units), options.json)
+        return
+    study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
+    if kind is Compare:
+        study = _prepared(question, study)
+    _carry_out(question, study, options.json)
+
+
+def _prepared(question: Compare, study: Study) -> Study:
+    """The study with what is asked to be identified first; models that cannot be are refused before that."""
+    if not question.identify:
+        return study
+    if study.robot.nominal is not None:
+        raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
+    for word in question.models:
+        parse_variant(word, study.config)
+    with bar("identifying") as update:
+        return identified(study, update)
 
 
 def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
@@ -82,11 +103,12 @@ def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options
 
 def _command(kind: type[Any]) -> Any:
     """A question's command: its fields are options."""
+    usual = DEFAULTS.get(kind, Options())
 
-    def ask(dataset: Any, out: Any, question: Any, options: Any = Options()) -> None:  # noqa: B008
+    def ask(dataset: Any, out: Any, question: Any, options: Any = usual) -> None:
         _ask(kind, dataset, out, question, options)
 
-    place = tyro.conf.Positional[Path]
+    place = Folder
     ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
     trained_on = " that the models were trained on" if kind in PLAYED else ""
     ask.__doc__ = "\n    ".join((
@@ -102,5 +124,5 @@ def experiment(action: None) -> None:
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.
-ACTION: Any = Union[tuple(_command(kind) for kind in (Ablation, Payload, Unit, Data, *PLAYED))]  # noqa: UP007
+ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Ablation, Payload, Unit, Data, *PLAYED))]  # noqa: UP007
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

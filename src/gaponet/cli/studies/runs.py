@@ -5,23 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from gaponet.cli.options import Folder, Json
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.run_files import read_config, read_metrics, read_progress
 from gaponet.model.artifact import CARD, read_card
+from gaponet.plot.methods import method, title
+from gaponet.robot_folder import kept_robot
 
 
 def runs(
-    folder: tyro.conf.Positional[Path] = Path("."),
-    json: tyro.conf.FlagCreatePairsOff[bool] = False,
+    folder: Folder = Path("."),
+    json: Json = False,
 ) -> None:
     """List the training runs below a folder with their held-out numbers, best first.
 
     Args:
         folder: Where to look; run folders may lie at any depth.
-        json: One JSON object on stdout.
     """
     found = [
         _facts(p.parent, folder) for p in sorted(folder.rglob("config.json")) if (p.parent / "split.json").is_file()
@@ -34,7 +34,7 @@ def runs(
         f"Runs in {folder}: mean |error| of whole held-out motions in free run, mrad (of nominal)",
         ["run", "model", "seed", "minutes", "validation", "evaluated"],
         [
-            [r["run"], r["model"], str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",
+            [r["run"], title(r["model"]), str(r["seed"]), "" if r["seconds"] is None else f"{r['seconds'] / 60:.1f}",
              _error(r["val_mpjae"], r["val_ratio"]), _error(r["test_mpjae"], r["test_ratio"])]
             for r in found
         ],
@@ -51,11 +51,12 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
     card = read_card(file)[0] if file.is_file() else {}
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else {}
     val = card.get("val_mpjae", {"model": last.get("best"), "nominal": last.get("nominal_mpjae")})
-    own = metrics.get("methods", {}).get(kind, {}).get("mpjae")
+    own = method(kind, kept_robot(run, config["robot"]))
+    measured = metrics.get("methods", {}).get(own, {})
     virtual = bool(card.get("virtual", False))
     return {
         "run": str(run.relative_to(folder)) + (" V" if virtual else ""),
-        "model": kind,
+        "model": own,
         "seed": config["seed"],
         "robot": config["robot"],
         "virtual": virtual,
@@ -68,8 +69,8 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
         "val_mpjae": val["model"],
         "val_ratio": val["model"] / val["nominal"] if val["model"] and val["nominal"] else None,
         "evaluated_on": metrics.get("dataset"),
-        "test_mpjae": own,
-        "test_ratio": metrics.get("ratio_to_nominal", {}).get(kind),
+        "test_mpjae": measured.get("mpjae"),
+        "test_ratio": metrics.get("ratio_to_nominal", {}).get(own),
     }
 
 

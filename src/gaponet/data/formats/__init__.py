@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.log import CHANNELS, DERIVED, Log
+from gaponet.data.log import UNITS, Log
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 
@@ -30,7 +30,6 @@ FORMATS = {
     "bam": "JSON of BAM's servo test bench, a file or a folder of files",
 }
 TABLES = (".csv", ".parquet")
-UNITS = CHANNELS | DERIVED
 # Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
 MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
 

@@ -23,10 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.formats.lerobot_set import FEATURES, LATER, OURS, STATED, VERSION
+from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
 from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
+from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import UNITS, Dataset, Entry, dataset_hash
+from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
 from gaponet.files import MARK, sync, writing
 
@@ -212,7 +213,7 @@ class _Set:
             "data/chunk_index": self.chunk, "data/file_index": self.file,
             "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
             **{name: meta[name] for name in STATED},
-            **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *LATER)},
+            **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
             "content_hash": entry.hash,
             **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
         })  # fmt: skip

@@ -27,9 +27,7 @@ FEATURES = {
 }
 OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
 STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
-LATER = ("kp", "kd")  # not in the first exports
-
-
+GAINS = ("kp", "kd")
 AGAIN = "download or export it again"
 
 Name = Annotated[str, Len(1, 200)]
@@ -151,7 +149,7 @@ def _open(file: Path) -> Set:
 def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     said = STATED if ours else ()
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = read_table(file, (*NEEDED, *(n for n in said if n not in LATER)), ("tasks", *(LATER if ours else ())), hint)
+    table = read_table(file, (*NEEDED, *said), ("tasks",), hint)
     rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
@@ -162,10 +160,10 @@ def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
     where = f"{file}: episode {row['episode_index']}"
     told = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
     told["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
-    for name in LATER:
-        gains = told.pop(name, None)
-        if gains not in (None, "null"):
-            told[name] = parse_json(list[float], str(gains), f"{where}: {name}", LogError, hint)
+    for name in GAINS:
+        gains = str(told.pop(name))
+        if gains != "null":
+            told[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
     stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
     return row | {"stated": {name: stated[name] for name in STATED}}
 

@@ -1,4 +1,4 @@
-# mypy: disable-error-code="type-arg, valid-type, method-assign, unused-ignore, attr-defined, assignment"
+# mypy: disable-error-code="misc, type-arg, valid-type, method-assign, unused-ignore, attr-defined, assignment"
 """hg topics over cyclonedds: types for the bus, raw bytes for us. Imported when a bus is opened.
 
 The classes below are what other participants see of our types. They carry a message as bytes: `serialize` and
@@ -12,13 +12,14 @@ issue 1554; tests/deploy/test_peers.py).
 import time
 from collections import defaultdict
 from dataclasses import dataclass
+from types import new_class
 from typing import Any
 
 import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.deploy.driver import DriverError
-from gaponet.deploy.drivers.hg import HEADER
+from gaponet.deploy.drivers import hg
 
 try:
     from cyclonedds.core import DDSException
@@ -36,91 +37,33 @@ except ImportError:
 QUEUE = 64  # messages kept for us between two reads: 128 ms at 500 Hz
 
 
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class IMUState(IdlStruct, typename="unitree_hg.msg.dds_.IMUState_"):
-    """Attitude of the pelvis."""
-
-    quaternion: array[float32, 4]
-    gyroscope: array[float32, 3]
-    accelerometer: array[float32, 3]
-    rpy: array[float32, 3]
-    temperature: int16
+KINDS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
 
 
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class MotorState(IdlStruct, typename="unitree_hg.msg.dds_.MotorState_"):
-    """What a motor says."""
-
-    mode: byte
-    q: float32
-    dq: float32
-    ddq: float32
-    tau_est: float32
-    temperature: array[int16, 2]
-    vol: float32
-    sensor: array[uint32, 2]
-    motorstate: uint32
-    reserve: array[uint32, 4]
+def _struct(name: str, fields: hg.Fields, **parts: type[IdlStruct]) -> type[IdlStruct]:
+    """The type of a message of drivers.hg under the name that it has in Unitree's IDL; parts: its structs, by field."""
+    members = {field: (parts.get(field) or KINDS[kind], count) for field, kind, count in fields}
+    hints = {field: kind if count == 1 else array[kind, count] for field, (kind, count) in members.items()}
+    space = {"__annotations__": hints, "__module__": __name__}
+    made = new_class(name, (IdlStruct,), {"typename": f"unitree_hg.msg.dds_.{name}_"}, lambda ns: ns.update(space))
+    return annotate.autoid("sequential")(annotate.final(dataclass(made)))
 
 
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class MotorCmd(IdlStruct, typename="unitree_hg.msg.dds_.MotorCmd_"):
-    """What a motor is told."""
-
-    mode: byte
-    q: float32
-    dq: float32
-    tau: float32
-    kp: float32
-    kd: float32
-    reserve: uint32
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class LowState(IdlStruct, typename="unitree_hg.msg.dds_.LowState_"):
-    """rt/lowstate."""
-
-    version: array[uint32, 2]
-    mode_pr: byte
-    mode_machine: byte
-    tick: uint32
-    imu_state: IMUState
-    motor_state: array[MotorState, 35]
-    wireless_remote: array[byte, 40]
-    reserve: array[uint32, 4]
-    crc: uint32
-
-
-@dataclass
-@annotate.final
-@annotate.autoid("sequential")
-class LowCmd(IdlStruct, typename="unitree_hg.msg.dds_.LowCmd_"):
-    """rt/lowcmd and rt/arm_sdk."""
-
-    mode_pr: byte
-    mode_machine: byte
-    motor_cmd: array[MotorCmd, 35]
-    reserve: array[uint32, 4]
-    crc: uint32
+IMUState, MotorState = _struct("IMUState", hg.IMU), _struct("MotorState", hg.MOTOR_STATE)
+MotorCmd = _struct("MotorCmd", hg.MOTOR_CMD)
+LowState = _struct("LowState", hg.LOW_STATE, imu_state=IMUState, motor_state=MotorState)
+LowCmd = _struct("LowCmd", hg.LOW_CMD, motor_cmd=MotorCmd)
 
 
 def raw(kind: type[IdlStruct]) -> type[IdlStruct]:
     """The same type on the bus, its samples bytes (`.data`, after the CDR header)."""
 
     def serialize(self: Any, *_: Any, **__: Any) -> bytes:
-        return HEADER + self.data
+        return hg.HEADER + self.data
 
     def deserialize(cls: Any, data: bytes, *_: Any, **__: Any) -> Any:
         sample = cls.__new__(cls)
-        sample.data = data[len(HEADER) :] if data[:2] == HEADER[:2] else b""
+        sample.data = data[len(hg.HEADER) :] if data[:2] == hg.HEADER[:2] else b""
         return sample
 
     kind.serialize = serialize

@@ -28,7 +28,6 @@ class LiveUnit:
         robot: RobotSpec,
         physics: Physics,
         payload: tuple[float, str],
-        start: Array | None = None,
         seed: int = 0,
         period: float = STATE_PERIOD,
     ) -> None:
@@ -37,14 +36,13 @@ class LiveUnit:
             robot: The type.
             physics: Hidden physics of this unit.
             payload: kg per hand, and side.
-            start: Where it stands, (n) rad; home by default.
             seed: Seed of its noise.
             period: Between two states, s.
         """
         self.robot, self.period = robot, period
         locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
         self.unit = VirtualRobot(robot, [physics], [payload], dt=period, locked=locked)
-        self.ctrl = np.array(robot.qpos_home if start is None else start, float)
+        self.ctrl = robot.qpos_home.copy()
         self.unit.reset(self.ctrl[None], [seed])
         self._law = np.array([robot.kp, robot.kd, robot.effort_limit, np.zeros_like(robot.kp)])
         self.steps = 0
@@ -83,9 +81,7 @@ class VirtualDriver:
         clock: Clock,
         payload: tuple[float, str] = (0.0, "both"),
         name: str = "unit",
-        start: Array | None = None,
         seed: int = 0,
-        period: float = STATE_PERIOD,
     ) -> None:
         """
         Args:
@@ -94,17 +90,14 @@ class VirtualDriver:
             clock: The controller's.
             payload: kg per hand, and side.
             name: Name of the unit.
-            start: Where it stands at first, (n) rad.
             seed: Seed of its noise.
-            period: Between two states, s.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
         self.kp, self.kd = robot.kp, robot.kd
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
-        self.clock, self._given = clock, (robot, physics, payload, start, seed, period)
-        self.period = period
+        self.clock, self._given = clock, (robot, physics, payload, seed)
         locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
@@ -117,8 +110,8 @@ class VirtualDriver:
 
     def read(self) -> State:
         """Let it live until now."""
-        due = int((self.clock.now() - self._begun) / self.period + 1e-6)
-        if (due - self.live.steps) * self.period > LAG:
+        due = int((self.clock.now() - self._begun) / STATE_PERIOD + 1e-6)
+        if (due - self.live.steps) * STATE_PERIOD > LAG:
             raise DriverError(f"{self.address}: this machine cannot simulate it in real time; run without real time")
         if due > self.live.steps:
             while self.live.steps < due:
@@ -127,7 +120,7 @@ class VirtualDriver:
         return self._state
 
     def _sense(self) -> State:
-        return State(self._begun + self.live.steps * self.period, *self.live.read())
+        return State(self._begun + self.live.steps * STATE_PERIOD, *self.live.read())
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Takes effect after the unit's own command delay."""

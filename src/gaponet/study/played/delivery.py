@@ -16,15 +16,15 @@ import numpy as np
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.plot.charts import Once, draw_bars
-from gaponet.plot.methods import COLOURS, colour, title
+from gaponet.plot.charts import draw_bars
+from gaponet.plot.methods import colour, title
 from gaponet.plot.style import DASHED, figure, legend, styled
+from gaponet.plot.table import Spread, Table
 from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Example, Placed, deliver
 from gaponet.study.played.goals import STOPS, Planner
 from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, over_seeds, payloads, percent, series
 from gaponet.study.played.session import Playing, Session, Tell
 from gaponet.study.result import Result
-from gaponet.study.table import Spread, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -159,10 +159,10 @@ def draw_offsets(found: ListOf[Placed]) -> Figure:
     fig, masses = figure(10.2, 3.5), payloads(found)
     for a, ax in enumerate(fig.subplots(1, 3)):
 
-        def over_goals(method: str, payload: float, a: int = a) -> Once:
+        def over_goals(method: str, payload: float, a: int = a) -> Spread:
             values = np.array([d.offset[a] for d in of(found, method, payload)]) * 1e2
-            goals = max(len(values) / len({d.seed for d in of(found, method)}), 1)
-            return Once(float(values.mean()), float(values.std() / np.sqrt(goals)))
+            goals = max(len(values) // len({d.seed for d in of(found, method)}), 1)
+            return Spread(float(values.mean()), float(values.std() / np.sqrt(goals)), goals)
 
         draw_bars(ax, [f"{p:g} kg" for p in masses], series(found, masses, over_goals))
         ax.axhline(NEAR * 1e2, color="#111111", lw=0.7, ls=DASHED)
@@ -185,7 +185,7 @@ def draw_example(shown: Example) -> Figure:
         for goal, arrive, leave in zip(shown.goals, shown.arrive, shown.leave, strict=True):
             low, high = (goal[a] - NEAR) * 1e2, (goal[a] + NEAR) * 1e2
             span = [arrive * shown.dt, leave * shown.dt]
-            ax.fill_between(span, low, high, color=COLOURS["target"], alpha=0.18, lw=0)
+            ax.fill_between(span, low, high, color=colour("target"), alpha=0.18, lw=0)
         ax.set_title(f"{AXES[a]}, {SIDES[a]}")
         ax.set_xlabel("time, s")
     fig.axes[0].set_ylabel("hand, cm")

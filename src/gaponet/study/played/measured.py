@@ -8,9 +8,8 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from gaponet.plot.charts import Once
 from gaponet.plot.methods import colour, title
-from gaponet.study.table import Spread
+from gaponet.plot.table import Spread
 
 LEFT_OUT = ("identified feedforward",)  # of figures; it stands in the tables
 
@@ -58,7 +57,7 @@ def over_seeds(found: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, 
     return Spread.of([float(middle(values)) for values in finite if values], scale)
 
 
-def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], Once]) -> dict[str, Any]:
+def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], Spread]) -> dict[str, Any]:
     """Bars of every method that is drawn, one for each group."""
     shown = [m for m in methods(found) if m not in LEFT_OUT]
     return {title(m): (colour(m), [value(m, group) for group in groups]) for m in shown}

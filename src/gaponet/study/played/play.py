@@ -107,7 +107,6 @@ def play(
     driven: Driven | None = None,
     lengths: Array | None = None,
     progress: Callable[[float], None] = lambda share: None,
-    nthread: int = 1,
 ) -> Played:
     """Start at rest under the first target, then follow.
 
@@ -122,18 +121,15 @@ def play(
         driven: By what; None for the targets as they are.
         lengths: Rows of each that count, (N,), falling; those that are through stand still.
         progress: Called after each period with the share of all control steps that is done.
-        nthread: Threads, 0 for all cores.
     """
     count = len(mass)
     locked = idle_joints(robot, robot.operated)
-    robots = VirtualRobot(
-        robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked, nthread=nthread
-    )
+    robots = VirtualRobot(robot, [unit] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked, nthread=1)
     robots.reset(targets[0], seeds, WARMTH)
     compensator = None
     if driven is not None:
         compensator = Compensator(
-            driven.robot, driven.model, driven.config, num_envs=count, nthread=nthread, extrapolate=True
+            driven.robot, driven.model, driven.config, num_envs=count, nthread=1, extrapolate=True
         )
         compensator.reset(targets[0], mass)
     out = np.empty((6, *targets.shape), np.float32)

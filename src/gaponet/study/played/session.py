@@ -14,12 +14,12 @@ from gaponet.collect import fleet_of
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.eval.whose import label
+from gaponet.plot.table import Table
 from gaponet.robot import RobotSpec
 from gaponet.study.options import Options
 from gaponet.study.played.trained import Trained, load_trained
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
-from gaponet.study.table import Table
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics
 
@@ -32,8 +32,8 @@ class Playing:
     """A question for which a unit is played."""
 
     runs: tuple[Path, ...] = ()
-    """Run folders, or folders of them such as gaponet compare's cells; without any, GAPONet and the MLP are trained
-    here, in OUT/cells."""
+    """Run folders, or folders of them such as the cells of gaponet experiment compare; without any, GAPONet and the MLP
+    are trained here, in OUT/cells."""
     unit: str = ""
     """Unit of the fleet that plays; by default one that no model was trained on."""
     fleet: str = ""

@@ -10,7 +10,7 @@ not, when a motion begins. e_t compares the target of a moment with the joint at
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.eval.evaluate import choose
-from gaponet.plot.charts import Course, Once, against, draw_bars
+from gaponet.plot.charts import Course, against, draw_bars
 from gaponet.plot.methods import colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
+from gaponet.plot.table import Spread, Table
 from gaponet.robot import RobotSpec
 from gaponet.study.played.measured import LEFT_OUT, cut, duel, methods, of, over_seeds, payloads, percent, series
 from gaponet.study.played.play import PLANNED
@@ -28,7 +29,6 @@ from gaponet.study.played.session import Playing, Session, Tell
 from gaponet.study.played.track import Example, Score, align, track
 from gaponet.study.played.unseen import Unseen, from_files, generated, require_unseen
 from gaponet.study.result import Result
-from gaponet.study.table import Spread, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -180,7 +180,7 @@ def sentences(scores: ListOf[Score], part: str, joints: Joints) -> list[str]:
     return said
 
 
-def _pick(values: dict[str, list[Once]], method: str, joint: int) -> Once:
+def _pick(values: dict[str, list[Spread]], method: str, joint: int) -> Spread:
     return values[method][joint]
 
 
@@ -206,14 +206,14 @@ def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
     return fig
 
 
-def over_motions(scores: ListOf[Score]) -> list[Once]:
+def over_motions(scores: ListOf[Score]) -> list[Spread]:
     """Mean over motions and its standard error for each joint, seeds averaged first."""
     by_motion: dict[str, list[Any]] = {}
     for s in scores:
         by_motion.setdefault(s.motion, []).append(s.q_dis)
     values = np.array([np.mean(v, axis=0) for v in by_motion.values()])  # (motions, n)
-    error = values.std(axis=0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full(values.shape[1], np.nan)
-    return [Once(float(m), float(e)) for m, e in zip(values.mean(axis=0), error, strict=True)]
+    found = [Spread.of(column) for column in values.T]
+    return [replace(f, std=f.error) for f in found]
 
 
 def draw_example(shown: Example, robot: RobotSpec, tag: str) -> Figure:

@@ -10,6 +10,7 @@ from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
 from gaponet.eval.evaluate import corrected_robot
 from gaponet.model.artifact import GapModel
+from gaponet.plot.methods import IDENTIFIED, method, title
 from gaponet.robot import RobotSpec
 
 SAME = ("mlp_match=on",)  # changes that make no other method of it
@@ -38,8 +39,8 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
     """Runs by method and seed, plain before identified.
 
     Args:
-        folders: Run folders, or folders of them such as the cells of gaponet compare, of which those that change
-            something of a model are passed over.
+        folders: Run folders, or folders of them such as the cells of gaponet experiment compare, of which those that
+            change something of a model are passed over.
         robot: The nominal robot.
 
     Raises:
@@ -55,18 +56,19 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
         runs += [run for run in inside if not _changed(run)]
     if not runs:
         names = ", ".join(map(str, folders))
-        raise UsageError(f"--runs {names}: no run of gaponet train or cells of gaponet compare there")
+        raise UsageError(f"--runs {names}: no run of gaponet train or cells of gaponet experiment compare there")
     found: dict[tuple[str, int], Trained] = {}
     for run in runs:
         model = GapModel.load(run)
         corrected = corrected_robot(run, robot)
         model.require(corrected)
-        method = ("identified+" if corrected.nominal is not None else "") + model.config.kind
-        key = method, int(model.card["seed"])
+        key = method(model.config.kind, corrected), int(model.card["seed"])
         if key in found:
-            raise UsageError(f"{run}: {method} seed {key[1]} is there already ({found[key].run}); give one of them")
+            raise UsageError(
+                f"{run}: {title(key[0])} seed {key[1]} is there already ({found[key].run}); give one of them"
+            )
         found[key] = Trained(*key, run, model, corrected)
-    return [found[key] for key in sorted(found, key=lambda k: (k[0].startswith("identified+"), k[0] != "mlp", k))]
+    return [found[key] for key in sorted(found, key=lambda k: (k[0].startswith(IDENTIFIED), k[0] != "mlp", k))]
 
 
 def _changed(run: Path) -> bool:

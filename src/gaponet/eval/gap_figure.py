@@ -1,4 +1,4 @@
-"""The gap budget as a waterfall."""
+"""Where the gap comes from, as a waterfall."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ FLOOR = "#1f7a56"
 
 
 @styled
-def waterfall(budget: dict[str, Any]) -> Figure:
+def waterfall(found: dict[str, Any]) -> Figure:
     """What each step removes of the mean |error| (hollow: adds), the mean over joints first, and the floor."""
-    panels = {"all joints": {"left": budget["left"], "floor": budget["floor"]}} | budget["by_joint"]
-    steps = list(budget["left"])
+    panels = {"all joints": {"left": found["left"], "floor": found["floor"]}} | found["by_joint"]
+    steps = list(found["left"])
     rows = -(-len(panels) // COLUMNS)
     columns = -(-len(panels) // rows)
     fig = figure(2.55 * columns, 2.0 * rows + 0.55)
@@ -32,9 +32,9 @@ def waterfall(budget: dict[str, Any]) -> Figure:
             ax.set_ylabel("MPJAE, mrad")
         bottom = i + columns >= len(panels)
         ax.set_xticks(range(len(steps) + 1), [*(_tick(s) for s in steps), "left"] if bottom else [], fontsize=5.8)
-    who = "VIRTUAL " if budget["virtual"] else "real "
+    who = "VIRTUAL " if found["virtual"] else "real "
     fig.suptitle(
-        f"{who}{budget['robot']}, {budget['sequences']} {'held-out ' if budget['unseen'] else ''}recordings: "
+        f"{who}{found['robot']}, {found['sequences']} {'held-out ' if found['unseen'] else ''}recordings: "
         "what each step removes (hollow: adds)\n"
         "dashed: floor, what encoder and repeatability hide (– unknown)",
         fontsize=9, x=0.01, ha="left",

@@ -1,4 +1,4 @@
-"""The gap budget: steps and floor."""
+"""Where the gap comes from: steps, causes and floor."""
 
 import json
 
@@ -9,10 +9,10 @@ from runs import untrained
 
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.eval.budget import causes, floor, gap_budget, removed
-from gaponet.eval.budget_figure import waterfall
 from gaponet.eval.evaluate import LEARNED
-from gaponet.eval.run_files import read_budget
+from gaponet.eval.gap import causes, floor, gap_by_step, removed
+from gaponet.eval.gap_figure import waterfall
+from gaponet.eval.run_files import read_gap
 from gaponet.metrics import Run
 from gaponet.sim.model import model_hash
 
@@ -52,19 +52,19 @@ def test_every_kind_of_model_has_its_bar(kind):
 
 
 @pytest.mark.parametrize("kind", LEARNED)
-def test_a_run_of_every_kind_has_its_budget_and_its_figure(arm, tmp_path, kind):
+def test_a_run_of_every_kind_has_its_steps_and_its_figure(arm, tmp_path, kind):
     data = Dataset.create(tmp_path / "data", arm)
     for sequence in recordings(arm, 3, rows=60, kp=0.5):
         data.append(sequence)
     motions = sorted({e.meta.motion for e in data.entries})
     run = untrained(tmp_path / "run", arm, data, kind, train=motions[:1], val=motions[1:2], test=motions[2:])
-    found = gap_budget(run, data, arm)
+    found = gap_by_step(run, data, arm)
     assert list(found["left"]) == ["nominal", "delay", "offset", kind]
     assert found["left"][kind] == pytest.approx(found["left"]["nominal"], rel=0.2)  # it corrects nothing yet
     assert found["floor"] == {"encoder": None, "repeatability": None, "both": None}
-    (run / "budget.json").write_text(json.dumps(found))
-    for budget in (found, read_budget(run)):
-        assert [ax.get_title("right") for ax in waterfall(budget).axes if ax.get_visible()] == ["floor –"] * 3
+    (run / "gap.json").write_text(json.dumps(found))
+    for shown in (found, read_gap(run)):
+        assert [ax.get_title("right") for ax in waterfall(shown).axes if ax.get_visible()] == ["floor –"] * 3
 
 
 def test_each_bar_says_what_it_removes_and_the_floor_what_it_is():

@@ -21,13 +21,14 @@ from gaponet.eval.evaluate import choose, corrected_robot
 from gaponet.metrics import Run, metrics, runs, standard_error
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
+from gaponet.plot.methods import method
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
 
-def gap_budget(
+def gap_by_step(
     run: Path,
     dataset: Dataset,
     robot: RobotSpec,
@@ -63,7 +64,7 @@ def gap_budget(
     only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
     steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
     steps += [(cause, physics, None) for cause, physics in causes(simulator)]
-    steps.append((model.config.kind, simulator, model.corrector(simulator)))
+    steps.append((method(model.config.kind, simulator), simulator, model.corrector(simulator)))
     done = {}
     for name, physics, corrector in steps:
         twins = replay(sequences, physics, corrector, lock_idle=True, progress=partial(progress, name))
@@ -97,7 +98,7 @@ def gap_budget(
     }  # fmt: skip
 
 
-# What an identified simulator differs in from the nominal one, in the order in which the budget adopts it.
+# What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
 CAUSES = {
     "gain": ("kp", "damping", "armature", "delay", "offset"),
     "friction": ("frictionloss",),

@@ -1,0 +1,34 @@
+"""Options that several commands have, each said once."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import tyro
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+Folder = tyro.conf.Positional[Path]
+Flag = tyro.conf.FlagCreatePairsOff[bool]
+Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.")]
+Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.")]
+Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these.")]
+Robot = Annotated[
+    str | None, tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.")
+]
+Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
+
+
+def like(function: Callable[..., Any]) -> Callable[[Command], Command]:
+    """Decorator of a command: options that it does not explain itself mean what this function's arguments do."""
+
+    def decorate(command: Command) -> Command:
+        own, theirs = (inspect.getdoc(f) or "" for f in (command, function))
+        said = theirs.partition("Args:\n")[2].partition("\n\n")[0]
+        command.__doc__ = own + ("\n" if "Args:\n" in own else "\n\nArgs:\n") + said
+        return command
+
+    return decorate
