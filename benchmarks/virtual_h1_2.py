@@ -1,177 +1,237 @@
-"""GAPONet on virtual H1-2 robots: an unseen unit at four payloads, payloads left out, calibration, another fleet.
+"""The ladder on virtual H1-2 robots: what each step leaves of the gap of a unit that no step has seen.
 
-    python benchmarks/virtual_h1_2.py WORK [--seeds 3] [--budget 230400] [--all-payloads-only]
+    python benchmarks/virtual_h1_2.py WORK [--seeds 3] [--budget 76800]
 
-Trains on virtual-1 to virtual-3 and measures on virtual-4, motions that no training saw, whole-motion free run:
+Fitted and trained on virtual-1 to virtual-3 of the fleet `hard`, measured on virtual-4 playing other motions, at every
+payload, whole-motion free run:
 
-1. nominal, delay + offset, pooled identification, an MLP with as many weights, GAPONet from the nominal and from the
-   identified simulator;
-2. after `gaponet calibrate` with 30 s of virtual-4 (motions that are not in the test);
-3. GAPONet trained without 2 kg, with and without payload input, asked at 2 kg; trained without 3 kg, asked at 3 kg;
-4. the same models on the `shifted` fleet, whose physics none of them was trained on.
+1. nominal; delay + offset; four scalars for all joints and units (kp, damping, dry friction, delay); pooled
+   identification, classic and with the terms of the servo's law that validation keeps;
+2. GAPONet on that: a supervised start, no PPO; then `gaponet calibrate` with 30 s of virtual-4, training motions;
+3. the untrained steps on the fleet `easy`.
 
-Writes docs/results/virtual_h1_2.{md,json,csv,svg,png}. What is found in WORK is kept. Every number is from VIRTUAL
-robots.
+Writes docs/results/virtual_h1_2.{md,json,csv,svg,png}. What is found in WORK is kept. Every number is
+from VIRTUAL robots.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Mapping
-from collections.abc import Sequence as ListOf
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from publish import WIDE, publish, say
+import numpy as np
+from publish import publish, say
 
+from gaponet.arrays import Array
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
+from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.eval.evaluate import choose, corrected_robot
-from gaponet.metrics import metrics, runs
+from gaponet.metrics import metrics, runs, standard_error
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
+from gaponet.model.baselines import delay_offset
 from gaponet.plot.charts import bars
-from gaponet.plot.methods import palette, title
-from gaponet.plot.table import Spread, Table, compared
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.plot.methods import shade
+from gaponet.plot.table import Spread, Table
+from gaponet.robot import LAW, RobotSpec, load_robot
+from gaponet.robot_folder import save_robot
+from gaponet.sim.evolve import evolve
+from gaponet.sim.identify import DEFAULT_TERMS, identify
+from gaponet.sim.joint_runs import JointRuns
+from gaponet.sim.model import build_model
+from gaponet.sim.refit import cut
 from gaponet.sim.replay import Corrector, replay
-from gaponet.study.compare import Compare, identified
 from gaponet.study.found import Found, answer
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
-from gaponet.training.config import TrainConfig, WarmStartConfig
 
 RECIPE = Path(__file__).with_suffix(".toml")
-UNIT, UNITS = "virtual-4", ("virtual-1", "virtual-2", "virtual-3", "virtual-4")
-# Small rounds of the warm start: validation has stopped falling after five or six of them.
-TRAINING = TrainConfig(WIDE, warm_start=WarmStartConfig(rounds=6, num_envs=128, steps=300, gradient_steps=200))
-MLP, OURS, FURTHER = "mlp:mlp_match=on", "gaponet", "identified+gaponet"
-WITHOUT_2, WITHOUT_3 = "gaponet:holdout_payloads=2", "gaponet:holdout_payloads=3"
-BLIND = f"{WITHOUT_2}:payload_input=off"
-CALIBRATED = ", calibrated"  # behind a word
+UNIT, WORD = "virtual-4", "identified+gaponet"
+SCALES = {"kp": (0.2, 0.2, 3.0), "damping": (1.0, 0.0, 10.0), "frictionloss": (2.0, 0.0, 40.0)}  # unit, low, high
+GENERATIONS, WINDOWS = 60, 24  # of the four scalars; of 8 s, of every fit
+STEPS = {  # → colour
+    "nominal": "#8c8c8c", "delay + offset": "#d99000", "four scalars": "#3b7dd8", "identification, classic": "#2a9d6f",
+    "identification": "#17543c", "identification + GAPONet": "#c8102e", "… calibrated": shade("#c8102e", -0.4),
+}  # fmt: skip
 
-By = dict[str, float]  # payload, or "all" → MPJAE, rad
-Errors = Mapping[str, ListOf[By]]  # method → seed by seed
+Errors = list[Array]  # seed by seed: MPJAE of each test sequence, rad
 
 
 @dataclass(frozen=True)
-class VirtualH12(Compare):
-    """The comparison on the unit held out, after calibration, and on another fleet."""
+class Bench:
+    """A fleet's recordings in parts, and where what is fitted on them is kept."""
 
-    models: tuple[str, ...] = (MLP, OURS, FURTHER, WITHOUT_2, BLIND, WITHOUT_3)
+    fleet: str
+    data: Dataset
+    nominal: RobotSpec
+    work: Path
+    train: list[Sequence]
+    val: list[Sequence]
+    test: list[Sequence]
+
+    @classmethod
+    def of(cls, fleet: str, recipe: Path, work: Path) -> Bench:
+        """Collect what is not there."""
+        run("collect", "--fleet", fleet, "--recipe", recipe, "--out", work / fleet)
+        data = Dataset(work / fleet)
+        parts = split_entries(data, (UNIT,))
+        test = [e for e in parts["test"] if e.meta.unit_id == UNIT]
+        found = (data.sequences(part) for part in (parts["train"], parts["val"], test))
+        return cls(fleet, data, load_robot("h1_2"), work / f"{fleet}-fits", *found)
+
+    def kept(self, name: str, fit: Callable[[], RobotSpec]) -> RobotSpec:
+        """A fitted simulator, fitted once."""
+        if not (self.work / name / "robot.toml").is_file():
+            print(f"{self.fleet}: {name} …", flush=True)
+            save_robot(fit(), self.work / name)
+        return load_robot(self.work / name)
+
+    def errors(self, simulator: RobotSpec, corrector: Corrector | None = None) -> Array:
+        """Of every test sequence, rad."""
+        twins = replay(self.test, simulator, corrector, lock_idle=True)
+        return np.array([metrics([r])["mpjae"] for r in runs(self.test, [t.qpos for t in twins], self.nominal)])
+
+    def identified(self, terms: tuple[str, ...]) -> RobotSpec:
+        """Pooled identification on the training units, with these terms of the servo's law."""
+        fit = lambda: identify(self.train, self.nominal, self.val, WINDOWS, terms).robot  # noqa: E731
+        return self.kept("law" if terms else "classic", fit)
+
+    def simulators(self) -> dict[str, RobotSpec]:
+        """What was identified on the training units, step by step."""
+        return {
+            "four scalars": self.kept("four", lambda: four_scalars(self.train, self.nominal)),
+            "identification, classic": self.identified(()),
+            "identification": self.identified(DEFAULT_TERMS),
+        }
+
+    def untrained(self) -> dict[str, Errors]:
+        """The steps without a network."""
+        late = delay_offset.fit(self.train, self.nominal)
+        first = {"nominal": [self.errors(self.nominal)],
+                 "delay + offset": [self.errors(self.nominal, late.corrector(self.nominal))]}  # fmt: skip
+        return first | {name: [self.errors(robot)] for name, robot in self.simulators().items()}
+
+
+def four_scalars(sequences: list[Sequence], robot: RobotSpec) -> RobotSpec:
+    """Factors of kp, damping and dry friction and one delay, the same for all joints."""
+    parts, model = JointRuns(cut(sequences, WINDOWS), robot), build_model(robot)
+    dof, n = np.array([model.joint(j).dofadr[0] for j in robot.operated]), len(robot.operated)
+    own = {"kp": robot.kp[robot.operated_index], "damping": model.dof_damping[dof],
+           "frictionloss": model.dof_frictionloss[dof]}  # fmt: skip
+    still = {"armature": model.dof_armature[dof], "offset": np.zeros(n)}
+    unit, low, high = np.array([*SCALES.values(), (0.01, 0.0, 0.15)]).T
+
+    def values(x: Array) -> dict[str, Array]:
+        factors = x[:, 0] * unit
+        scaled = {f: factors[:, [i]] * v for i, (f, v) in enumerate(own.items())}
+        fixed = {f: np.broadcast_to(v, (len(x), n)) for f, v in still.items()}
+        return scaled | fixed | {"delay": np.repeat(factors[:, [3]], n, axis=1)}
+
+    cost = lambda x: parts.cost(parts.errors(values(x))).sum(axis=1, keepdims=True)  # noqa: E731
+    start = np.array([[1.0, 1.0, 1.0, 0.01]])
+    best = values(evolve(start / unit, low / unit, high / unit, cost, GENERATIONS)[None])
+    return robot.with_servos({j: {f: float(v[0, i]) for f, v in best.items()} for i, j in enumerate(robot.operated)})
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The question: the hard fleet's steps with those that are trained, beside the easy fleet's."""
+
+    hard: Bench
+    easy: Bench
     holdout_units: tuple[str, ...] = (UNIT,)
 
+    def cells(self, study: Study) -> list[Cell]:
+        """GAPONet in the identified simulator, every seed."""
+        return study.cells((WORD,))
+
     def result(self, study: Study, found: Found) -> Result:
-        """Its tables after the one that counts: the unit never trained on, by payload."""
-        made = super().result(study, found)
-        unit: dict[str, ListOf[By]] = {
-            name: [_new(found.baselines((OURS, ""))[name])] for name in ("nominal", "delay_offset", "identified")
-        }
-        for word in self.models:
-            unit[word] = [_new(run) for run in found.of_word(word)]
-            if word in (OURS, FURTHER):
-                unit[word + CALIBRATED] = [_after_calibration(c, study) for c in found.cells[word, ""]]
-        shifted = _on_shifted(study, found, made.facts["motions"])
-        told = f"MPJAE in mrad on {UNIT}, never trained on; calibrated: with 30 s of it playing other motions."
-        fleet = "The fleet `shifted`: other effects and larger spread, all four units, zero-shot."
-        tables = (made.tables[0], _by_payload("unit", unit, told), _by_payload("shifted", shifted, fleet))
-        figures = {"unit": _figure(unit, f"VIRTUAL {UNIT}, never trained on"),
-                   "shifted": _figure(shifted, "VIRTUAL fleet `shifted`, zero-shot")}  # fmt: skip
-        said = made.sentences
-        if unit.get(BLIND) and unit.get(WITHOUT_2):
-            blind, seen = (Spread.of([by["2"] for by in unit[w]], 1e3) for w in (BLIND, WITHOUT_2))
-            said += (
-                f"At 2 kg, on which it was not trained, {compared('mass not told', blind, seen, 'told', ' mrad')}.",
-            )
-        return replace(made, name="virtual_h1_2", tables=(*tables, *made.tables[1:]), figures=figures, sentences=said)
-
-
-def _new(run: Mapping[str, dict]) -> By:
-    """Errors on the unit held out, by payload."""
-    return {p: v["mpjae"] for p, v in run["new"]["by_payload"].items()} | {"all": run["new"]["mpjae"]}
-
-
-def _mpjae(
-    sequences: list[Sequence], nominal: RobotSpec, simulator: RobotSpec, corrector: Corrector | None = None
-) -> By:
-    """Free runs in a simulator, by payload and of all."""
-    twins = replay(sequences, simulator, corrector, lock_idle=True)
-    done = runs(sequences, [t.qpos for t in twins], nominal)
-    payloads = sorted({s.meta.payload_mass for s in sequences})
-    by = {f"{p:g}": metrics([r for r in done if r.real.meta.payload_mass == p])["mpjae"] for p in payloads}
-    return by | {"all": metrics(done)["mpjae"]}
-
-
-def _after_calibration(cell: Cell, study: Study) -> By:
-    """With 30 s of the unit, on the same test sequences."""
-    run = cell.folder
-    model, simulator = GapModel.load(run), corrected_robot(run, study.robot)
-    if UNIT not in calibration.load(run, model.weights_hash()):
-        _run("calibrate", run, study.data.path, "--unit", UNIT)
-    own = calibration.load(run, model.weights_hash())[UNIT]
-    entries = [e for e in choose([run], study.data)[0] if e.meta.unit_id == UNIT]
-    return _mpjae(study.data.sequences(entries), study.robot, own.robot(simulator), model.corrector(simulator))
-
-
-def _on_shifted(study: Study, found: Found, motions: list[str]) -> Errors:
-    """The same models and simulators on the other fleet, all its units."""
-    recipe, nominal = study.out / "shifted.toml", study.robot
-    recipe.write_text(
-        f"motions = {json.dumps(motions)}\npayloads = [0.0, 1.0, 2.0, 3.0]\nunits = {json.dumps(UNITS)}\nvariants = 2\n"
-    )
-    sequences = collected(study.out / "shifted", recipe, "shifted").sequences()
-    assert study.identified is not None
-    out = {
-        "nominal": [_mpjae(sequences, nominal, nominal)],
-        "identified": [_mpjae(sequences, nominal, study.identified)],
-    }
-    for word in (MLP, OURS, FURTHER):
-        models = [
-            (GapModel.load(c.folder), corrected_robot(c.folder, nominal)) for c in found.cells.get((word, ""), [])
+        """Tables by payload, what each step takes from the one before, and a figure."""
+        cells, simulator = found.cells[WORD, ""], study.identified
+        assert simulator is not None
+        steps = self.hard.untrained()
+        models = [GapModel.load(c.folder) for c in cells]
+        steps["identification + GAPONet"] = [self.hard.errors(simulator, m.corrector(simulator)) for m in models]
+        steps["… calibrated"] = [self.calibrated(c, m, simulator) for c, m in zip(cells, models, strict=True)]
+        easy = self.easy.untrained()
+        motions = sorted({s.meta.motion for s in self.hard.test})
+        law = [f for f in LAW if getattr(simulator, f)[simulator.operated_index].any()]
+        told = (
+            f"MPJAE in mrad on {UNIT}, ± standard error over {len(motions)} motions; seeds: std over {len(cells)}. "
+            "GAPONet: a supervised start, no PPO. Calibrated: with 30 s of the unit playing training motions."
+        )
+        tables = (table("ladder", steps, self.hard.test, told), lines(steps, self.hard.test),
+                  table("easy", easy, self.easy.test, f"The fleet `easy`, its {UNIT}."))  # fmt: skip
+        said = [
+            *differences(steps, self.hard.test),
+            f"Of the servo's law, validation kept {', '.join(law) or 'nothing'}.",
         ]
-        out[word] = [_mpjae(sequences, nominal, robot, model.corrector(robot)) for model, robot in models]
-    return {word: errors for word, errors in out.items() if errors}
+        figures = {"ladder": figure(steps, self.hard.test, f"VIRTUAL {UNIT} of fleet hard, never seen")}
+        return found.result(study, "virtual_h1_2", "The ladder on a unit never seen", list(tables), figures, said,
+                            motions=motions, fleets=["hard", "easy"])  # fmt: skip
+
+    def calibrated(self, cell: Cell, model: GapModel, simulator: RobotSpec) -> Array:
+        """After 30 s of the unit."""
+        if UNIT not in calibration.load(cell.folder, model.weights_hash()):
+            run("calibrate", cell.folder, self.hard.data.path, "--unit", UNIT)
+        own = calibration.load(cell.folder, model.weights_hash())[UNIT]
+        return self.hard.errors(own.robot(simulator), model.corrector(simulator))
 
 
-def _name(word: str) -> str:
-    return title(word.removesuffix(CALIBRATED)) + (CALIBRATED if word.endswith(CALIBRATED) else "")
+def by_motion(errors: Errors, sequences: list[Sequence], payload: float | None = None) -> Array:
+    """Mean of each motion over seeds, and over payloads if none is given, (motions,) mrad."""
+    mean = np.mean(errors, axis=0) * 1e3
+    own = [payload is None or s.meta.payload_mass == payload for s in sequences]
+    names = np.array([s.meta.motion for s in sequences])
+    return np.array([mean[(names == m) & own].mean() for m in sorted(set(names))])
 
 
-def _by_payload(name: str, errors: Errors, caption: str) -> Table:
-    """A row per method: mrad by payload, of nominal, and where it is worst."""
-    payloads, nominal, rows = list(errors["nominal"][0]), errors["nominal"][0], []
-    for word, found in errors.items():
-        if found:
-            values = {p: Spread.of([by[p] for by in found], 1e3) for p in payloads}
-            left = {p: values[p].mean / nominal[p] / 1e3 for p in payloads}
-            worst = max((p for p in payloads if p != "all"), key=lambda p: left[p])
-            rows.append((_name(word), *values.values(), left["all"], f"{left[worst]:.2f} ({worst} kg)"))
-    heads = (f"{p} kg" if p != "all" else "mean" for p in payloads)
-    return Table(name, ("method", *heads, "of nominal", "worst"), tuple(rows), caption)
+def table(name: str, steps: dict[str, Errors], sequences: list[Sequence], caption: str) -> Table:
+    """A row per step, a column per payload."""
+    payloads: list[float | None] = [*sorted({s.meta.payload_mass for s in sequences}), None]
+    nominal = by_motion(steps["nominal"], sequences).mean()
+    rows = []
+    for step, errors in steps.items():
+        values = [by_motion(errors, sequences, p) for p in payloads]
+        seeds = Spread.of([float(e.mean()) for e in errors], 1e3).std if len(errors) > 1 else None
+        cells = (f"{v.mean():.2f} ± {standard_error(v):.2f}" for v in values)
+        rows.append((step, *cells, values[-1].mean() / nominal, seeds))
+    heads = ("mean" if p is None else f"{p:g} kg" for p in payloads)
+    return Table(name, ("step", *heads, "of nominal", "seeds"), tuple(rows), caption)
 
 
-def _figure(errors: Errors, heading: str):
-    """Error by payload with spread over seeds; models that were trained on all payloads."""
-    shown = {w: found for w, found in errors.items() if found and "holdout" not in w}
-    payloads = [p for p in shown["nominal"][0] if p != "all"]
-    colours = palette(w.replace(CALIBRATED, ":calibrated") for w in shown)
-    methods = {
-        _name(w): (colour, [Spread.of([by[p] for by in found], 1e3) for p in payloads])
-        for (w, found), colour in zip(shown.items(), colours.values(), strict=True)
-    }
-    return bars([f"{p} kg" for p in payloads], methods, "MPJAE, mrad", heading)
+def lines(steps: dict[str, Errors], sequences: list[Sequence]) -> Table:
+    """Every number: a line per step, seed and sequence."""
+    rows = [(step, seed, s.meta.motion, s.meta.payload_mass, float(e))
+            for step, errors in steps.items() for seed, found in enumerate(errors)
+            for s, e in zip(sequences, found, strict=True)]  # fmt: skip
+    return Table("all", ("step", "seed", "motion", "payload kg", "MPJAE rad"), tuple(rows), shown=False)
 
 
-def collected(folder: Path, recipe: Path, fleet: str) -> Dataset:
-    """A dataset of the fleet, unless it is there."""
-    _run("collect", "--fleet", fleet, "--recipe", recipe, "--out", folder)
-    return Dataset(folder)
+def differences(steps: dict[str, Errors], sequences: list[Sequence]) -> list[str]:
+    """What each step takes from the one before, paired by motion."""
+    means, said = {step: by_motion(errors, sequences) for step, errors in steps.items()}, []
+    for before, after in zip(list(means)[1:-1], list(means)[2:], strict=True):
+        less = means[before] - means[after]
+        said.append(f"{after}: {less.mean():+.2f} ± {standard_error(less):.2f} mrad less than the step before.")
+    return said
 
 
-def _run(*words: object) -> None:
+def figure(steps: dict[str, Errors], sequences: list[Sequence], heading: str):
+    """Bars by payload with standard errors over motions."""
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    found = {step: [by_motion(e, sequences, p) for p in payloads] for step, e in steps.items()}
+    shown = {step: (STEPS[step], [Spread(float(v.mean()), standard_error(v), len(v)) for v in values])
+             for step, values in found.items()}  # fmt: skip
+    return bars([f"{p:g} kg" for p in payloads], shown, "MPJAE, mrad", heading)
+
+
+def run(*words: object) -> None:
+    """A command of gaponet."""
     if gaponet([*map(str, words)]):
         raise SystemExit(2)
 
@@ -181,15 +241,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--budget", default="230400", help="of each run, as in gaponet train")
-    parser.add_argument("--all-payloads-only", action="store_true", help="leave 3. out: half of the trainings")
+    parser.add_argument("--budget", default="76800", help="of each run, as in gaponet train")
     parser.add_argument("--recipe", type=Path, default=RECIPE)
     args = parser.parse_args()
-    question = VirtualH12((MLP, OURS, FURTHER)) if args.all_payloads_only else VirtualH12()
-    data = collected(args.work / "default", args.recipe, "default")
-    out = args.work / "compare"
-    study = Study(data, load_robot("h1_2"), out, TRAINING, args.budget, args.seeds, question.holdout_units)
-    study = identified(study, lambda done, total, rms: None)
+    question = Ladder(*(Bench.of(fleet, args.recipe, args.work) for fleet in ("hard", "easy")))
+    study = Study(question.hard.data, question.hard.nominal, args.work / "study", budget=args.budget, seeds=args.seeds,
+                  holdout_units=question.holdout_units)  # fmt: skip
+    study = replace(study, identified=question.hard.identified(DEFAULT_TERMS))
     publish(answer(question, study, say), args.work / "results")
 
 

@@ -52,6 +52,16 @@ def test_the_shifted_fleet_lies_outside_the_easy_one():
     assert easy.digest() != shifted.digest()
 
 
+def test_units_of_the_hard_fleet_differ_as_motors_and_friction_do():
+    robot = load_robot("h1_2")
+    units = list(load_fleet("hard", robot).units.values())
+    stiff = np.array([u.kp_scale * u.kt_scale for u in units])  # (units, joints)
+    dry = np.array([u.friction for u in units])
+    spread = lambda x: (x.std(axis=0, ddof=1) / x.mean(axis=0)).mean()  # noqa: E731
+    assert 0.05 < spread(stiff) < 0.08
+    assert 0.3 < spread(dry) < 0.5
+
+
 def test_a_robot_that_the_file_does_not_hold_is_drawn_from_the_same_distributions(arm):
     a, b = load_fleet("easy", arm), load_fleet("easy", arm)
     assert a.digest() == b.digest()

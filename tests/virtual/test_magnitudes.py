@@ -24,32 +24,39 @@ MOTIONS = (
 )
 
 
-@pytest.fixture(scope="module")
-def played():
-    """Robot, virtual and nominal positions and commands, (T, motions, payloads, 27); a motion that has ended rests."""
+def play(fleet, unit, simulators):
+    """Robot, commands, and positions of a unit and of simulators, (T, motions, payloads, 27); ended motions rest."""
     robot = load_robot("h1_2")
     library, locked = Library(robot), idle_joints(robot, robot.operated)
     free = robot.index([name for name in robot.joint_names if name not in locked])
-    unit = load_fleet("easy", robot).unit("virtual-1")
     motions = [library.make(name).sample(robot.dt)[:450] for name in MOTIONS]
     rows = max(len(m) for m in motions)
     ctrl = np.stack([np.concatenate([m, np.repeat(m[-1:], rows - len(m), axis=0)]) for m in motions], axis=1)
     ctrl = np.repeat(ctrl, len(PAYLOADS), axis=1)  # motion by motion, payloads within
     payloads = [(p, "both") for _ in MOTIONS for p in PAYLOADS]
-    robots = VirtualRobot(robot, [unit] * len(payloads), payloads, locked=locked)
+    robots = VirtualRobot(robot, [load_fleet(fleet, robot).unit(unit)] * len(payloads), payloads, locked=locked)
     robots.reset(ctrl[0], [1] * len(payloads), 12.0)
-    nominal = BatchSim(robot, [(p, side, robot.dt) for p, side in payloads], 1, locked)
+    sims = [BatchSim(make(robot), [(p, side, robot.dt) for p, side in payloads], 1, locked) for make in simulators]
     first = robots.read()
-    nominal.reset(slice(None), first.qpos[:, free], first.qvel[:, free])
-    real, sim = np.empty_like(ctrl), np.empty_like(ctrl)
+    for sim in sims:
+        sim.reset(slice(None), first.qpos[:, free], first.qvel[:, free], past=ctrl[:1, :, free].transpose(1, 0, 2))
+    seen = np.empty((1 + len(sims), *ctrl.shape))
     for t, targets in enumerate(ctrl):
-        real[t] = robots.read().qpos
-        sim[t] = real[t]
-        sim[t][:, free] = nominal.qpos
+        seen[:, t] = robots.read().qpos
+        for k, sim in enumerate(sims, 1):
+            seen[k, t] = seen[0, t]
+            seen[k, t][:, free] = sim.qpos
+            sim.step(targets[:, free])
         robots.step(targets)
-        nominal.step(targets[:, free])
     shape = (rows, len(MOTIONS), len(PAYLOADS), len(robot.joint_names))
-    return robot, real.reshape(shape), sim.reshape(shape), ctrl.reshape(shape)
+    return robot, ctrl.reshape(shape), *(x.reshape(shape) for x in seen)
+
+
+@pytest.fixture(scope="module")
+def played():
+    """Robot, virtual and nominal positions and commands of the easy fleet."""
+    robot, ctrl, real, sim = play("easy", "virtual-1", [lambda robot: robot])
+    return robot, real, sim, ctrl
 
 
 def test_the_gap_grows_with_payload_on_every_shoulder_and_elbow_joint(played):
