@@ -2,8 +2,8 @@
 
 Per operated joint: gain, damping, dry friction, armature, zero offset, command delay; then, each only where it lowers
 the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). Fitted on windows of 8 s,
-every joint on its own beside the recording (sim/joint_runs.py), by separable CMA-ES; then what the robot touches, in
-the simulator of the whole robot (sim/touching.py).
+every joint on its own beside the recording (sim/joint_runs.py), by least squares from several starts
+(sim/multistart.py); then what the robot touches, in the simulator of the whole robot (sim/touching.py).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import itertools
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -19,22 +20,26 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.metrics import standard_error
 from gaponet.robot import LAW, RobotSpec
-from gaponet.sim.evolve import evolve
-from gaponet.sim.joint_runs import JointRuns
+from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
+from gaponet.sim.multistart import better_half, descend
 from gaponet.sim.refit import cut
-from gaponet.sim.touching import GENERATIONS as TABLE_GENERATIONS
+from gaponet.sim.touching import SEARCH as TABLE_SEARCH
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 
 Array = np.ndarray
 Values = dict[str, Array]  # field → (n,) of the operated joints
+Std = dict[str, dict[str, float]]  # joint → field → standard error
 
 WINDOWS = 40
-GENERATIONS, MORE = 120, 60  # of the classic fields, and for each term
+STARTS, SPREAD = 4, 2.0  # of each search, and how far apart in the parameters' scales
+SHORT = 0.5  # s: a search begins with runs so short
+SEARCH = (10, 8, 15)  # iterations: of all starts on short runs, of all on whole windows, of the better half
 FIRST_DELAY = 0.02  # s: a delay of zero hides what it does
 MAX_DELAY = 0.15  # s
-BLIND, NOISE = 1e-9, 1e-4  # rad² and rad: what no log resolves
-HEAVY = 2e-4  # price of an armature e times the MJCF's: it trades against delay and damping
+AGAIN, AGAIN_STEPS, BESIDE = 8, 6, 1.0  # fits for the standard errors, their iterations, how far beside they begin
+WIDE = 0.25  # a standard error so large, of the value and of its scale: not determined
+HEAVY = 2e-4  # price of kp or armature e times the given one: both trade against all the others
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
@@ -45,8 +50,11 @@ TERMS: dict[str, tuple[str, ...]] = {
     "encoder": ("encoder_step",),
 }
 DEFAULT_TERMS = ("stribeck", "load")
+# The search's axes: what a motion shows is a torque over kp, whatever kp is.
+LOGARITHM = ("kp", "stribeck_speed")
+OVER_KP = ("damping", "frictionloss", "armature", "stribeck", "min_torque", "effort_limit")
 
-Progress = Callable[[float, float, str], None]  # generations done, in all, what is fitted and its error
+Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ class Identified:
     before: float
     after: float
     warnings: tuple[str, ...]
-    std: dict[str, dict[str, float]]
+    std: Std
     tried: tuple[Tried, ...]
     touch: Touch | None
 
@@ -112,13 +120,15 @@ def identify(
         terms: Of the servo's law, from TERMS, in the order in which they are tried.
         table: Look for a table under the robot's tips.
         nthread: Threads for the table, 0 for all cores.
-        progress: Called in each generation.
+        progress: Called in each iteration.
     """
-    total = GENERATIONS + MORE * len(terms) + TABLE_GENERATIONS * bool(table and robot.tips)
-    done = itertools.count(1)
+    each = sum(SEARCH)
+    before_table = each * (1 + len(terms)) + AGAIN_STEPS
+    total = before_table + sum(TABLE_SEARCH) * bool(table and robot.tips)
 
-    def tell(what: str) -> Callable[[float], None]:
-        return lambda error: progress(min(next(done), total), total, f"{what} {error * 1e3:.2f} mrad")
+    def tell(what: str, done: int) -> Callable[[float], None]:
+        step = itertools.count(done + 1)
+        return lambda error: progress(min(next(step), total), total, f"{what} {error * 1e3:.2f} mrad")
 
     robot = with_stops(robot, sequences)
     heights = tip_heights(sequences, robot)
@@ -127,26 +137,51 @@ def identify(
     fit = Fit(JointRuns(parts, robot, below), robot, sequences)
     start = fit.start()
     before = fit.mean_error(start)
-    values = fit.descend(CLASSIC, start, GENERATIONS, tell("servos"))
+    values = fit.search(CLASSIC, start, tell("servos", 0))
     judge = JointRuns(list(validation), robot, below) if validation else None
     tried = []
-    for term in terms:
-        fields = tuple(fit.fields_of(values)) + TERMS[term]
-        richer = fit.descend(fields, fit.with_term(values, term), MORE, tell(term))
+    for i, term in enumerate(terms, 1):
+        richer = fit.with_term(values, term)
+        richer = fit.search(fit.fields_of(richer), richer, tell(term, each * i))
         if judge is None:
             values = richer
             continue
         tried.append(Tried(term, *(motion_errors(judge, v) for v in (values, richer))))
         if tried[-1].kept:
             values = richer
+    std = fit.uncertainty(values, tell("standard errors", before_table - AGAIN_STEPS))
     found = fit.robot(values)
     touch = None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
-        touch = fit_table(low, found, lowest, nthread, tell("table"))
+        touch = fit_table(low, found, lowest, nthread, tell("table", before_table))
         found = touch.robot
-    std = fit.uncertainty(values)
     return Identified(found, before, fit.mean_error(values), fit.doubts(values, std), std, tuple(tried), touch)
+
+
+class Axes:
+    """Fields as the search sees them: (…, n, P), in units in which a change of one is a large one."""
+
+    def __init__(self, fit: Fit, fields: ListOf[str], rest: Values) -> None:
+        self.names, self.rest = list(dict.fromkeys(fields)), rest
+        low, high, self.unit = (np.stack([fit.limits[f][i] for f in self.names], axis=1) for i in range(3))
+        self.low, self.high = low / self.unit, high / self.unit
+
+    def of(self, values: Values) -> Array:
+        """From values, inside the bounds."""
+        kp = values["kp"]
+        seen = [
+            np.log(np.maximum(values[f], 1e-9)) if f in LOGARITHM else values[f] / kp ** (f in OVER_KP)
+            for f in self.names
+        ]
+        return np.clip(np.stack(seen, axis=-1) / self.unit, self.low, self.high)
+
+    def values(self, x: Array) -> Values:
+        """To values; fields that are not searched stay."""
+        own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
+        found = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()} | own
+        found |= {f: np.exp(own[f]) for f in LOGARITHM if f in own}
+        return found | {f: own[f] * found["kp"] for f in OVER_KP if f in own}
 
 
 class Fit:
@@ -164,21 +199,21 @@ class Fit:
             **{f: getattr(robot, f)[self.op] for f in ("offset", "delay", "effort_limit", *LAW)},
         }  # fmt: skip
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in self.op])
-        one = np.ones(self.n)
-        # Field → lowest, highest, and a change that is a large one, (n,) each.
+        one, heavy = np.ones(self.n), self.first["armature"] / kp
+        # Field → lowest, highest, and a change that is a large one, (n,) each, on the search's axes.
         self.limits: dict[str, tuple[Array, Array, Array]] = {
-            "kp": (0.2 * kp, 8.0 * kp, 0.2 * kp),
-            "damping": (0 * kp, 0.5 * kp, 0.015 * kp),
-            "frictionloss": (0 * kp, 0.2 * kp, 0.005 * kp),
-            "armature": (0.1 * self.first["armature"], 10 * self.first["armature"], 0.4 * self.first["armature"]),
+            "kp": (np.log(0.2 * kp), np.log(8.0 * kp), 0.3 * one),
+            "damping": (0 * one, 0.5 * one, 0.015 * one),
+            "frictionloss": (0 * one, 0.2 * one, 0.005 * one),
+            "armature": (0.02 * heavy, 10 * heavy, 0.4 * heavy),
             "offset": (-0.2 * one, 0.2 * one, 0.01 * one),
             "delay": (0 * one, MAX_DELAY * one, 0.005 * one),
-            "stribeck": (0 * kp, 0.1 * kp, 0.002 * kp),
-            "stribeck_speed": (0.005 * one, 1.0 * one, 0.03 * one),
+            "stribeck": (0 * one, 0.1 * one, 0.002 * one),
+            "stribeck_speed": (np.log(0.005) * one, 0 * one, 0.3 * one),
             "friction_motor": (0 * one, 0.8 * one, 0.05 * one),
             "friction_external": (0 * one, 0.8 * one, 0.05 * one),
-            "min_torque": (0 * kp, 0.05 * kp, 0.002 * kp),
-            "effort_limit": (0.2 * limit, 3 * limit, 0.2 * limit),
+            "min_torque": (0 * one, 0.05 * one, 0.002 * one),
+            "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
             "encoder_step": (counts, counts, one),
         }
         self.guess = {"stribeck": 0.003 * kp, "stribeck_speed": 0.05 * one, "friction_motor": 0.05 * one,
@@ -188,7 +223,7 @@ class Fit:
     def start(self) -> Values:
         """The given robot, a little late."""
         own = self.first | {"delay": np.maximum(self.first["delay"], FIRST_DELAY)}
-        return {f: np.clip(own[f], *self.limits[f][:2]) for f in CLASSIC} | {f: own[f] for f in LAW if own[f].any()}
+        return {f: own[f] for f in CLASSIC} | {f: own[f] for f in LAW if own[f].any()}
 
     def fields_of(self, values: Values) -> list[str]:
         """Names, classic ones first."""
@@ -198,28 +233,34 @@ class Fit:
         """Values with a first guess at a term's fields."""
         return values | {f: self.guess[f] for f in TERMS[term]}
 
-    def descend(
-        self, fields: tuple[str, ...], start: Values, generations: int, tell: Callable[[float], None]
-    ) -> Values:
-        """Fit these fields from a start; those of `start` that are not among them stay."""
-        names = list(dict.fromkeys(fields))
-        low, high, unit = (np.stack([self.limits[f][i] for f in names], axis=1) for i in range(3))
-        x = np.clip(np.stack([start[f] for f in names], axis=1), low, high)
+    def search(self, fields: ListOf[str], start: Values, tell: Callable[[float], None]) -> Values:
+        """Fit these fields from a start, and from STARTS − 1 beside it; those of `start` not among them stay."""
+        axes = Axes(self, fields, start)
+        rng = np.random.default_rng(0)
+        x = np.repeat(axes.of(start)[None], STARTS, axis=0)
+        x[1:] += SPREAD * rng.standard_normal(x[1:].shape)
+        x = np.clip(x, axes.low, axes.high)
+        for runs, iterations in zip((self.runs.shortened(SHORT), self.runs, self.runs), SEARCH, strict=True):
+            errors = partial(lambda runs, xs: self.errors(axes.values(xs), runs), runs)
+            x, cost = descend(x, axes.low, axes.high, errors, iterations, self.telling(runs, tell))
+            if runs is self.runs:
+                x = better_half(x, cost)
+        return {f: v[0].copy() for f, v in axes.values(x[:1]).items()}
 
-        def values_of(xs: Array) -> Values:
-            kept = {f: np.broadcast_to(v, xs.shape[:-1]) for f, v in start.items() if f not in names}
-            return kept | {f: xs[..., i] * unit[:, i] for i, f in enumerate(names)}
+    def telling(self, runs: JointRuns, tell: Callable[[float], None]) -> Callable[[Array], None]:
+        """Costs, (n,), told as a root mean square in rad."""
+        rows = max(int(runs.counted.sum()), 1)
+        return lambda cost: tell(SOFT * float(np.sqrt(2 * cost.mean() / rows)))
 
-        def cost(xs: Array) -> Array:
-            values = values_of(xs)
-            errors = self.runs.errors(values)
-            tell(float(np.abs(errors).sum(axis=(0, 2)).min(axis=0).mean() / max(self.runs.counted.sum(), 1)))
-            known = self.armature > 0
-            far = np.log(values["armature"] / np.where(known, self.armature, 1.0)) ** 2
-            return self.runs.cost(errors) + HEAVY * np.where(known, far, 0.0)
-
-        best = evolve(x / unit, low / unit, high / unit, cost, generations)
-        return {f: v.copy() for f, v in values_of(best).items()}
+    def errors(self, values: Values, runs: JointRuns) -> Array:
+        """Of (k, n) values, (k, n, windows · rows), in SOFT; then the prices of kp and armature, two more."""
+        found = np.moveaxis(runs.errors(values), (1, 3, 2, 0), (0, 1, 2, 3)) / np.float32(SOFT)
+        price = np.sqrt(2 * HEAVY * runs.counted.sum())
+        given = {f: np.where(v > 0, v, np.nan) for f, v in (("kp", self.first["kp"]), ("armature", self.armature))}
+        far = [np.nan_to_num(np.log(values[f] / given[f])) for f in given]
+        return np.concatenate(
+            [found.reshape(*found.shape[:2], -1), price * np.stack(far, axis=-1)], axis=2, dtype=np.float32
+        )
 
     def mean_error(self, values: Values) -> float:
         """Of the windows, rad."""
@@ -232,38 +273,40 @@ class Fit:
             {j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(joints)}
         )
 
-    def uncertainty(self, values: Values) -> dict[str, dict[str, float]]:
-        """Standard errors, joint → field, from the errors' slopes; windows count as independent, rows do not."""
+    def uncertainty(self, values: Values, tell: Callable[[float], None] = lambda error: None) -> Std:
+        """Standard errors, joint → field: how far from these values fits end that begin beside them and give every
+        window a random weight (a Bayesian bootstrap, Rubin 1981). Slopes would say less: the surface is rough."""
         names = [f for f in self.fields_of(values) if f != "encoder_step"]
-        steps = {f: 0.1 * self.limits[f][2] for f in names}
-        tried = {f: np.tile(v, (len(names) + 1, 1)) for f, v in values.items()}
-        for k, f in enumerate(names, 1):
-            tried[f][k] += np.where(values[f] + steps[f] > self.limits[f][1], -steps[f], steps[f])
-        errors = self.runs.errors(tried)
-        found = {}
-        rows_per_error = max(1.0, 0.1 / self.runs.dt)  # about ten a second count as independent
-        for i, joint in enumerate(self.base.operated):
-            e = errors[..., i][self.runs.counted.nonzero()[0], :, self.runs.counted.nonzero()[1]]  # (rows, k)
-            jac = np.stack([(e[:, k] - e[:, 0]) / (tried[f][k, i] - values[f][i]) for k, f in enumerate(names, 1)], 1)
-            scale = np.array([self.limits[f][2][i] for f in names])
-            inverse = np.linalg.inv((jac * scale).T @ (jac * scale) + BLIND * np.eye(len(names)))
-            variance = inverse.diagonal() * max(np.square(e[:, 0]).mean(), NOISE**2) * rows_per_error
-            found[joint] = dict(zip(names, (scale * np.sqrt(np.maximum(variance, 0.0))).tolist(), strict=True))
-        return found
+        axes, windows = Axes(self, names, values), self.runs.counted.shape[1]
+        rng = np.random.default_rng(1)
+        weight = np.sqrt(rng.dirichlet(np.ones(windows), AGAIN) * windows).astype(np.float32)
+        weight = np.append(np.repeat(weight, len(self.runs.ctrl), axis=1), np.ones((AGAIN, 2), np.float32), axis=1)
 
-    def doubts(self, values: Values, std: dict[str, dict[str, float]]) -> tuple[str, ...]:
+        def errors(xs: Array) -> Array:
+            found = self.errors(axes.values(xs), self.runs)
+            return found * np.tile(weight, (len(xs) // AGAIN, 1))[:, None]
+
+        x = axes.of(values) + BESIDE * rng.standard_normal((AGAIN, self.n, len(names)))
+        x = np.clip(x, axes.low, axes.high)
+        x, _ = descend(x, axes.low, axes.high, errors, AGAIN_STEPS, self.telling(self.runs, tell))
+        ends = axes.values(x)
+        std = {f: np.sqrt(np.square(ends[f] - values[f]).mean(axis=0)) for f in names}
+        return {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(self.base.operated)}
+
+    def doubts(self, values: Values, std: Std) -> tuple[str, ...]:
         """Parameters at a bound, and those whose standard error is as large as what they may mean."""
-        found = []
+        names, found = [f for f in self.fields_of(values) if f != "encoder_step"], []
+        axes = Axes(self, names, values)
+        x = axes.of(values)
+        edge = ((x - axes.low < 0.02) & (axes.low != 0)) | (axes.high - x < 0.02)
+        ahead = axes.values(x + 1)
         for i, joint in enumerate(self.base.operated):
-            for f in self.fields_of(values):
-                value, (low, high, unit) = values[f][i], (x[i] for x in self.limits[f])
-                if f == "encoder_step":
-                    continue
-                edge = 0.02 * unit
-                if (value - low < edge and low != 0) or high - value < edge:
+            for k, f in enumerate(names):
+                value, error = values[f][i], std[joint][f]
+                if edge[i, k]:
                     found.append(f"{joint}: {f} ended at its bound ({value:.4g}); the model's form does not fit")
-                elif std[joint][f] > max(0.5 * abs(value), unit):
-                    found.append(f"{joint}: {f} {value:.4g} ± {std[joint][f]:.2g} is not determined by these logs")
+                elif error > WIDE * max(abs(value), ahead[f][i] - value):
+                    found.append(f"{joint}: {f} {value:.4g} ± {error:.2g} is not determined by these logs")
         return tuple(found)
 
 
@@ -274,7 +317,7 @@ def motion_errors(runs: JointRuns, values: Values) -> Array:
     return np.asarray(errors.sum(axis=0)[counted > 0] / counted[counted > 0])
 
 
-STOPPED, AGAIN = 0.1, 50  # rad that commands go beyond a stop, and rows that must show it
+STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and rows that must show it
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
@@ -285,6 +328,6 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
         for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
             end = float((sign * qpos).max())
             pressed = (sign * ctrl > end + STOPPED) & (sign * qpos > end - 0.005)
-            if pressed.sum() >= AGAIN and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
+            if pressed.sum() >= OFTEN and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
     return robot.with_servos(servos) if servos else robot

@@ -8,6 +8,8 @@ whole robot, and its error by joint to a few per cent (tests/sim/test_joint_runs
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 
@@ -55,15 +57,27 @@ class JointRuns:
         self.inertia, self.weight, self.pull, self.slope = (middle(stack([a[i] for a in along])) for i in range(4))
         self.at = middle(self.qpos)
         self.touch = stack([a[4] for a in along]) < below  # (rows, windows)
-        lengths = np.array([len(p) for p in parts])
-        after = round(SETTLE / self.dt)
-        near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
-        time = np.arange(rows)[:, None]
+        self.lengths = np.array([len(p) for p in parts])
+        self.counted = self._counted()
         # Gains while recording: kp as a multiple of the robot's own, kd in N·m·s/rad, (windows, n).
         set_to = [robot.with_gains(*p.meta.known_gains) for p in parts]
         self.stiffer = np.array([(r.kp / robot.kp)[self.op] for r in set_to])
         self.kd = np.array([r.kd[self.op] for r in set_to])
-        self.counted = (time > max(after, 1)) & (time < lengths) & ~near
+
+    def _counted(self) -> Array:
+        """Rows that count, (rows, windows): after the start has settled, away from what may be touched."""
+        rows, after = len(self.touch), round(SETTLE / self.dt)
+        near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
+        time = np.arange(rows)[:, None]
+        return np.asarray((time > max(after, 1)) & (time < self.lengths) & ~near)
+
+    def shortened(self, seconds: float) -> JointRuns:
+        """The same windows, put back on the recording every so many seconds: a smoother surface to descend on."""
+        short = copy.copy(self)
+        short.touch = self.touch.copy()
+        short.touch[:: max(round(seconds / self.dt), 1)] = True
+        short.counted = short._counted()
+        return short
 
     def errors(self, values: dict[str, Array]) -> Array:
         """q_sim − q_real of parameters (k, n) each, (rows, k, windows, n) rad; zero where rows do not count.
@@ -72,25 +86,32 @@ class JointRuns:
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and
                 any of effort_limit and LAW.
         """
-        k, n = values["kp"].shape
-        v = {name: x[:, None] for name, x in values.items()}
-        law = {name: v.get(name, np.zeros((1, 1, n))) for name in LAW}
-        kp, mass = v["kp"] * self.stiffer, v["armature"]
-        damping = v["damping"] + self.kd
-        limit = v.get("effort_limit", self.robot.effort_limit[self.op])
-        h = self.dt / self.count
-        q, w = np.repeat(self.qpos[:1], k, axis=0), np.repeat(self.qvel[:1], k, axis=0)
-        out = np.zeros((len(self.ctrl), *q.shape), np.float32)
+        k = len(values["kp"])
+        shape = (k, *self.qpos.shape[1:])
+        # Every array has the shape of the state and its precision: broadcasting costs more than the sums.
+        v = {name: _filled(x[:, None], shape) for name, x in values.items()}
+        law = {name: v.get(name, NONE) for name in LAW}
+        kp, kd = v["kp"] * _filled(self.stiffer, shape), _filled(self.kd, shape)
+        own, mass, offset, dry = v["damping"], v["armature"], v["offset"], v["frictionloss"]
+        damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op], shape))
+        h = np.float32(self.dt / self.count)
+        given = [x.astype(np.float32) for x in (self.inertia, self.weight, self.pull, self.slope, self.at)]
+        driven, late = bool(self.kd.any()), bool(values["delay"].any())
+        q, w = _filled(self.qpos[0], shape), _filled(self.qvel[0], shape)
+        out = np.zeros((len(self.ctrl), *shape), np.float32)
         for t in range(len(out) - 1):
-            inertia = self.inertia[t] + mass
-            turn, stop = h / (inertia + h * damping), inertia / h
+            inertia, weight, pull, slope, at = (x[t] for x in given)
+            heavy = inertia + mass
+            turn, stop = h / (heavy + h * damping), heavy / -h
+            weight, slope = weight - slope * at, _filled(slope, shape)
             for part in range(self.count):
-                aim = self._target(t, part, values["delay"]) + v["offset"]
-                torque = np.clip(servo_torque(law, kp, aim, q) - self.kd * w, -limit, limit)
-                load = self.weight[t] + self.slope[t] * (q - self.at[t])
-                most = friction_limit(law, v["frictionloss"], w, torque, load)
-                net = torque - load - self.pull[t] - v["damping"] * w
-                w = w + turn * (net + np.clip(-stop * w - net, -most, most))
+                aim = (self._target(t, part, values["delay"]) if late else self.ctrl[t]).astype(np.float32)
+                torque = servo_torque(law, kp, aim + offset, q)
+                torque = np.minimum(np.maximum(torque - kd * w if driven else torque, -limit), limit)
+                load = slope * q + weight
+                most = friction_limit(law, dry, w, torque, load)
+                net = torque - load - pull - own * w
+                w = w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
                 q = q + h * w
             touch = self.touch[t + 1]
             if touch.any():  # goes on from the recording
@@ -100,8 +121,6 @@ class JointRuns:
 
     def _target(self, t: int, part: int, delay: Array) -> Array:
         """The command in force in a physics step, (k or 1, windows, n); a part of it where it changes on the way."""
-        if not delay.any():
-            return self.ctrl[t][None]
         at = part / self.count - delay / self.dt  # rows from t
         row = np.floor(at)
         late = np.clip((at - row - 1) * self.count + 1, 0, 1)
@@ -111,11 +130,6 @@ class JointRuns:
             if share.any():
                 out += share[:, None] * self.ctrl[min(max(t + r, 0), len(self.ctrl) - 1)]
         return out
-
-    def cost(self, errors: Array) -> Array:
-        """Soft mean square, (k, n)."""
-        soft = np.sqrt(1 + (errors / SOFT) ** 2) - 1
-        return np.asarray(soft.sum(axis=(0, 2)) / max(self.counted.sum(), 1))
 
 
 class Along:
@@ -158,6 +172,13 @@ class Along:
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         return self.data.qfrc_bias.copy()
+
+
+NONE = np.zeros(1, np.float32)
+
+
+def _filled(x: Array, shape: tuple[int, ...]) -> Array:
+    return np.array(np.broadcast_to(x, shape), np.float32)
 
 
 SPARSE = 5  # rows that share the slope of gravity's torque

@@ -22,7 +22,9 @@ SLOWEST = 1e-3  # rad/s: of stribeck_speed
 
 def friction_limit(law: Law, frictionloss: Array, qvel: Array, torque: Array, load: Array) -> Array:
     """The most that friction takes, N·m, at a speed, under the motor's torque and gravity's."""
-    limit = frictionloss + np.abs(law["friction_motor"] * torque + law["friction_external"] * load)
+    limit = frictionloss
+    if law["friction_motor"].any() or law["friction_external"].any():
+        limit = limit + np.abs(law["friction_motor"] * torque + law["friction_external"] * load)
     if law["stribeck"].any():
         limit = limit + law["stribeck"] * np.exp(-np.abs(qvel) / np.maximum(law["stribeck_speed"], SLOWEST))
     return limit

@@ -17,9 +17,9 @@ from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.evolve import evolve
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
+from gaponet.sim.multistart import better_half, descend, soft
 from gaponet.sim.replay import idle_limbs
 from gaponet.sim.table import write_table
 
@@ -27,8 +27,9 @@ Array = np.ndarray
 
 CLEARANCE = 0.045  # m above the lowest tip, or the table, in which a joint's zero may hide a contact
 WINDOW = 5.0  # s
-WINDOWS, PER_MOTION, GENERATIONS = 14, 2, 30
-HEIGHTS = 10  # tried first, from the lowest tip upwards
+WINDOWS, PER_MOTION = 14, 2
+HEIGHTS, STARTS = 10, 4  # tried first, from the lowest tip upwards, and from how many of them fits start
+SEARCH = (4, 6)  # iterations: of all starts, of the better half
 STEP = 0.005  # m between them
 ZERO, PRICE = 0.02, 2e-4  # rad: an ordinary zero, and what it costs (soft square of one for a window)
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
@@ -110,7 +111,7 @@ def fit_table(
         robot: Servos and all; with a table its height is taken as measured.
         lowest: Tip height in them, m.
         nthread: Threads, 0 for all cores.
-        progress: Called with the least error of each generation, rad.
+        progress: Called in each iteration with the root mean square error, rad.
     """
     if not parts:
         return Touch(robot, False, np.zeros(0), np.zeros(0), ())
@@ -123,19 +124,25 @@ def fit_table(
     before = scene.errors(away)
     guesses = np.repeat(away, HEIGHTS, axis=0)
     guesses[:, 0] = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else measured.height
-    start = guesses[scene.cost(scene.errors(guesses)).argmin()]
-    free = 0.0 if measured is not None else 1.0
+    starts = guesses[np.argsort(soft(scene.soft_errors(guesses)))[:STARTS]]
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
-    low = np.array([start[0] - free * 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
-    high = np.array([start[0] + free * 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
+    low = np.array([starts[0, 0] - 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
+    high = np.array([starts[0, 0] + 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
+    if measured is not None:
+        low[0] = high[0] = measured.height
+    price = np.sqrt(2 * PRICE * scene.counted.sum() * n)
 
-    def cost(xs: Array) -> Array:
+    def errors(xs: Array) -> Array:
         x = xs[:, 0] * unit
-        errors = scene.errors(x)
-        progress(float(scene.mean(errors).mean(axis=1).min()))
-        return (scene.cost(errors) + PRICE * np.square(x[:, 3:] / ZERO).sum(axis=1))[:, None]
+        return np.append(scene.soft_errors(x), price * x[:, 3:] / ZERO, axis=1)[:, None].astype(np.float32)
 
-    best = evolve((start / unit)[None], low / unit, high / unit, cost, GENERATIONS)[0] * unit
+    def tell(cost: Array) -> None:
+        progress(SOFT * float(np.sqrt(2 * cost.mean() / (scene.counted.sum() * n))))
+
+    x = starts[:, None] / unit
+    for iterations in SEARCH:
+        x = better_half(*descend(x, low[None] / unit, high[None] / unit, errors, iterations, tell))
+    best = x[0, 0] * unit
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
     kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
     found = robot
@@ -184,11 +191,10 @@ class Scene:
             out[t] = sim.qpos[:, self.at].reshape(k, m, -1) - self.real[t + 1]
         return out * self.counted[:, None, :, None]
 
+    def soft_errors(self, xs: Array) -> Array:
+        """The same in SOFT, (k, rows)."""
+        return np.asarray(np.moveaxis(self.errors(xs), 1, 0).reshape(len(xs), -1) / np.float32(SOFT))
+
     def mean(self, errors: Array) -> Array:
         """Mean |error| by window, (k, windows) rad."""
         return np.asarray(np.abs(errors).mean(axis=3).sum(axis=0) / self.counted.sum(axis=0))
-
-    def cost(self, errors: Array) -> Array:
-        """Soft mean square, (k,)."""
-        soft = np.sqrt(1 + (errors / SOFT) ** 2) - 1
-        return np.asarray(soft.sum(axis=(0, 2, 3)) / (self.counted.sum() * len(self.op)))
