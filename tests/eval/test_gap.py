@@ -1,12 +1,14 @@
 """Where the gap comes from: steps, causes and floor."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from arm import recordings, write_arm
 from runs import untrained
 
+from gaponet.data.repeatability import periods
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import LEARNED
@@ -15,6 +17,7 @@ from gaponet.eval.gap_figure import waterfall
 from gaponet.eval.run_files import read_gap
 from gaponet.metrics import Run
 from gaponet.sim.model import model_hash
+from gaponet.sim.replay import replay
 
 
 def test_the_encoder_step_is_read_off_the_recordings():
@@ -26,8 +29,6 @@ def test_the_encoder_step_is_read_off_the_recordings():
 
 
 def test_the_floor_is_what_two_repetitions_differ_by(tmp_path):
-    from dataclasses import replace
-
     robot = write_arm(tmp_path / "arm")
     first = recordings(robot, 1, rows=400)[0]
     noise = np.random.default_rng(1).normal(0, 0.002, (2, *first.qpos.shape))
@@ -79,7 +80,7 @@ def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
     robot = write_arm(tmp_path / "arm")
     found = robot.with_servos({"elbow": {"kp": 15.0, "frictionloss": 0.1, "stribeck": 0.05, "stribeck_speed": 0.1}})
     steps = causes(found)
-    assert [name for name, _ in steps] == ["gain", "friction", "stribeck"]
+    assert [name for name, _ in steps] == ["gain", "friction", "creep", "stribeck"]
     assert model_hash(steps[-1][1]) == model_hash(found)
     assert steps[0][1].frictionloss[1] != 0.1
     assert causes(robot) == []
@@ -92,3 +93,27 @@ def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
     assert removed(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
     less, error = removed({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})["gain"]
     assert (less, error) == pytest.approx((0.02, 0.01 / np.sqrt(3)), abs=1e-6)
+
+
+def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    once = recordings(robot, 1, rows=60)[0]
+    start, noise = once.ctrl[:1] + 0.3, np.random.default_rng(1).normal(0, 0.002, (270, 2))
+    qpos = np.concatenate([np.tile(once.qpos, (5, 1))[:270] + noise, once.qpos[:1]])
+    thrice = replace(once, ctrl=np.tile(once.ctrl, (5, 1))[:270], qpos=qpos[:270].astype(np.float32),
+                     qvel=np.zeros((270, 2), np.float32))  # fmt: skip
+    assert [len(p) for p in periods(thrice)] == [60, 60, 60]  # without the first, and the last is not whole
+    for joint in floor([thrice], robot).values():
+        assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
+    assert not periods(once)
+    assert not periods(replace(thrice, ctrl=np.concatenate([thrice.ctrl[:-1], start])))
+
+
+def test_friction_creeps_where_it_is_asked_to(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    stiff = {"kp": 20.0, "frictionloss": 2.0, "armature": 0.002}
+    heavy = robot.with_servos(dict.fromkeys(robot.joint_names, stiff))
+    still = recordings(robot, 1, rows=100)[0]
+    held = replace(still, ctrl=np.repeat(still.qpos[:1] + 0.05, 100, axis=0), qvel=np.zeros_like(still.qvel))
+    moved = [np.abs(np.ptp(replay([held], heavy, creeps=c)[0].qpos, axis=0)).max() for c in (False, True)]
+    assert moved[1] > 5 * moved[0]

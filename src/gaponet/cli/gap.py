@@ -52,14 +52,15 @@ def _show_steps(out: Out, found: dict[str, Any]) -> None:
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
     panels = {"all joints": found} | found["by_joint"]
     out.table(f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
-              ["", *map(title, steps), "floor"], [
-        *([j, *(_left(v, s) for s in steps), mrad(v["floor"]["both"])] for j, v in panels.items()),
-        *([f"{p} kg", *(mrad(v[s]) for s in steps), ""] for p, v in found["by_payload"].items()),
+              ["", *map(title, steps), "floor", "unexplained"], [
+        *([j, *(_left(v, s) for s in steps), mrad(v["floor"]["both"]), mrad(v["unexplained"])]
+          for j, v in panels.items()),
+        *([f"{p} kg", *(mrad(v[s]) for s in steps), "", ""] for p, v in found["by_payload"].items()),
     ])  # fmt: skip
     out.say("in brackets: what the step removes ± its standard error over motions")
     if found["floor"]["repeatability"] is None:
         rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
-        out.say(f"floor: {rest}; no motion was recorded twice, so repeatability is unknown")
+        out.say(f"floor: {rest}; no motion was recorded twice or repeats itself: repeatability is unknown")
 
 
 def _left(panel: dict[str, Any], step: str) -> str:

@@ -11,6 +11,7 @@ from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 
 SAME_COMMAND = 1e-3  # rad; repetitions whose commands differ by more somewhere were not asked for the same thing
+SHORTEST = 0.5  # s: of a period
 MOVED = 0.02  # rad; joints commanded to move by less say nothing
 REPEATED = ("qpos", "qvel", "tau", "temperature")
 
@@ -56,6 +57,20 @@ class Repetitions:
         """Over repetitions, averaged over rows, (n); None where the channel was not recorded."""
         squares = self._squares.get(channel)
         return None if squares is None else squares.mean(axis=0) / (self.count - 1)
+
+
+def periods(sequence: Sequence) -> list[Sequence]:
+    """A motion's periods after the first one, in which the robot came from elsewhere; none where it does not repeat."""
+    ctrl = sequence.ctrl
+    rows = len(ctrl)
+    for period in range(max(1, round(SHORTEST / sequence.dt)), rows // 3 + 1):
+        later, sparse = np.arange(rows - period), slice(None, None, 97)  # most are ruled out by a few rows
+        if all(np.abs(ctrl[period:][k] - ctrl[later][k]).max() <= SAME_COMMAND for k in (sparse, slice(None))):
+            break
+    else:
+        return []
+    starts = range(period, rows - period + 1, period) if np.ptp(ctrl, axis=0).max() > MOVED else ()
+    return [sequence.rows(slice(a, a + period)) for a in starts]
 
 
 def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from functools import partial
@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.data.repeatability import Repetitions, summary
+from gaponet.arrays import Array
+from gaponet.data.repeatability import Repetitions, periods, summary
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
@@ -38,8 +39,9 @@ def gap_by_step(
     """Mean |error| left after each step, in free run over whole motions that the run never saw.
 
     Steps: nominal; delay (fitted on the training motions); offset (delay and offset); where the run starts from an
-    identified simulator its CAUSES, one after the other; the run's model. Standard errors are over motions, of what a
-    step removes motion by motion (paired); what causes remove depends on their order.
+    identified simulator its CAUSES, one after the other, and that friction holds ("creep": "friction" itself creeps as
+    MuJoCo's does); the run's model. Standard errors are over motions, of what a step removes motion by motion (paired);
+    what causes remove depends on their order. "unexplained" is what is left above the floor.
 
     Args:
         run: Run folder; its split, baseline, simulator and model apply.
@@ -49,9 +51,9 @@ def gap_by_step(
         progress: Called with step, control steps done, total.
 
     Returns:
-        {"left": {step: rad}, "removed": {step: [rad, standard error]}, "by_joint": {joint: the same and "floor"},
-        "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …};
-        a floor that is unknown is None.
+        {"left": {step: rad}, "removed": {step: [rad, standard error]}, "unexplained": rad, "by_joint": {joint: the same
+        and "floor"}, "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad},
+        …}; a floor that is unknown is None, and so is what is left above it.
     """
     dataset.require_robot(robot)
     simulator = corrected_robot(run, robot)
@@ -67,18 +69,25 @@ def gap_by_step(
     steps.append((method(model.config.kind, simulator), simulator, model.corrector(simulator)))
     done = {}
     for name, physics, corrector in steps:
-        twins = replay(sequences, physics, corrector, lock_idle=True, progress=partial(progress, name))
+        tell = partial(progress, name)
+        twins = replay(sequences, physics, corrector, lock_idle=True, progress=tell, creeps=name == "friction")
         done[name] = runs(sequences, [t.qpos for t in twins], robot)
     payloads = sorted({s.meta.payload_mass for s in sequences})
     columns = {j: [i] for i, j in enumerate(robot.operated)}
-    floors = floor(sequences, robot)
+    units = {s.meta.unit_id for s in sequences}
+    others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
+    floors = floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
+    floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
+    last = list(done)[-1]
     return {
         "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
         "removed": removed(done),
+        "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
         "by_joint": {
             j: {
                 "left": {n: metrics(part, c)["mpjae"] for n, part in done.items()},
                 "removed": removed(done, c),
+                "unexplained": _above(metrics(done[last], c)["mpjae"], floors[j]["both"]),
                 "floor": floors[j],
             }
             for j, c in columns.items()
@@ -89,7 +98,7 @@ def gap_by_step(
             }
             for p in payloads
         },
-        "floor": {key: _mean([f[key] for f in floors.values()]) for key in ("encoder", "repeatability", "both")},
+        "floor": floors["all"],
         "virtual": any(s.meta.virtual for s in sequences),
         "unseen": unseen,
         "sequences": len(sequences),
@@ -100,7 +109,7 @@ def gap_by_step(
 
 # What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
 CAUSES = {
-    "gain": ("kp", "damping", "armature", "delay", "offset"),
+    "gain": ("kp", "damping", "armature", "delay", "offset", "effort_limit"),
     "friction": ("frictionloss",),
     "stribeck": ("stribeck", "stribeck_speed"),
     "load": ("friction_motor", "friction_external"),
@@ -123,7 +132,7 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
         if cause == "contact":
             changed = replace(changed, table=simulator.table)
         if model_hash(changed) != model_hash(robot):
-            steps.append((cause, changed))
+            steps += [(cause, changed)] if cause != "friction" else [(cause, changed), ("creep", changed)]
         robot = changed
     return steps
 
@@ -136,21 +145,26 @@ def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dic
     return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
 
 
-def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
+def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
     """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
 
-    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition to
-    the next differs from its own mean by √(2/π)·σ on average, encoder included.
+    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition, or
+    from one period of a motion, to the next differs from its own mean by √(2/π)·σ on average, encoder included.
     """
     groups: dict[Any, Repetitions] = defaultdict(Repetitions)
+    angles: list[Array] = []
     for s in sequences:
         m = s.meta
-        groups[m.motion, m.unit_id, m.payload_mass, m.payload_side, round(s.dt * 1e6)].add(s)
+        angles.append(s.qpos[:, robot.operated_index])
+        same = (m.motion, m.unit_id, m.payload_mass, m.payload_side, round(s.dt * 1e6))
+        groups[same].add(s)
+        for period in periods(s):
+            groups[*same, "period"].add(period)
     repeated = [g for g in groups.values() if g.count > 1]
     spread = summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
     found: dict[str, dict[str, float | None]] = {}
-    for joint, column in zip(robot.operated, robot.operated_index, strict=True):
-        encoder = encoder_step([s.qpos[:, column] for s in sequences]) / 4 or None
+    for i, joint in enumerate(robot.operated):
+        encoder = encoder_step([a[:, i] for a in angles]) / 4 or None
         again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
         found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
     return found
@@ -159,3 +173,7 @@ def floor(sequences: ListOf[Sequence], robot: RobotSpec) -> dict[str, dict[str, 
 def _mean(values: ListOf[float | None]) -> float | None:
     known = [v for v in values if v is not None]
     return float(np.mean(known)) if len(known) == len(values) else None
+
+
+def _above(left: float, floor: float | None) -> float | None:
+    return None if floor is None else max(left - floor, 0.0)

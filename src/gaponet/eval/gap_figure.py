@@ -60,6 +60,7 @@ def _panel(ax: Any, steps: list[str], left: dict[str, float], floor: float | Non
     ax.annotate(f"{left[steps[0]]:.1f}", (0, left[steps[0]]), ha="center", va="bottom", fontsize=7)
     known = floor is not None and floor == floor  # absent numbers are read as NaN
     if floor is not None and known:
+        ax.bar(len(steps), min(1e3 * floor, before), color=FLOOR)
         ax.axhline(1e3 * floor, ls=(0, (4, 2)), lw=0.8, color=FLOOR)
     ax.set_title(f"floor {1e3 * floor:.1f}" if floor is not None and known else "floor –", loc="right", fontsize=7,
                  fontweight="normal", color=FLOOR)  # fmt: skip

@@ -39,7 +39,7 @@ FIRST_DELAY = 0.02  # s: a delay of zero hides what it does
 MAX_DELAY = 0.15  # s
 AGAIN, AGAIN_STEPS, BESIDE = 8, 6, 1.0  # fits for the standard errors, their iterations, how far beside they begin
 WIDE = 0.25  # a standard error so large, of the value and of its scale: not determined
-HEAVY = 2e-4  # price of kp or armature e times the given one: both trade against all the others
+PRICES = {"kp": 2e-3, "armature": 2e-4}  # of e times the given one: both trade against all the others
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
@@ -253,14 +253,12 @@ class Fit:
         return lambda cost: tell(SOFT * float(np.sqrt(2 * cost.mean() / rows)))
 
     def errors(self, values: Values, runs: JointRuns) -> Array:
-        """Of (k, n) values, (k, n, windows · rows), in SOFT; then the prices of kp and armature, two more."""
+        """Of (k, n) values, (k, n, windows · rows), in SOFT; then, two more, what kp and armature cost."""
         found = np.moveaxis(runs.errors(values), (1, 3, 2, 0), (0, 1, 2, 3)) / np.float32(SOFT)
-        price = np.sqrt(2 * HEAVY * runs.counted.sum())
         given = {f: np.where(v > 0, v, np.nan) for f, v in (("kp", self.first["kp"]), ("armature", self.armature))}
-        far = [np.nan_to_num(np.log(values[f] / given[f])) for f in given]
-        return np.concatenate(
-            [found.reshape(*found.shape[:2], -1), price * np.stack(far, axis=-1)], axis=2, dtype=np.float32
-        )
+        far = [np.nan_to_num(np.log(values[f] / v)) * np.sqrt(2 * PRICES[f]) for f, v in given.items()]
+        far = np.sqrt(runs.counted.sum()) * np.stack(far, axis=-1)
+        return np.concatenate([found.reshape(*found.shape[:2], -1), far], axis=2, dtype=np.float32)
 
     def mean_error(self, values: Values) -> float:
         """Of the windows, rad."""

@@ -7,6 +7,7 @@ import math
 
 import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.identity import lines
@@ -21,6 +22,7 @@ from gaponet.sim.table import add_table, soften_table
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
+LOOSE_IMPEDANCE = 0.999
 TOLERANCE = 1e-10
 
 PAYLOAD_DENSITY = 7850.0  # standard payload: a solid steel ball, kg/m³
@@ -71,6 +73,12 @@ def build_model(
 def stiffen_friction(model: mujoco.MjModel) -> None:
     """Make friction hold; once after each compilation or mj_setConst, which undo it."""
     model.dof_invweight0 *= STIFF_MOBILITY
+
+
+def loosen_friction(batch: Batch) -> None:
+    """Undo it in a batch's simulations: friction creeps with MuJoCo's own mobility and impedance."""
+    batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
+    batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
 
 
 def build_spec(

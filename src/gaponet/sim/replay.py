@@ -12,7 +12,7 @@ from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.model import idle_joints, model_hash
+from gaponet.sim.model import idle_joints, loosen_friction, model_hash
 
 Array = np.ndarray
 CHUNK = 256  # simulations side by side
@@ -37,6 +37,7 @@ def replay(
     nthread: int = 0,
     progress: Progress | None = None,
     lock_idle: bool = False,
+    creeps: bool = False,
 ) -> list[Twin]:
     """Step every sequence's commands from its first recorded state; the recording is not looked at again.
 
@@ -47,6 +48,7 @@ def replay(
         nthread: Threads, 0 for all cores.
         progress: Called now and then.
         lock_idle: Clamp limbs that no command moves: faster, the same for all others to rounding, home for those.
+        creeps: Friction creeps as MuJoCo's own does, to see what that takes.
 
     Returns:
         One twin per sequence, in order.
@@ -62,7 +64,7 @@ def replay(
             if progress is not None:
                 progress(before + k, total)
 
-        runs = _free_run(part, robot, corrector, nthread, tell, locked[chunk[0]])
+        runs = _free_run(part, robot, corrector, nthread, tell, locked[chunk[0]], creeps)
         twins |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [twins[i] for i in range(len(sequences))]
@@ -102,10 +104,13 @@ def _free_run(
     nthread: int,
     progress: Callable[[int], None],
     locked: tuple[str, ...],
+    creeps: bool,
 ) -> list[Twin]:
     """Sequences in order of falling length: those still running are always a prefix."""
     lengths = np.array([len(s) for s in sequences])
     sim = BatchSim(robot, [Condition.of(s, robot) for s in sequences], nthread, locked)
+    if creeps:
+        loosen_friction(sim.batch)
     free = robot.index(sim.joint_names)
     ctrl = np.zeros((lengths[0], len(sequences), len(robot.joint_names)))
     out = np.zeros((4, *ctrl.shape))
