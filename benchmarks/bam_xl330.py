@@ -1,6 +1,6 @@
 """A servo's law fitted at three gains and judged at the fourth: docs/results/bam_xl330.md.
 
-    python benchmarks/bam_xl330.py LOGS WORK          # 4 gains held out in turn × 3 laws, some minutes each
+    python benchmarks/bam_xl330.py LOGS WORK          # 4 gains held out in turn × 4 laws, some minutes each
     python benchmarks/bam_xl330.py LOGS WORK --page   # the tables
 
 LOGS: BAM's logs of one XL330 on a pendulum at four gains. Whole recordings in free run, ± standard error over them.
@@ -25,7 +25,8 @@ from gaponet.sim.replay import replay
 LAWS = {
     "classic": ("limit",),
     "+ Stribeck": ("limit", "stribeck"),
-    "+ load": ("limit", "stribeck", "load", "external"),
+    "+ load": ("limit", "load", "external"),
+    "+ load + Stribeck": ("limit", "load", "external", "stribeck"),
 }
 
 

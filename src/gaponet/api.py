@@ -199,6 +199,7 @@ def identify(
     holdout_units: tuple[str, ...] = (),
     terms: tuple[str, ...] = ("stribeck", "load"),
     table: bool = True,
+    shared: bool = False,
     threads: int = 0,
 ) -> Identification:
     """Fit the servos of the simulator, and what the robot touches, to the training motions.
@@ -214,6 +215,7 @@ def identify(
         holdout_units: Units to leave out, as in training.
         terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
+        shared: Give joints with one type of servo ([[servo]] in robot.toml) one law; what it costs is said.
         threads: For the table, 0 for all cores.
 
     Raises:
@@ -233,7 +235,7 @@ def identify(
     parts = split_entries(data, tuple(sorted((held - set(units) if units else set()) | set(holdout_units))))
     began, val = time.monotonic(), data.sequences(parts["val"])
     with writing(Path(out), "robot"), bar("identifying") as update:
-        found = fit(data.sequences(parts["train"]), spec, val, windows, terms, table, threads, update)
+        found = fit(data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update)
         save_robot(found.robot, Path(out))
     seconds, op = time.monotonic() - began, spec.operated_index
 

@@ -18,10 +18,10 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import JointMismatchError, RobotError
-from gaponet.robot_table import PayloadMount, RobotTable, Table, Tip
+from gaponet.robot_table import PayloadMount, RobotTable, ServoType, Table, Tip
 from gaponet.structure import read_toml
 
-__all__ = ["PayloadMount", "RobotSpec", "Table", "Tip", "available", "load_robot"]
+__all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "available", "load_robot"]
 
 BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
@@ -63,6 +63,7 @@ class RobotSpec:
         friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
         min_torque: Least torque of a motor that turns at all, (n), N·m.
         encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
+        servos: Type of each joint's servo, (n); None where robot.toml does not say.
         tips, table: What may touch, and the table, without which nothing does.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
     """
@@ -96,6 +97,7 @@ class RobotSpec:
     friction_external: Array = field(default_factory=lambda: np.array(0.0))
     min_torque: Array = field(default_factory=lambda: np.array(0.0))
     encoder_step: Array = field(default_factory=lambda: np.array(0.0))
+    servos: tuple[ServoType | None, ...] = ()
     tips: tuple[Tip, ...] = ()
     table: Table | None = None
     nominal: RobotSpec | None = None
@@ -114,6 +116,7 @@ class RobotSpec:
                 raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
             value.flags.writeable = False
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "servos", self.servos or (None,) * n)
         if len(set(self.joint_names)) != n:
             raise RobotError(f"{self.name}: a joint name appears twice in {', '.join(self.joint_names)}")
         if not self.operated:
@@ -259,6 +262,16 @@ def _folder(name_or_path: str | Path) -> Path:
     return packaged
 
 
+def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
+    """Of each joint."""
+    known: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
+    for joint in table.joint:
+        if joint.servo not in known:
+            there = ", ".join(s.name for s in table.servo) or "none"
+            raise RobotError(f"joint '{joint.name}': servo '{joint.servo}' is no [[servo]]; there are: {there}")
+    return tuple(known[joint.servo] for joint in table.joint)
+
+
 def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     joints = table.joint
     robot = RobotSpec(
@@ -277,6 +290,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         payload_mounts=table.payload_mount,
         dt=table.dt,
         timestep=table.timestep,
+        servos=_servo_types(table),
         tips=table.tip,
         table=table.table,
     )

@@ -25,7 +25,25 @@ class Joint:
     home: Angle = 0.0  # rad
     operated: bool = True
     log_unit: Literal["rad", "deg", "fraction"] = "rad"
+    servo: str = ""  # name of a [[servo]]
     aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ServoType:
+    """One [[servo]]: a type that joints name, and what others measured of it, with the source."""
+
+    name: Name
+    source: str = ""
+    damping: Gain | None = None  # N·m·s/rad
+    armature: Gain | None = None  # kg·m²
+    frictionloss: Gain | None = None  # N·m
+
+    @property
+    def published(self) -> dict[str, float]:
+        """Field → value, where there is one."""
+        found = {"damping": self.damping, "armature": self.armature, "frictionloss": self.frictionloss}
+        return {name: value for name, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -85,6 +103,7 @@ class RobotTable:
     dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
     joint: Annotated[tuple[Joint, ...], Len(1, 500)]
+    servo: Annotated[tuple[ServoType, ...], Len(0, 50)] = ()
     payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None

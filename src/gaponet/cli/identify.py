@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet import api
-from gaponet.cli.options import Data, Json, Robot, like
+from gaponet.cli.options import Data, Flag, Json, Robot, like
 from gaponet.cli.out import Out, writes
 from gaponet.eval.tables import mrad
 from gaponet.metrics import standard_error
@@ -46,6 +46,7 @@ def identify(
     windows: int = 40,
     terms: tuple[Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"], ...] = ("stribeck", "load"),
     table: bool = True,
+    shared: Flag = False,
     threads: int = 0,
     robot: Robot = None,
     units: tuple[str, ...] = (),
@@ -60,7 +61,7 @@ def identify(
         terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
     """
     screen = Out(json)
-    made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, threads)
+    made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, shared, threads)
     found = made.found
     _tell(screen, found, made.val)
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")
@@ -68,6 +69,9 @@ def identify(
         "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
         "terms": {t.name: {"gain": t.gain[0], "standard_error": t.gain[1], "kept": t.kept} for t in found.tried},
+        "shared": {
+            t.name: {"own": t.before.mean(), "one": t.after.mean(), "standard_error": t.gain[1]} for t in found.shared
+        },
         "table": vars(found.robot.table) if found.robot.table else None,
         "touching": list(found.touch.motions) if found.touch else [],
         "warnings": list(found.warnings), "seconds": made.seconds, "robot": str(out),
@@ -78,7 +82,11 @@ def _values(found: Identified) -> dict[str, dict[str, float]]:
     """Joint → field → value of the fields that say something."""
     robot = found.robot
     return {
-        joint: {f: float(getattr(robot, f)[i]) for f in COLUMNS if np.isfinite(getattr(robot, f)[i])}
+        joint: {
+            f: float(getattr(robot, f)[i])
+            for f in COLUMNS
+            if np.isfinite(getattr(robot, f)[i]) and (f != "effort_limit" or f in found.std[joint])
+        }
         for joint, i in zip(robot.operated, robot.operated_index, strict=True)
     }
 
@@ -90,6 +98,9 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
     for start in range(0, len(shown), WIDE):
         part = shown[start : start + WIDE]
         rows = [[j, *(_cell(v.get(f), found.std[j].get(f), COLUMNS[f][1]) for f in part)] for j, v in values.items()]
+        for servo in dict.fromkeys(filter(None, (found.robot.servos[i] for i in found.robot.operated_index))):
+            known = [_cell(servo.published.get(f), None, COLUMNS[f][1]) for f in part]
+            rows += [[f"published for {servo.name}, {servo.source}", *known]] * any(known)
         title = "Identified servos" if start == 0 else "The same"
         screen.table(f"{title}, ± standard error", ["joint", *(COLUMNS[f][0] for f in part)], rows)
     for term in found.tried:
@@ -98,6 +109,10 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
         screen.say(
             f"{term.name}: validation error falls by {fell} ± {error} mrad over {len(term.before)} motions; {kept}"
         )
+    for law in found.shared:
+        own, one = (mrad(e.mean()) for e in (law.before, law.after))
+        costs = f"{mrad(-law.gain[0])} ± {mrad(law.gain[1])}"
+        screen.say(f"one law for every {law.name}: {own} → {one} mrad over {len(law.before)} motions, costs {costs}")
     if found.touch is not None and found.touch.motions:
         touch, table = found.touch, found.robot.table
         what = "none that explains them"

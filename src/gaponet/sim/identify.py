@@ -24,6 +24,8 @@ from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import better_half, descend
 from gaponet.sim.refit import cut
+from gaponet.sim.shared import ITERATIONS as SHARED_ITERATIONS
+from gaponet.sim.shared import far_from_published, same_servos, share
 from gaponet.sim.touching import SEARCH as TABLE_SEARCH
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 
@@ -89,6 +91,7 @@ class Identified:
         std: Joint → field → standard error.
         tried: The terms of the law in the order tried.
         touch: What was found about the table; None where nothing may touch.
+        shared: Type of servo whose joints were given one law, with the errors before and after.
     """
 
     robot: RobotSpec
@@ -98,6 +101,7 @@ class Identified:
     std: Std
     tried: tuple[Tried, ...]
     touch: Touch | None
+    shared: tuple[Tried, ...] = ()
 
 
 def identify(
@@ -107,6 +111,7 @@ def identify(
     windows: int = WINDOWS,
     terms: tuple[str, ...] = DEFAULT_TERMS,
     table: bool = True,
+    shared: bool = False,
     nthread: int = 0,
     progress: Progress = lambda done, total, note: None,
 ) -> Identified:
@@ -119,11 +124,13 @@ def identify(
         windows: Free runs of 8 s, taken evenly from the recordings.
         terms: Of the servo's law, from TERMS, in the order in which they are tried.
         table: Look for a table under the robot's tips.
+        shared: In the end give joints with one type of servo (robot.servos) one law.
         nthread: Threads for the table, 0 for all cores.
         progress: Called in each iteration.
     """
-    each = sum(SEARCH)
-    before_table = each * (1 + len(terms)) + AGAIN_STEPS
+    each, same = sum(SEARCH), same_servos(robot) if shared else {}
+    before_shared = each * (1 + len(terms)) + AGAIN_STEPS
+    before_table = before_shared + SHARED_ITERATIONS * len(same)
     total = before_table + sum(TABLE_SEARCH) * bool(table and robot.tips)
 
     def tell(what: str, done: int) -> Callable[[float], None]:
@@ -149,14 +156,21 @@ def identify(
         tried.append(Tried(term, *(motion_errors(judge, v) for v in (values, richer))))
         if tried[-1].kept:
             values = richer
-    std = fit.uncertainty(values, tell("standard errors", before_table - AGAIN_STEPS))
+    std = fit.uncertainty(values, tell("standard errors", before_shared - AGAIN_STEPS))
+    common = []
+    for i, (servo, places) in enumerate(same.items()):
+        armature, step = float(fit.first["armature"][places].mean()), before_shared + SHARED_ITERATIONS * i
+        mine = share(fit.runs, values, places, armature, tell(f"one {servo}", step))
+        common.append(Tried(servo, *(motion_errors(judge or fit.runs, v) for v in (values, mine))))
+        values = mine
     found = fit.robot(values)
     touch = None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
         touch = fit_table(low, found, lowest, nthread, tell("table", before_table))
         found = touch.robot
-    return Identified(found, before, fit.mean_error(values), fit.doubts(values, std), std, tuple(tried), touch)
+    doubts = (*fit.doubts(values, std), *far_from_published(found))
+    return Identified(found, before, fit.mean_error(values), doubts, std, tuple(tried), touch, tuple(common))
 
 
 class Axes:
