@@ -114,8 +114,8 @@ def test_compare_puts_models_and_seeds_into_one_table_and_keeps_what_is_there(pl
     words += [*TRAIN, "--budget", "900", "--warm-start.rounds", "1", "--identify"]
     result, err = run(place, capsys, *words)
     totals = {row[0]: row[2] for row in result["tables"]["totals"]["rows"]}
-    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP"]
-    assert totals["MLP"]["count"] == 2
+    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP, full coupling"]
+    assert totals["MLP, full coupling"]["count"] == 2
     assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
     assert result["facts"]["unseen"] is True
     assert "VIRTUAL" in err

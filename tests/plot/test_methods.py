@@ -16,7 +16,7 @@ def test_every_method_that_is_measured_has_a_name_and_a_colour_of_its_own():
 
 def test_a_word_says_where_a_model_starts_and_what_is_changed_in_it():
     assert title("identified+gaponet") == "identification + GAPONet"
-    assert title("mlp:mlp_match=on") == "MLP, as many weights"
+    assert title("mlp:mlp_match=on") == "MLP, full coupling, as many weights"
     assert title("gaponet:history=8:payload_input=off") == "GAPONet, mass not told (history 8)"
     assert title("someone's") == "someone's"
 

@@ -43,7 +43,16 @@ def test_the_main_table_has_spread_ratio_and_the_worst_payload(result):
     rows = made.texts()
     assert rows[0][2:6] == ["20.00", "1.00", "0.02", "30.00 (3 kg)"]
     # Means of the seeds are 7.5 and 17.5 mrad: 12.5 ± 10/√2; at 3 kg 10 and 30.
-    assert rows[2] == ["MLP", "1.23 k", "12.50 ± 7.07", "0.62", "0.01", "20.00 ± 14.14 (3 kg)", "30.00 ± 0.00", "1.5"]
+    assert rows[2] == [
+        "MLP, full coupling",
+        "1.23 k",
+        "12.50 ± 7.07",
+        "0.62",
+        "0.01",
+        "20.00 ± 14.14 (3 kg)",
+        "30.00 ± 0.00",
+        "1.5",
+    ]
 
 
 def test_payloads_are_in_order_of_mass_and_new_units_are_named(result):

@@ -37,7 +37,9 @@ def test_the_least_that_comes_close_to_everything_is_enough(make_study, make_fou
         cells[word, ""] = [SimpleNamespace(folder=folder.parent)]
     base = {"nominal": found(0.010)[0], "delay_offset": found(0.008)[0]}
     made = Data(("mlp",), shares).result(make_study(), make_found(runs, base, cells))
-    assert made.sentences[0].startswith("MLP: 0.20 of the nominal error is left with 60 minutes of recordings")
+    assert made.sentences[0].startswith(
+        "MLP, full coupling: 0.20 of the nominal error is left with 60 minutes of recordings"
+    )
     assert says in made.sentences[0]
     assert made.tables[0].texts()[2][:2] == ["4", "60.00"]
     assert [t.get_text() for t in made.figures["data"].axes[0].get_xticklabels()] == ["15", "30", "60"]

@@ -105,17 +105,6 @@ def test_a_cell_kept_from_another_set_up_is_refused(data, arm, tmp_path):
         cells(data, arm, tmp_path / "out", budget="641")
 
 
-def test_a_cell_from_before_a_field_existed_had_its_default(data, arm, tmp_path):
-    (cell,) = cells(data, arm, tmp_path / "out")
-    setup = cell.setup(data)
-    del setup["config"]["train_share"], setup["config"]["model"]["num_basis"]
-    cell.folder.mkdir(parents=True)
-    (cell.folder / SETUP).write_text(json.dumps(setup))
-    assert cells(data, arm, tmp_path / "out")
-    with pytest.raises(UsageError, match="another config"):
-        cells(data, arm, tmp_path / "out", base=replace(SMALL, train_share=0.5))
-
-
 def test_a_model_named_twice_is_refused(data, arm, tmp_path):
     with pytest.raises(UsageError, match="'mlp' is there twice"):
         cells(data, arm, tmp_path / "out", ("mlp", "gaponet", "mlp"))

@@ -31,7 +31,7 @@ def test_a_unit_is_known_in_the_folds_that_left_out_another(make_study, make_fou
     assert texts[1] == ["b", "10.00", "8.00", "6.00 ± 1.41", "2.00", "0.60 ± 0.14"]
     assert texts[2][3] == "5.00 ± 1.41"  # 4 and 6: over units
     assert made.sentences == (
-        "MLP leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when trained on.",
+        "MLP, full coupling leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when trained on.",
     )
 
 
@@ -41,4 +41,4 @@ def test_a_model_that_is_worse_than_nominal_is_called_so_and_two_are_compared_un
     folds = make_found(runs, {"nominal": found(0.010), "delay_offset": found(0.008)})
     sentences = Unit(("gaponet", "mlp")).result(make_study(), folds).sentences
     assert sentences[1].endswith("; it is worse than nominal on 1 of 2.")
-    assert "GAPONet leaves 0.75 ± 0.35 of the error of MLP (over units), less on 1 of 2." in sentences[2]
+    assert "GAPONet leaves 0.75 ± 0.35 of the error of MLP, full coupling (over units), less on 1 of 2." in sentences[2]

@@ -35,7 +35,7 @@ from gaponet.sim.replay import Corrector, replay
 from gaponet.structure import read_json
 
 SHOWN = 8  # sequences whose trajectories are kept for the report
-LEARNED = ("inverse", "mlp", "transformer", "fno", "gaponet")  # kinds of model
+LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "fno", "gaponet")  # kinds of model
 ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
 
 

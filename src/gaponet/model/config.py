@@ -9,7 +9,8 @@ from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
 
-Kind = Literal["gaponet", "mlp", "transformer", "fno", "inverse"]
+Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "fno", "inverse"]
+OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
@@ -23,7 +24,8 @@ class ModelConfig:
     """Shape of a delta-action model; every dimension is derived from it and the number of operated joints n."""
 
     kind: Kind = "gaponet"
-    """gaponet: the operator. mlp: a plain network on [observation, action], the ASAP form. transformer: attention over
+    """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as its
+    branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form. transformer: attention over
     the past frames and the present. fno: Fourier neural operator over the same time axis. inverse: the mlp fitted once
     to the inverse labels on the recorded motions, without roll-outs of its own and without PPO."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
@@ -94,8 +96,12 @@ class ModelConfig:
         for field in POSITIVE:
             if getattr(self, field) <= 0:
                 raise UsageError(f"{field} is {getattr(self, field)}; it must be positive")
-        if self.mlp_match and not self.mlp_hidden:
-            raise UsageError("mlp_match without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1")
+        if (self.mlp_match or self.kind == "shared_mlp") and not self.mlp_hidden:
+            raise UsageError(
+                "mlp_match or shared_mlp without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1"
+            )
+        if self.kind == "shared_mlp" and self.coupling == "full":
+            raise UsageError("shared_mlp takes one joint at a time; with full coupling the plain network is mlp")
         if self.transformer_width % self.transformer_heads:
             raise UsageError(
                 f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
@@ -105,7 +111,7 @@ class ModelConfig:
     @property
     def joint_wise(self) -> bool:
         """Whether one joint at a time passes through branch and trunk."""
-        return self.kind == "gaponet" and self.coupling == "joint"
+        return self.kind in OPERATORS and self.coupling == "joint"
 
     def observation_dim(self, n: int) -> int:
         """2n + 3nH (+ 1 with payload)."""
@@ -118,7 +124,7 @@ class ModelConfig:
     @property
     def asks_simulator(self) -> bool:
         """Whether the sensors are the simulator's own answers, a part of x."""
-        return self.kind == "gaponet" and self.sensors in ("oracle", "learned")
+        return self.kind in OPERATORS and self.sensors in ("oracle", "learned")
 
     @property
     def learns_points(self) -> bool:
@@ -128,7 +134,7 @@ class ModelConfig:
     @property
     def keeps_observation(self) -> bool:
         """Whether x carries the observation of the last refresh, for what the sensors are predicted or chosen from."""
-        return self.kind == "gaponet" and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
+        return self.kind in OPERATORS and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
 
     def input_dim(self, n: int) -> int:
         """Numbers in x = [o_t | a_t | o_refresh or S_t, where there is one]."""

@@ -158,15 +158,39 @@ class OperatorNet(DeltaNet):
         return torch.cat(see, dim=2), torch.cat(ask, dim=2)
 
 
+class SharedMLP(OperatorNet):
+    """Baseline: what branch and trunk are given, side by side into one plain network, shared by the joints.
+
+    It has the operator's sensors and as many weights as branch and trunk: only their product is missing.
+    """
+
+    def __init__(self, config: ModelConfig, n: int) -> None:
+        super().__init__(config, n)
+        asked = self.input_dims(config, n)[2] + n
+        weights = size(self.branch) + size(self.trunk) + n
+        del self.branch, self.trunk, self.bias
+        hidden = matched_hidden(config.mlp_hidden, weights, lambda widths: dense(self.branch_inputs + asked, widths, 1))
+        self.net = dense(self.branch_inputs + asked, hidden, 1, zero=True)
+
+    def correct(self, prepared: Tensor) -> Tensor:
+        """What `prepare` made of each joint → Δa, (B, n) rad."""
+        return self.bounded(self.net(prepared).squeeze(-1))
+
+
 def build_network(config: ModelConfig, n: int) -> DeltaNet:
     """The network a config describes, for n operated joints."""
     if config.kind == "gaponet":
         return OperatorNet(config, n)
+    if config.kind == "shared_mlp":
+        return SharedMLP(config, n)
     if config.kind == "transformer":
         return DeltaTransformer(config, n)
     if config.kind == "fno":
         return DeltaFNO(config, n)
-    return DeltaMLP(config, n, matched_hidden(config, n, operator_size(config, n)) if config.mlp_match else None)
+    if not config.mlp_match:
+        return DeltaMLP(config, n)
+    weights = operator_size(config, n)
+    return DeltaMLP(config, n, matched_hidden(config.mlp_hidden, weights, lambda widths: DeltaMLP(config, n, widths)))
 
 
 def operator_size(config: ModelConfig, n: int) -> int:

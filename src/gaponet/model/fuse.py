@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from gaponet.arrays import Array
 from gaponet.model.baselines.mlp import DeltaMLP
-from gaponet.model.deeponet import OperatorNet
+from gaponet.model.deeponet import OperatorNet, SharedMLP
 from gaponet.model.fused import CLAMP, JOINT_WISE, PARTS, Layers
 
 
@@ -20,7 +20,7 @@ def fuse(net: nn.Module) -> dict[str, Array] | None:
     """
     if type(net) is DeltaMLP:
         weights = _mlp(net)
-    elif type(net) is OperatorNet and _plain(net):
+    elif type(net) in (OperatorNet, SharedMLP) and _plain(net):
         weights = (_joint if net.per_joint else _full)(net)
     else:
         return None
@@ -37,7 +37,7 @@ def _plain(net: OperatorNet) -> bool:
     if c.payload_input and not (c.payload_trunk and c.payload_predictor):
         return False
     parts = {name.split(".")[0] for name in net.state_dict()}
-    return parts <= {"features", "predictor", "branch", "trunk", "bias", "bounded"}
+    return parts <= {"features", "predictor", "branch", "trunk", "bias", "bounded", "net"}
 
 
 def _mlp(net: DeltaMLP) -> dict[str, Array]:
@@ -79,7 +79,9 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         [np.concatenate([own + j, np.full(payload, depth * n), [dim - n + j]]) for j in range(n)]
     ).astype(int)
     weights = _named(_features(net, columns), n)
-    branch, trunk = dense_layers(_sequential(net.branch)), dense_layers(net.trunk)
+    alone = isinstance(net, SharedMLP)  # one net is a branch whose trunk answers 1
+    branch = dense_layers(net.net if alone else _sequential(net.branch))
+    trunk = [(np.zeros((1 + payload + n, 1)), np.ones(1))] if alone else dense_layers(net.trunk)
     predictor: Layers = []
     (w, b), sensed = branch[0], 0
     parts = []
@@ -98,13 +100,16 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         parts.append(w[n : n + sensed])
     seen = _rows(w[:n] + b, names, width)
     if net.sees_observation:
-        seen += _rows(w[n + sensed :], np.arange(depth + payload), width)
+        seen += _rows(w[n + sensed : net.branch_inputs], np.arange(depth + payload), width)
+    asked = np.array([known - 1] + [known - 2] * payload)
+    if alone:
+        query = w[net.branch_inputs :]
+        seen += _rows(query[:n], names, width) + _rows(query[n:], asked, width)
     branch[0] = (np.concatenate([*parts, seen]), np.zeros_like(b))
     w, b = trunk[0]
-    asked = np.array([known - 1] + [known - 2] * payload)
     trunk[0] = (_rows(w[:n] + b, names, width) + _rows(w[n:], asked, width), np.zeros_like(b))
     trunk = _scaled(trunk, net)
-    weights |= _name("predictor", predictor) | {"bias": _bias(net)}
+    weights |= _name("predictor", predictor) | {"bias": np.zeros(n) if alone else _bias(net)}
     if len(branch) != len(trunk):
         return weights | _name("branch", branch) | _name("trunk", trunk) | {"kind": np.array("joint")}
     p = config.num_basis

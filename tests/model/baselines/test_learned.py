@@ -9,7 +9,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network, operator_size
 from gaponet.model.layers import size
 
-KINDS = ("mlp", "transformer", "fno")
+KINDS = ("mlp", "shared_mlp", "transformer", "fno")
 
 
 def x(config, n, batch=7):
@@ -27,7 +27,7 @@ def test_an_untrained_baseline_corrects_nothing(kind):
 def test_every_number_of_the_observation_and_the_action_is_seen(kind):
     config, n = ModelConfig(kind=kind, history=3), 2
     net = build_network(config, n)
-    head = (net.net if kind == "mlp" else net.head)[-1]
+    head = (net.net if kind in ("mlp", "shared_mlp") else net.head)[-1]
     torch.nn.init.normal_(head.weight, std=0.01)
     data = x(config, n, batch=1).requires_grad_(True)
     net(data).sum().backward()
@@ -42,6 +42,18 @@ def test_a_matched_mlp_has_the_operators_parameters_within_one_percent(config):
     )
     assert operator_size(matched.config, 10) == operator
     assert abs(size(matched) / operator - 1) < 0.01
+
+
+@pytest.mark.parametrize("n", [2, 10])
+def test_the_shared_mlp_has_the_weights_of_branch_and_trunk_and_sees_one_joint_at_a_time(n):
+    operator, shared = (build_network(ModelConfig(kind=kind, sensors="off"), n) for kind in ("gaponet", "shared_mlp"))
+    assert abs(size(shared) / size(operator) - 1) < 0.02
+    torch.nn.init.normal_(shared.net[-1].weight)
+    data = x(shared.config, n, batch=1).requires_grad_(True)
+    shared(data)[0, 0].backward()
+    state = data.grad[0, : 2 * n].reshape(2, n)
+    assert (state[:, 0] != 0).all()
+    assert (state[:, 1:] == 0).all()
 
 
 def test_building_a_matched_mlp_leaves_the_seed_alone():

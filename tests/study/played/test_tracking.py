@@ -81,7 +81,13 @@ def test_figures_show_every_method(robot, tracked):
     made = result(session(robot), scores, example, motions)
     assert list(made.figures) == ["joints", "example"]
     labels = {t.get_text() for t in made.figures["joints"].legends[0].get_texts()}
-    assert labels == {"nominal simulator", "raw targets", "nominal model's feed-forward alone", "MLP", "GAPONet"}
+    assert labels == {
+        "nominal simulator",
+        "raw targets",
+        "nominal model's feed-forward alone",
+        "MLP, full coupling",
+        "GAPONet",
+    }
     assert [t.name for t in made.tables] == [
         "alignment", "compensation", "alignment-joints", "compensation-joints", "motions",
     ]  # fmt: skip

@@ -51,7 +51,7 @@ def test_methods_come_in_order_and_changed_models_are_passed_over(arm, runs, tmp
 
 def test_two_of_one_seed_and_none_at_all_are_refused(arm, runs, tmp_path):
     first, second = runs("a", "mlp", 0), runs("b", "mlp", 0)
-    with pytest.raises(UsageError, match="MLP seed 0 is there already"):
+    with pytest.raises(UsageError, match="MLP, full coupling seed 0 is there already"):
         load_trained([first, second], arm)
     with pytest.raises(UsageError, match="no run of gaponet train"):
         load_trained([tmp_path / "nothing"], arm)

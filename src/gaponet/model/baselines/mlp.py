@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, dense, size
@@ -24,16 +24,18 @@ class DeltaMLP(DeltaNet):
         return self.bounded(self.net(prepared))
 
 
-def matched_hidden(config: ModelConfig, n: int, parameters: int) -> tuple[int, ...]:
-    """mlp_hidden scaled so that the MLP has as near to `parameters` parameters as whole widths allow."""
-    largest = max(config.mlp_hidden)
+def matched_hidden(
+    hidden: Sequence[int], parameters: int, build: Callable[[tuple[int, ...]], nn.Module]
+) -> tuple[int, ...]:
+    """The widths scaled so that what `build` makes of them has as near to `parameters` parameters as they allow."""
+    largest = max(hidden)
 
     def scaled(width: int) -> tuple[int, ...]:
-        return tuple(max(1, round(w * width / largest)) for w in config.mlp_hidden)
+        return tuple(max(1, round(w * width / largest)) for w in hidden)
 
     def miss(width: int) -> int:
         with torch.device("meta"):  # shapes only
-            return size(DeltaMLP(config, n, scaled(width))) - parameters
+            return size(build(scaled(width))) - parameters
 
     low, high = 1, 1
     while miss(high) < 0:
