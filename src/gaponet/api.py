@@ -163,7 +163,7 @@ def _gap_by_step(
 
     data, spec = open_dataset(dataset, robot, run)
     with bar("gap") as update:
-        found = gap_by_step(run, data, spec, motions, lambda step, done, total: update(done, total, step))
+        found = gap_by_step(run, data, spec, motions, update)
     with writing(run, "run"):
         write_text(run / "gap.json", json.dumps(found, indent=1) + "\n")
         save(waterfall(found), run / "gap")
@@ -324,9 +324,7 @@ def evaluate(
     folder = _run(run)
     data, spec = open_dataset(dataset, robot, folder)
     with bar("evaluating") as update:
-        found = step(
-            [folder, *map(Path, also)], data, spec, motions, lambda method, done, total: update(done, total, method)
-        )
+        found = step([folder, *map(Path, also)], data, spec, motions, update)
     save(found, folder)
     return found
 

@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -26,6 +26,7 @@ from gaponet.data.store import KIND, Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text, writing
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
+from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import MOVE_KEPT
 from gaponet.sim.kept import require_kept
@@ -36,8 +37,6 @@ from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.play import Job, library, play
 
 __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
-
-Progress = Callable[[int, int, float], None]  # sequences done, total, recorded seconds
 
 CLAIM, HARD = "collect.json", "hard"
 MOST_PROCESSES = 1024
@@ -67,20 +66,15 @@ def collect(
     out: str | Path,
     seed: int = 0,
     nproc: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     twins: bool = True,
 ) -> Collected:
     """Record every take of a recipe that the dataset at `out` does not hold yet.
 
     Args:
-        robot: The type that is played.
-        fleet: Virtual units of that type.
-        recipe: What to play.
-        out: Dataset folder; made if missing.
         seed: Seed of motions and of everything random in a take.
         nproc: Processes; 0 for one per core, 1 for none beside this one. More than one starts fresh interpreters: a
             script that calls this needs `if __name__ == "__main__":`.
-        progress: Called after each sequence.
         twins: Store the nominal twin of each sequence beside it, limbs that stand still locked in both.
 
     Raises:
@@ -114,8 +108,7 @@ def collect(
                 dataset.write_twin(entry, twin)
             written += 1
             seconds += sequence.duration
-            if progress:
-                progress(written, len(missing), seconds)
+            progress(written, len(missing), f"{written} of {len(missing)}, {seconds / 3600:.2f} h recorded")
     return Collected(str(out), written, len(wanted) - len(missing), seconds / 3600, time.monotonic() - start)
 
 

@@ -150,7 +150,6 @@ def lock(path: Path, opened: Callable[[Path], int] | None = None) -> int | None:
     """Lock a file, made if missing, against other processes; returns its descriptor, None where another has it.
 
     Args:
-        path: The file.
         opened: Opens it, for a file that may be another user's; by default it is opened for writing.
     """
     import fcntl

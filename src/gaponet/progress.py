@@ -10,21 +10,31 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    Progress,
     ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.progress import Progress as Bars
 
 from gaponet.text import plain
 
 EVERY = 10.0  # s between two lines where there is no terminal
 
 
+Progress = Callable[[float, float, str], None]  # done, total, what is done now
 Running = dict[str, tuple[float, str]]  # name of a part → share done, note
-Show = Callable[[Running, float, float, str], None]  # parts running, done, total, note
+_Show = Callable[[Running, float, float, str], None]  # parts running, done, total, note
+
+
+def silent(done: float, total: float, note: str = "") -> None:
+    """A Progress that nobody looks at."""
+
+
+def noted(progress: Progress, note: str) -> Callable[[int, int], None]:
+    """progress(done, total) of a part that is called so."""
+    return lambda done, total: progress(done, total, note)
 
 
 @contextmanager
@@ -48,7 +58,7 @@ def bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
 
 
 @contextmanager
-def _progress(title: str) -> Iterator[Show]:
+def _progress(title: str) -> Iterator[_Show]:
     console = Console(stderr=True, force_jupyter=False)  # in a notebook it is text as well
     if not console.is_terminal:
         yield _lines(title, console)
@@ -58,7 +68,7 @@ def _progress(title: str) -> Iterator[Show]:
         TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("left"),
         TimeRemainingColumn(), TextColumn("{task.fields[note]}", markup=False),
     )  # fmt: skip
-    with Progress(*columns, console=console, speed_estimate_period=600) as progress:
+    with Bars(*columns, console=console, speed_estimate_period=600) as progress:
         whole = progress.add_task(title, total=None, note="")
         shown: dict[str, TaskID] = {}
 
@@ -74,7 +84,7 @@ def _progress(title: str) -> Iterator[Show]:
         yield show
 
 
-def _lines(title: str, console: Console) -> Show:
+def _lines(title: str, console: Console) -> _Show:
     """The same as lines, the first when there is something to say, then at most one every EVERY seconds."""
     began = time.monotonic()
     last = began - EVERY

@@ -64,9 +64,6 @@ def validated(
 
     Args:
         kind: Dataclass, TypedDict, or anything else that pydantic knows, such as dict[str, float].
-        data: As parsed from JSON or TOML.
-        where: File, for the error.
-        error: What is raised.
         hint: What to do about it, for the error.
         more: Keep fields that a TypedDict does not name, instead of refusing them.
 
@@ -122,8 +119,6 @@ def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, 
 
     Args:
         kind: What it is, for messages: "recipe".
-        folder: Where the package keeps them.
-        name_or_path: Name without ".toml", or a path.
 
     Raises:
         UsageError: No such file, or not TOML.

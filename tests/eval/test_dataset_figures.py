@@ -8,7 +8,8 @@ from logs import arm_sequence, late, wave
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
-from gaponet.eval.draw_dataset import PICTURES, draw_all, liveliest, spread, swing
+from gaponet.eval.draw_dataset import PICTURES, draw_all, liveliest, swing
+from gaponet.eval.evaluate import evenly
 from gaponet.eval.whose import who
 from gaponet.plot.style import save
 from gaponet.sim.model import model_hash
@@ -75,8 +76,8 @@ def test_spikes_are_no_swing():
 
 
 def test_items_are_chosen_evenly():
-    assert spread([1, 2, 3], 5) == [1, 2, 3]
-    assert spread(list(range(101)), 3) == [0, 50, 100]
+    assert evenly([1, 2, 3], 5) == [1, 2, 3]
+    assert evenly(list(range(101)), 3) == [0, 50, 100]
 
 
 def test_virtual_stands_in_the_title(dataset, arm):

@@ -12,7 +12,7 @@ from gaponet.model.deeponet import build_network
 from gaponet.model.export import drawn_states, export
 from gaponet.model.fuse import FusedNet, fuse
 from gaponet.model.fused import FusedForward
-from gaponet.model.torchscript import compare, export_torchscript
+from gaponet.model.torchscript import export_torchscript, largest_difference
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
 
@@ -206,7 +206,7 @@ def test_torchscript_is_self_contained_and_the_same(artifact, tmp_path):
     loaded = torch.jit.load(str(tmp_path / "delta.pt"))
     assert loaded.joint_names == ["shoulder", "elbow"]
     assert loaded.dt == [0.02]
-    assert compare(loaded, model, num_envs=2) <= 1e-5
+    assert largest_difference(loaded, model, num_envs=2) <= 1e-5
 
 
 @pytest.mark.parametrize("how", [{"sensor_hold": 2}, {"delta_hold": 2}, {"sensors": "oracle"}])

@@ -19,13 +19,13 @@ def web(arm):
     """Three copies of a moving arm, served and played as gaponet view --web does."""
     from gaponet.view.film import Clip
     from gaponet.view.scene import Scene
-    from gaponet.view.side_by_side import Played, SideBySide
+    from gaponet.view.side_by_side import Copy, SideBySide
     from gaponet.view.web import WebScene
 
     real = recordings(arm, 1, rows=200, kp=0.5)[0]
     swing = 0.8 * np.sin(np.arange(len(real)) / 20)[:, None] * np.ones(2)
     off = {"nominal": 0.4, "gaponet": 0.1, "recorded": 0.0}
-    shown = SideBySide(real, arm, tuple(Played(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
+    shown = SideBySide(real, arm, tuple(Copy(m, swing + o, np.full(len(real), o)) for m, o in off.items()), None)
     served = WebScene(Scene(shown, ghost=False), Clip.of(shown, 0.0, 3.0), port=0)
     served.playing.value = False
     ended = threading.Event()

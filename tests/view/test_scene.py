@@ -14,7 +14,7 @@ from gaponet.sim.model import build_model
 from gaponet.view.film import Clip, require_kind, write
 from gaponet.view.picture import Camera
 from gaponet.view.scene import Scene, View, dressed
-from gaponet.view.side_by_side import Played, SideBySide
+from gaponet.view.side_by_side import Copy, SideBySide
 from gaponet.view.watch import LEFT, SPACE, Playback
 
 METHODS = ("target", "nominal", "gaponet", "recorded")
@@ -25,7 +25,7 @@ def shown(robot, payload=0.5, virtual=True):
     real = record(robot, commands(40, 0), "wave", payload)
     real = dataclasses.replace(real, meta=dataclasses.replace(real.meta, virtual=virtual))
     off = {"target": 0.5, "nominal": 0.3, "gaponet": 0.1, "recorded": 0.0}
-    motions = tuple(Played(m, real.qpos + off[m], np.full(len(real), off[m])) for m in METHODS)
+    motions = tuple(Copy(m, real.qpos + off[m], np.full(len(real), off[m])) for m in METHODS)
     return SideBySide(real, robot, motions, False)
 
 
@@ -123,7 +123,7 @@ def test_the_robots_of_the_package_can_be_dressed(name):
 def test_a_closeup_may_cut_limbs_without_operated_joints():
     h1_2 = load_robot("h1_2")
     real = Sequence(SequenceMeta("h1_2", "a", "stand", 0.0), h1_2.joint_names, 0.02, *np.zeros((3, 2, 27)))
-    standing = SideBySide(real, h1_2, (Played("recorded", real.qpos, np.zeros(2)),), None)
+    standing = SideBySide(real, h1_2, (Copy("recorded", real.qpos, np.zeros(2)),), None)
     whole, near = Scene(standing), Scene(standing, closeup=True)
     assert whole.box[2] < 0.1 < 0.6 < near.box[2]  # feet, pelvis
     assert whole.box[3] == near.box[3]

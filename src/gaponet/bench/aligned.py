@@ -19,9 +19,6 @@ def bench_aligned(
     are locked in both.
 
     Args:
-        robot: The simulator that the model corrects.
-        model: What training made.
-        num_envs: Simulations side by side.
         steps: Control periods per turn.
         rounds: Turns each.
     """

@@ -44,7 +44,6 @@ def measure(run: Path, calls: int, threads: int) -> dict[str, Any]:
     """Microseconds per call, p50, p99 and max, and corrections per second in batches.
 
     Args:
-        run: Run or artifact folder.
         calls: How often each is called; they take turns of a tenth, so that a machine that slows down slows all.
         threads: Threads of onnxruntime for the batch; 0 for all cores. Single steps have one.
     """

@@ -39,11 +39,10 @@ def bench_sim(robot: RobotSpec, num_envs: int = 512, steps: int = 40, rounds: in
 
     Args:
         robot: The robot; limbs without an operated joint are locked, as in training.
-        num_envs: Simulations side by side.
         steps: Control periods per turn.
         rounds: Turns each.
     """
-    sequences = [wander(robot, steps + 1, seed) for seed in range(num_envs)]
+    sequences = [slow_sines(robot, steps + 1, seed) for seed in range(num_envs)]
     env = _environment(robot, ModelConfig(), num_envs)
     seconds = take_turns(
         {
@@ -67,7 +66,6 @@ def bench_train(
     Args:
         robot: The robot; limbs without an operated joint are locked, as in training.
         config: Model and PPO; threads.
-        num_envs: Simulations side by side.
         rounds: Turns each, after one that does not count.
         others: Makes the turns of other trainers, and says how many control steps one of each is
             (benchmarks/sb3.py).
@@ -131,7 +129,7 @@ def _environment(robot: RobotSpec, model: ModelConfig, num_envs: int, nthread: i
 
 def _bare_loop(robot: RobotSpec, num_envs: int, steps: int, nthread: int = 0) -> Turn:
     """The same simulations without anything around them."""
-    motions = [wander(robot, steps + 1, seed) for seed in range(num_envs)]
+    motions = [slow_sines(robot, steps + 1, seed) for seed in range(num_envs)]
     locked = idle_limbs(motions, robot)
     condition = Condition(0.0, "both", robot.dt)
     sim = BatchSim(robot, [condition] * num_envs, nthread, locked)
@@ -167,10 +165,10 @@ def _inference(learner: Learner, steps: int) -> None:
 
 def recordings(robot: RobotSpec, count: int) -> list[Sequence]:
     """Motions as long as recorded ones."""
-    return [wander(robot, round(20 / robot.dt), seed) for seed in range(count)]
+    return [slow_sines(robot, round(20 / robot.dt), seed) for seed in range(count)]
 
 
-def wander(robot: RobotSpec, rows: int, seed: int) -> Sequence:
+def slow_sines(robot: RobotSpec, rows: int, seed: int) -> Sequence:
     """A slow random motion of the operated joints about home."""
     rng = np.random.default_rng(seed)
     t = np.arange(rows)[:, None] * robot.dt
@@ -179,5 +177,5 @@ def wander(robot: RobotSpec, rows: int, seed: int) -> Sequence:
     wave = np.sin(2 * np.pi * rng.uniform(0.2, 1.0, len(op)) * t + rng.uniform(0, 2 * np.pi, len(op)))
     ctrl = np.tile(robot.qpos_home, (rows, 1))
     ctrl[:, op] = np.clip(ctrl[:, op] + 0.3 * wave, low, high)
-    meta = SequenceMeta(robot.name, "bench", f"wander-{seed}", 0.0, virtual=True)
+    meta = SequenceMeta(robot.name, "bench", f"slow_sines-{seed}", 0.0, virtual=True)
     return Sequence(meta, robot.joint_names, robot.dt, ctrl, ctrl, np.gradient(ctrl, robot.dt, axis=0))

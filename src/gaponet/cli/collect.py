@@ -50,7 +50,7 @@ def collect(
             out,
             seed,
             nproc,
-            lambda k, total, seconds: update(k, total, f"{k} of {total}, {seconds / 3600:.2f} h recorded"),
+            update,
         )
     screen.table(
         f"VIRTUAL recordings, fleet {fleet}",

@@ -9,6 +9,7 @@ import tyro
 
 from gaponet.cli.options import Data, Json, Robot
 from gaponet.cli.out import Out
+from gaponet.data.checks.finding import some
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.progress import bar
 
@@ -162,8 +163,3 @@ def members(entries: list[Any]) -> dict[str, list[str]]:
         "units": sorted({e.meta.unit_id for e in entries}),
         "payloads_kg": [f"{p:g}" for p in sorted({e.meta.payload_mass for e in entries})],
     }
-
-
-def some(names: list[str]) -> str:
-    """Up to four, and how many more."""
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

@@ -56,9 +56,7 @@ def demo(
         api.train(dataset, run, limit, config, robot=robot, holdout_units=holdout, resume=resume)
     evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
-        path = write_report(
-            out / "gaponet", robot=robot, progress=lambda what, d, n: update(d, n, what), picture=portrait
-        )
+        path = write_report(out / "gaponet", robot=robot, progress=update, picture=portrait)
     screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
 
 

@@ -97,6 +97,6 @@ def report(
 
     out = Out(json)
     with bar("report") as update:
-        path = write_report(run, dataset, also, robot, lambda what, done, total: update(done, total, what), portrait)
+        path = write_report(run, dataset, also, robot, update, portrait)
     out.say(f"report: {path}")
     out.result({"report": str(path)})

@@ -80,7 +80,7 @@ def view(
     data, spec = open_dataset(dataset, robot)
     entry = pick(data, model, motion, unit, payload_mass)
     with bar("replaying") as update:
-        shown = side_by_side(data, entry, spec, model, lambda method, done, total: update(done, total, method))
+        shown = side_by_side(data, entry, spec, model, update)
     shown = shown.only(tuple(n for n in show if n != "aligned" or model))
     clip = Clip.of(shown, start, duration, speed, fps)
     meta = entry.meta

@@ -17,9 +17,8 @@ from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
+from gaponet.progress import Progress, silent
 from gaponet.structure import read_json
-
-Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 
 QUANTILE_ROWS = 100_000  # so many rows, evenly spread over the set, give the 1 % and 99 % quantiles
 NOT_STATED = "not stated"
@@ -31,12 +30,8 @@ SHARES: dict[str, Callable[[Entry], str]] = {
 }
 
 
-def make_card(dataset: Dataset, progress: Progress | None = None) -> dict[str, Any]:
+def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
     """Read every sequence once, repetitions of a motion one after the other, and count.
-
-    Args:
-        dataset: At least one sequence.
-        progress: Called after each sequence.
 
     Raises:
         DatasetError: Empty, or a file has other rows than the journal says.
@@ -54,8 +49,7 @@ def make_card(dataset: Dataset, progress: Progress | None = None) -> dict[str, A
                 ranges[name].add(getattr(sequence, name))
             repetitions.add(sequence)
             done += 1
-            if progress:
-                progress(done, len(dataset), entry.meta.motion)
+            progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
             repeated.append(repetitions)
     return _identity(dataset) | {
@@ -99,7 +93,7 @@ def repetition_groups(entries: list[Entry]) -> Iterable[list[Entry]]:
     """Entries of the same motion, unit, payload and period together."""
     groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
     for e in entries:
-        groups[e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.meta.payload_side, round(e.dt, 7)].append(e)
+        groups[*e.meta.slot, round(e.dt, 7)].append(e)
     return groups.values()
 
 

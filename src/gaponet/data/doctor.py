@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey, survey
 from gaponet.errors import DatasetError
+from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 
 
@@ -56,16 +56,14 @@ class Diagnosis:
 def diagnose(
     dataset: Dataset,
     robot: RobotSpec,
-    progress: Callable[[float, float, str], None] | None = None,
+    progress: Progress = silent,
     model: Gravity | None = None,
     heights: Heights | None = None,
 ) -> Diagnosis:
     """Survey every sequence, one in memory at a time, and judge them together.
 
     Args:
-        dataset: At least one sequence.
         robot: The dataset's robot.
-        progress: Called with done, total and the motion.
         model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
         heights: Lowest tip of a sequence in every row, m, to tell motions that press on something; needs `model`.
     """
@@ -79,8 +77,7 @@ def diagnose(
         surveys.append(survey(entry, sequence, robot))
         if model is not None and heights is not None:
             stands.append(standing(sequence, robot, heights, model))
-        if progress:
-            progress(len(surveys), len(dataset), entry.meta.motion)
+        progress(len(surveys), len(dataset), entry.meta.motion)
     findings = [f for check in CHECKS for f in check(surveys, robot)]
     if model is not None:
         findings += gravity(surveys, robot, model)

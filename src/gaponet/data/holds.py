@@ -93,7 +93,6 @@ def static_error(holds: Holds, joint: int, offset: Array | None = None) -> Stati
 
     Args:
         holds: Holds of one unit, any number of sequences.
-        joint: Index.
         offset: (k,) rad, expected error to take off, such as the sag of the nominal model; default none.
     """
     error = holds.qpos[:, joint] - holds.ctrl[:, joint] - (0.0 if offset is None else offset)

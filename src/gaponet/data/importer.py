@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,8 @@ from gaponet.data.signals import estimate_delay, fast_speed
 from gaponet.data.store import KIND, Dataset, Entry
 from gaponet.errors import DatasetError, LogError, UsageError
 from gaponet.files import writing
+from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
-
-Progress = Callable[[float, float, str], None]  # done, total, motion
 
 HOLD = 1 << 29  # bytes of samples kept between checking and writing; a larger source is read twice
 UNSTATED = -1  # repetition that the format does not state, until it is counted
@@ -68,7 +67,7 @@ def import_logs(
     fmt: str | None = None,
     gravity: Gravity | None = None,
     simulator: str = "",
-    progress: Progress | None = None,
+    progress: Progress = silent,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     **options: Any,
@@ -79,16 +78,13 @@ def import_logs(
 
     Args:
         src: File or folder in one of data.formats.FORMATS.
-        robot: The robot that was recorded.
         unit_id: Which of its kind; zero offsets belong to a unit. None where the format states it.
         payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None where the format states it.
         out: Dataset folder; made, or appended to by one process at a time.
         payload_side: "both" (default), or the side of one payload mount.
         level: joint, upper_body or whole_body (default).
-        fmt: Format; default by looking.
         gravity: Nominal model's gravity, to fit offsets with (data.offsets); default: no offsets.
         simulator: Hash of that model, recorded beside the offsets.
-        progress: Called after each recording.
         kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some of the joints;
             default what the format states, else the robot's.
         options: Options of data.formats.read_logs: joint_map, columns, position_unit, time_unit.
@@ -124,7 +120,7 @@ def _import(
     robot: RobotSpec,
     given: _Given,
     fmt: str | None,
-    progress: Progress | None,
+    progress: Progress,
     options: dict[str, Any],
     rests: dict[str, Holds] | None,
 ) -> tuple[Dataset, list[Entry], list[Entry]]:
@@ -146,22 +142,21 @@ def _import(
         held.append(sequence)
         if size > HOLD:
             held.clear()
-        if progress:
-            progress(len(digests), total, sequence.meta.motion)
+        progress(len(digests), total, sequence.meta.motion)
     _refuse_twice(digests)
     again = (s for s, _ in _sequences(src, robot, given, fmt, options))
     dataset = Dataset.create(out, robot)
     if facts and not dataset.entries:
         dataset.state(**facts)
     present = [entry for digest, _ in digests if (entry := dataset.find(digest))]
-    taken = Counter(_slot(e.meta) for e in dataset.entries)
+    taken = Counter(e.meta.slot for e in dataset.entries)
     added = []
     for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
         if rests is not None:
             rests[digest] = find_holds(sequence, robot.operated_index)
         if dataset.find(digest):
             continue
-        slot = _slot(sequence.meta)
+        slot = sequence.meta.slot
         if sequence.meta.repetition < 0:  # the format does not state it
             sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
         added.append(dataset.append(sequence, findings(sequence), digest))
@@ -243,11 +238,6 @@ def _refuse_twice(recordings: list[tuple[str, str]]) -> None:
             f"{len(twice)} of {len(recordings)} recordings are there twice (same samples, unit and payload): {source} "
             f"is {twin}. Nothing was imported; leave one of them out"
         )
-
-
-def _slot(meta: SequenceMeta) -> tuple[str, str, float, str]:
-    """Recordings in one slot are repetitions of each other."""
-    return meta.motion, meta.unit_id, meta.payload_mass, meta.payload_side
 
 
 def _require_side(robot: RobotSpec, side: str) -> None:

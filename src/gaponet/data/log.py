@@ -30,7 +30,6 @@ class Log:
     """One recording.
 
     Attributes:
-        robot: Robot name.
         joint_names: The robot's own names, (n).
         channels: Channels among CHANNELS and DERIVED, at least ctrl and qpos.
         source: File or folder it was read from, for errors and for the manifest.

@@ -42,7 +42,7 @@ FILE = "offsets.json"
 NOISE = 0.01  # scatter of a rest about its band's edge, rad; beyond it residuals count linearly (soft_l1)
 PRIOR = 0.5  # encoder zeros are mounted this well, rad; keeps what gravity does not see at 0
 STIFFNESS_PRIOR = 0.5  # of ln(kp_real / kp)
-IDENTIFIED = 0.1  # largest standard error at which a zero offset is called identified, rad
+SURE = 0.1  # largest standard error at which a zero offset is called identified, rad
 MIN_RESTS, MAX_POSES = 20, 250
 
 
@@ -116,9 +116,7 @@ def fit_offsets(holds: dict[Setting, Holds], robot: RobotSpec, gravity: Gravity)
     """Fit the offsets of the operated joints.
 
     Args:
-        holds: Rests under each payload.
         robot: Whose gains carry the load.
-        gravity: Gravity of the nominal model.
     """
     n = len(robot.joint_names)
     every = join(list(holds.values()), n)
@@ -198,9 +196,9 @@ def _fit_zeros(
         reason = ""
         if sampling > 0.7 * PRIOR:
             reason = "gravity hardly loads this joint in these postures"
-        elif std > IDENTIFIED and model > sampling:
+        elif std > SURE and model > sampling:
             reason = f"motors with {stiffness:.2f} of the nominal kp explain the sag with another zero"
-        elif std > IDENTIFIED:
+        elif std > SURE:
             reason = "the sag changes too little over these postures"
         fields[name] = {
             "zero_offset": round(float(fixed[i]), 6),

@@ -60,7 +60,6 @@ def require_disjoint(*parts: list[Any], key: Callable[[Any], str] = Sequence.con
 
     Args:
         parts: Sequences, or anything else with a `meta` and the given content key.
-        key: Content of one of them.
     """
     seen: dict[str, int] = {}
     for i, part in enumerate(parts):

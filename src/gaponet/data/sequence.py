@@ -69,6 +69,11 @@ class SequenceMeta:
         kp, _, kd = str(self.notes.get("gains", "")).removeprefix("kp ").partition(", kd ")
         return None if kp == ASSUMED else self.kp, None if (kd or kp) == ASSUMED else self.kd
 
+    @property
+    def slot(self) -> tuple[str, str, float, str]:
+        """Recordings in one slot, at one rate, are repetitions of each other."""
+        return self.motion, self.unit_id, self.payload_mass, self.payload_side
+
 
 @dataclass(frozen=True)
 class Sequence:
@@ -78,7 +83,6 @@ class Sequence:
     compares states at t+1. This convention is said here and nowhere else.
 
     Attributes:
-        meta: Where it comes from.
         joint_names: (n).
         dt: s.
         ctrl, qpos, qvel: (T, n), rad, rad, rad/s, float32.
@@ -165,7 +169,6 @@ def require_same_gains(metas: Iterable[SequenceMeta], joint_names: tuple[str, ..
     Args:
         metas: Metadata of the recordings taken together; one that does not say its gains (an old journal) may be any.
         joint_names: Joints that their gains belong to, (n).
-        joints: Those that matter.
 
     Raises:
         UsageError: Naming joint, gains and one recording of each.
@@ -195,7 +198,6 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
         robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
-        meta: Where it comes from.
         dt: Force this period, s.
     """
     time = log.channels["qpos"].time

@@ -99,6 +99,12 @@ def _correlation(a: Array, b: Array) -> Array:
     return (a * b).sum(axis=0) / np.where(power > 0, power, np.inf)
 
 
+def busiest(qpos: Array, rows: int) -> int:
+    """First row of the stretch of so many periods with the most motion; qpos (T, n) rad."""
+    moved = np.concatenate([[0.0], np.abs(np.diff(qpos, axis=0)).sum(axis=1).cumsum()])
+    return 0 if len(moved) <= rows else int((moved[rows:] - moved[:-rows]).argmax())
+
+
 def encoder_step(recordings: list[Array]) -> float:
     """The smallest step between distinct readings of one joint, rad; 0 where readings are continuous."""
     values = np.unique(np.concatenate(recordings).astype(np.float64))

@@ -22,9 +22,9 @@ from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text
+from gaponet.progress import Progress, silent
 from gaponet.structure import read_json
 
-Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 Parts = dict[str, list[Entry]]
 
 FORMAT = 1
@@ -61,7 +61,6 @@ def split_entries(
     """Entries per part: the fixed split by motion, the same for all rates and shares.
 
     Args:
-        dataset: What to divide.
         holdout_units: Appear in the test part only, with its motions.
         holdout_payloads: The same, kg.
         rates: Only recordings at these, Hz; all by default.
@@ -133,7 +132,6 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Part
     """Divide a dataset's sequences.
 
     Args:
-        dataset: What to divide.
         by: motion, unit or payload.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter, by the hash of their names.
 
@@ -181,7 +179,7 @@ def _kilograms(text: str) -> str:
         raise UsageError(f"--holdout {text}: payloads are numbers, kg") from None
 
 
-def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress | None = None) -> None:
+def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress = silent) -> None:
     """Refuse parts that share samples, whatever unit or payload these are filed under.
 
     Content hashes contain unit and payload: a log imported twice, for two units, has two. So commands and states are
@@ -200,8 +198,7 @@ def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress 
                     "the line of the wrong one from sequences.jsonl"
                 )
             done += 1
-            if progress:
-                progress(done, total, entry.meta.motion)
+            progress(done, total, entry.meta.motion)
 
 
 def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...] = ()) -> Path:

@@ -44,7 +44,6 @@ class Survey:
     """Numbers of one sequence; n joints in robot order.
 
     Attributes:
-        entry: Which sequence.
         samples: Hash of command and state alone, whatever unit or payload they are filed under.
         rate_hz, jitter_ms, longest_gap_ms: By the state's own timestamps; jitter is the largest deviation from median.
         ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.

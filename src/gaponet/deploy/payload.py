@@ -26,8 +26,6 @@ class PayloadEstimate:
         Args:
             sim: Its last `masses` rows carry payloads from 0 to the largest; the first and last of those are used.
             at: Operated joints among the simulation's.
-            robot: For gains.
-            masses: Rows.
             dt: Control period, s.
         """
         self.sim, self.at, self.dt = sim, at, dt

@@ -41,10 +41,8 @@ class Recording:
     """What a controller did.
 
     Attributes:
-        robot: Robot name.
         virtual: Whether there was no real robot.
         joint_names: All joints, (n).
-        commanded: Those that were commanded.
         dt: Control period, s.
         rows, events: In order of time.
         missed: Periods in which the loop did not start at all.

@@ -108,8 +108,6 @@ class Limits:
 
         Args:
             robot: Ranges and effort limits.
-            joints: Names.
-            config: The rest.
             gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
             qpos_range: Ranges of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
         """
@@ -156,7 +154,6 @@ def limit_command(
         previous: The last command, (..., n) rad; one outside the range counts as at its end.
         qpos, qvel: Measured, (..., n) rad and rad/s.
         dt: Control period, s.
-        limits: Limits of these joints.
         age: Age of the state when the command leaves, s, or (..., n).
     """
     before = np.clip(previous, limits.low, limits.high)
@@ -211,7 +208,6 @@ class Watch:
             joint_names: Names of all joints, (n).
             commanded: Index of the commanded ones.
             dt: Control period, s.
-            config: Thresholds.
             noisy: Equal readings mean frozen at once; else only when the command has moved on (frozen_travel).
         """
         self.names, self.commanded, self.dt, self.config, self.noisy = joint_names, commanded, dt, config, noisy
@@ -228,7 +224,6 @@ class Watch:
 
         Args:
             now: s.
-            state: The newest.
             ctrl: The command that holds since the last period, (len(commanded),) rad; None where there is none.
             late: By how much this period starts late, s.
         """

@@ -33,7 +33,6 @@ def joint_ranges(positions: dict[str, Array], limits: dict[str, tuple[float, flo
     Args:
         positions: {joint: (k,) rad}.
         limits: {joint: (low, high) rad}, infinite where there is none.
-        title: Above all.
     """
     fig = figure(7.0, 1.2 + 0.62 * len(positions))
     ax = fig.subplots()
@@ -123,8 +122,6 @@ def torque_temperature(takes: dict[float, Sequence], joints: list[str], title: s
 
     Args:
         takes: {payload kg: recording}, with torque or temperature or both.
-        joints: Which, one column each.
-        title: Above all.
     """
     some = next(iter(takes.values()))
     rows = [("qpos", "position, rad"), ("tau", "torque, N·m"), ("temperature", "warming, K")]
@@ -158,10 +155,7 @@ def overlay(real: Sequence, twin_qpos: Array, joints: list[str], title: str) -> 
     """Command, recording and simulated twin of a few joints, and the gap between the last two below.
 
     Args:
-        real: The recording.
         twin_qpos: (T, n) rad, the nominal simulator's, n as in the recording.
-        joints: Which, one column each.
-        title: Above all.
     """
     fig = figure(7.0, 3.7)
     axes = fig.subplots(2, len(joints), sharex=True, squeeze=False, height_ratios=[1.5, 1])
@@ -194,7 +188,6 @@ def gap_by_payload(errors: dict[float, Array], joints: list[str], title: str) ->
     Args:
         errors: {payload kg: (sequences, n) rad, mean |gap| of a sequence}.
         joints: (n).
-        title: Above all.
     """
     fig = figure(7.0, 3.4)
     ax = fig.subplots()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +15,14 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.eval import dataset_figures as draw
+from gaponet.eval.evaluate import evenly
 from gaponet.eval.whose import who
 from gaponet.files import writing
 from gaponet.plot.style import save
+from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.pairing import pair_dataset
-
-Progress = Callable[[float, float, str], None]  # figures done, total, what is done now
 
 RANGE_SEQUENCES, RANGE_ROWS = 400, 40_000  # most read for joint ranges, and rows kept of each joint
 GAP_SEQUENCES = 240  # most paired for the gap against payload
@@ -33,7 +32,7 @@ SHOWN_S = 12.0  # s of a long motion
 
 
 def draw_all(
-    dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = lambda done, total, what: None
+    dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = silent
 ) -> tuple[list[Path], dict[str, str]]:
     """Write every picture that the dataset has data for.
 
@@ -41,7 +40,6 @@ def draw_all(
         dataset: At least one sequence. Twins that a picture needs and that are not there are made and kept.
         robot: The dataset's robot.
         out: Folder; made, pictures of the same name replaced.
-        progress: Called before each picture and while sequences are replayed.
 
     Returns:
         Files written; and {picture: why it was left out}.
@@ -79,7 +77,7 @@ class _Nothing(Exception):  # noqa: N818
 def joint_ranges(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     """Positions of each operated joint, of sequences that command it to move."""
     kept: dict[str, list[Array]] = defaultdict(list)
-    entries = spread(dataset.entries, RANGE_SEQUENCES)
+    entries = evenly(dataset.entries, RANGE_SEQUENCES)
     stride = max(1, sum(e.rows for e in entries) // RANGE_ROWS)
     for entry in entries:
         arrays = dataset.channels(entry, ("ctrl", "qpos"))
@@ -106,7 +104,7 @@ def composition(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
 def torque_temperature(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     """The motion whose torques change most, at up to four payloads, and the joints that bear it."""
     group = liveliest(dataset, robot)
-    payloads = spread(sorted({e.meta.payload_mass for e in group}), 4)
+    payloads = evenly(sorted({e.meta.payload_mass for e in group}), 4)
     takes = {p: shown(dataset.read(next(e for e in group if e.meta.payload_mass == p))) for p in payloads}
     heaviest = takes[max(takes)]
     assert heaviest.tau is not None
@@ -138,7 +136,7 @@ def gap_by_payload(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     whole = [g for g in groups if {e.meta.payload_mass for e in g} == payloads]
     if len(payloads) < 2 or not whole:
         raise _Nothing("no motion was played with several payloads")
-    chosen = spread(whole, max(1, GAP_SEQUENCES // len(payloads)))
+    chosen = evenly(whole, max(1, GAP_SEQUENCES // len(payloads)))
     entries = [next(e for e in g if e.meta.payload_mass == p) for g in chosen for p in sorted(payloads)]
     pair_dataset(dataset, robot, tell, entries)
     errors: dict[float, list[Array]] = defaultdict(list)
@@ -179,7 +177,7 @@ def liveliest(dataset: Dataset, robot: RobotSpec) -> list[Entry]:
         rows = dataset.channels(entry, ("tau",))["tau"][: round(SHOWN_S / entry.dt)]
         return float(swing(rows[:, robot.operated_index]).mean())
 
-    return max(spread(list(full.values()), MOTIONS), key=torque)
+    return max(evenly(list(full.values()), MOTIONS), key=torque)
 
 
 def swing(values: Array) -> Array:
@@ -196,10 +194,3 @@ def shown(sequence: Sequence) -> Sequence:
 def most(robot: RobotSpec, size: Array) -> list[str]:
     """Operated joints with the largest values, in the robot's order."""
     return [robot.operated[i] for i in sorted(np.argsort(-size)[:COLUMNS])]
-
-
-def spread(items: list[Any], most: int) -> list[Any]:
-    """All, or so many of them evenly spaced."""
-    if len(items) <= most:
-        return items
-    return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]

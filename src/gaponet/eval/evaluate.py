@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,12 +27,14 @@ from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.plot.methods import IDENTIFIED, method, title
+from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of, require_kept
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 from gaponet.structure import read_json
 
+T = TypeVar("T")
 SHOWN = 8  # sequences whose trajectories are kept for the report
 LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "fno", "gaponet")  # kinds of model
 ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
@@ -62,18 +63,16 @@ def evaluate(
     dataset: Dataset,
     robot: RobotSpec,
     motions: tuple[str, ...] = (),
-    progress: Callable[[str, int, int], None] = lambda method, done, total: None,
+    progress: Progress = silent,
 ) -> Evaluation:
     """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
 
     Args:
         runs_dirs: Training runs; nothing that one of them was trained or chosen on is chosen or called unseen. The
             first one's test motions and delay + offset baseline apply.
-        dataset: The one trained on, or another.
         robot: The dataset's, which must be the one that the runs keep: the baseline is theirs.
         motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
             trained on.
-        progress: Called with method, control steps done, total.
     """
     dataset.require_robot(robot)
     models: dict[str, GapModel] = {}
@@ -95,18 +94,19 @@ def evaluate(
     ctrl = [s.ctrl[:, op] for s in sequences]
     moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
     for name, simulator, corrector in _methods(runs_dirs[0], models, nominal, robots):
-        twins = replay(sequences, simulator, corrector, progress=partial(progress, name), lock_idle=True)
+        twins = replay(sequences, simulator, corrector, progress=noted(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
     calibrated = calibration.load(runs_dirs[0], next(iter(models.values())).weights_hash())
     if any(s.meta.unit_id in calibrated for s in sequences):
         name = next(iter(models))
-        twins = _by_unit(sequences, models[name], robots[name], calibrated, partial(progress, "calibrated"))
+        twins = _by_unit(sequences, models[name], robots[name], calibrated, noted(progress, "calibrated"))
         done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
+    methods = {name: summary(part, robot) for name, part in done_runs.items()}
     result = {
-        "methods": {name: summary(part, robot) for name, part in done_runs.items()},
-        "ratio_to_nominal": _ratios(done_runs),
+        "methods": methods,
+        "ratio_to_nominal": {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()},
         "dataset": dataset.path.name,
         "sequences": len(sequences),
         "motions": sorted({s.meta.motion for s in sequences}),
@@ -181,10 +181,17 @@ def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
+def evenly(items: list[T], most: int) -> list[T]:
+    """All, or so many of them evenly spaced, the first and the last among them."""
+    if len(items) <= most:
+        return items
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]
+
+
 def save(evaluation: Evaluation, run: Path) -> None:
     """metrics.json and trajectories.npz in the run folder: the newest evaluation, all that the report needs."""
     reals = evaluation.runs["nominal"]
-    picked = sorted({round(i) for i in np.linspace(0, len(reals) - 1, min(SHOWN, len(reals)))})
+    picked = evenly(list(range(len(reals))), SHOWN)
     shown = [reals[i].real.meta for i in picked]
     result = evaluation.result | {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
@@ -203,16 +210,12 @@ def save(evaluation: Evaluation, run: Path) -> None:
             arrays[f"{row}/delta/{name}"] = delta[i]
     with writing(run, "run"):
         with whole(run / "trajectories.npz") as temporary:
-            np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})
+            np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
         write_json(run / "metrics.json", result)
 
 
 def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
     """The simulator that a run's model corrects, as the run keeps it: the nominal one, or an identified one.
-
-    Args:
-        run: Run folder.
-        robot: The robot of the data, or the one asked for.
 
     Raises:
         ModelError: They differ before identification: errors would be told against another baseline.
@@ -263,8 +266,3 @@ def _delta_summary(parts: list[Array], sequences: list[Sequence]) -> dict[str, f
         "max": float(max(np.abs(d).max() for d in parts)),
         "rate": float(np.mean([np.abs(np.diff(d, axis=0)).mean() for d in parts]) / dt),
     }
-
-
-def _ratios(done: dict[str, list[Run]]) -> dict[str, float]:
-    nominal = np.mean([np.abs(r.error).mean() for r in done["nominal"]])
-    return {name: float(np.mean([np.abs(r.error).mean() for r in part]) / nominal) for name, part in done.items()}

@@ -10,10 +10,13 @@ from matplotlib.figure import Figure
 
 from gaponet.arrays import Array
 from gaponet.data.repeatability import MOVED
+from gaponet.data.signals import busiest
 from gaponet.plot.charts import Course, against, bars, lines
 from gaponet.plot.methods import colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
 from gaponet.plot.table import Spread
+
+WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:
@@ -90,9 +93,6 @@ def trajectories(
 
     Args:
         arrays: For each row ROW/METHOD, recorded, command, delta/METHOD, (T, n) rad.
-        shown: What is known of each row.
-        joints: Names of the n operated joints.
-        methods: In the order of drawing.
 
     Returns:
         By row, those first in which the robot moved most.
@@ -101,7 +101,8 @@ def trajectories(
     drawn: dict[int, tuple[Array, dict[str, Course]]] = {}
     for row, facts in enumerate(shown):
         recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
-        window = _window(recorded, dt)
+        start = busiest(recorded, rows := round(WINDOW / dt))
+        window = slice(start, min(start + rows, len(recorded)))
         drawn[row] = np.arange(len(recorded))[window] * dt, _courses(arrays, row, joints, methods, window, dt)
     limit = max(
         (
@@ -135,16 +136,6 @@ def _courses(
             {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(asked, dt),
         )  # fmt: skip
     return courses
-
-
-def _window(recorded: Array, dt: float, seconds: float = 20.0) -> slice:
-    """The stretch with the most motion; a two-minute plot shows nothing."""
-    n = round(seconds / dt)
-    if len(recorded) <= n:
-        return slice(0, len(recorded))
-    moved = np.concatenate([[0], np.abs(np.diff(recorded, axis=0)).sum(axis=1).cumsum()])
-    start = int((moved[n:] - moved[:-n]).argmax())
-    return slice(start, start + n)
 
 
 def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from gaponet.metrics import Run, metrics, runs, standard_error
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.plot.methods import method
+from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import model_hash
@@ -34,7 +34,7 @@ def gap_by_step(
     dataset: Dataset,
     robot: RobotSpec,
     motions: tuple[str, ...] = (),
-    progress: Callable[[str, int, int], None] = lambda step, done, total: None,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Mean |error| left after each step, in free run over whole motions that the run never saw.
 
@@ -45,10 +45,7 @@ def gap_by_step(
 
     Args:
         run: Run folder; its split, baseline, simulator and model apply.
-        dataset: The one trained on, or another.
         robot: The dataset's, which must be the one that the run keeps: the baseline is the run's.
-        motions: Only these.
-        progress: Called with step, control steps done, total.
 
     Returns:
         {"left": {step: rad}, "removed": {step: [rad, standard error]}, "unexplained": rad, "by_joint": {joint: the same
@@ -69,8 +66,8 @@ def gap_by_step(
     steps.append((method(model.config.kind, simulator), simulator, model.corrector(simulator)))
     done = {}
     for name, physics, corrector in steps:
-        tell = partial(progress, name)
-        twins = replay(sequences, physics, corrector, lock_idle=True, progress=tell, creeps=name == "friction")
+        told = noted(progress, name)
+        twins = replay(sequences, physics, corrector, lock_idle=True, progress=told, creeps=name == "friction")
         done[name] = runs(sequences, [t.qpos for t in twins], robot)
     payloads = sorted({s.meta.payload_mass for s in sequences})
     columns = {j: [i] for i, j in enumerate(robot.operated)}
@@ -154,9 +151,8 @@ def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str
     groups: dict[Any, Repetitions] = defaultdict(Repetitions)
     angles: list[Array] = []
     for s in sequences:
-        m = s.meta
         angles.append(s.qpos[:, robot.operated_index])
-        same = (m.motion, m.unit_id, m.payload_mass, m.payload_side, round(s.dt * 1e6))
+        same = (*s.meta.slot, round(s.dt * 1e6))
         groups[same].add(s)
         for period in periods(s):
             groups[*same, "period"].add(period)

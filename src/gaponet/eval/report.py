@@ -22,11 +22,11 @@ from gaponet.files import write_text
 from gaponet.model.artifact import GapModel, how_trained
 from gaponet.plot.methods import method, title
 from gaponet.plot.table import Table
+from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.sim.kept import require_kept
 
-Tell = Callable[[str, float, float], None]
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN = 3  # motions shown without a click
 
@@ -36,17 +36,15 @@ def write_report(
     dataset: Path | None = None,
     also: tuple[Path, ...] = (),
     robot: str | None = None,
-    progress: Tell = lambda what, done, total: None,
+    progress: Progress = silent,
     picture: Picture | None = None,
 ) -> Path:
     """Write RUN/report.html from the run's newest evaluation, evaluating first where there is none.
 
     Args:
-        run: Run folder.
         dataset: Evaluate on this dataset first; default the newest evaluation, or the test motions of the training set.
         also: Further runs to compare (only when evaluating).
         robot: Robot name or folder, if not the one that the run keeps.
-        progress: Called with what is being done.
         picture: Draws the robot (view.portrait); left out where it can draw nothing.
     """
     model = GapModel.load(run)
@@ -59,17 +57,19 @@ def write_report(
     config, curve, gap = read_config(run), read_progress(run), read_gap(run)
     own = method(model.config.kind, spec)
     _require_complete(model, own, metrics, curve, spec)
-    progress("drawing", 0, 1)
+    progress(0, 1, "drawing")
     commands = [config.get("command", ""), metrics["command"], shlex.join(["gaponet", "report", str(run)])]
     photo = () if picture is None else _photo(picture, arrays, metrics, spec, own)
     text = _page(model.card, own, config, metrics, arrays, curve, spec, gap, photo, commands)
     path = run / "report.html"
     write_text(path, text)
-    progress("drawing", 1, 1)
+    progress(1, 1, "drawing")
     return path
 
 
-def _evaluate(run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec | None, progress: Tell) -> None:
+def _evaluate(
+    run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec | None, progress: Progress
+) -> None:
     from gaponet.eval.evaluate import evaluate, save
 
     place = dataset or run / read_config(run)["dataset"]

@@ -111,9 +111,7 @@ class Card(TypedDict):
     joint_names: Annotated[tuple[Name, ...], Len(1, 500)]
     kp: tuple[float, ...]
     kd: tuple[float, ...]
-    simulator: NotRequired[str]
-    simulator_hash: NotRequired[str]
-    """Hash of the MJCF's text, in cards written before November 2026."""
+    simulator: str
     model: dict[str, Json]
     qpos_range: NotRequired[tuple[tuple[float | None, float | None], ...]]
     dt: NotRequired[tuple[Annotated[float, Interval(ge=1e-4, le=1)], ...]]
@@ -133,7 +131,7 @@ class Card(TypedDict):
     parity_rad: NotRequired[float]
     motions: NotRequired[dict[str, tuple[str, ...]]]
     val_mpjae: NotRequired[dict[Literal["model", "nominal"], Number]]
-    sensor_r2: NotRequired[SensorR2 | Number]
+    sensor_r2: NotRequired[SensorR2 | None]
     versions: NotRequired[dict[str, str]]
     sha256: NotRequired[dict[str, str]]
 
@@ -148,8 +146,6 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     read_format(Card, file, FORMAT, ModelError, mend)
     card = read_json(dict[str, Any], file, ModelError, mend)
     config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
-    if "simulator" not in card and "simulator_hash" not in card:
-        raise ModelError(f"{file}: simulator: is missing; {mend}")
     n = len(card["joint_names"])
     lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
     for name, values in (lists | {f"recorded.{k}": v for k, v in card.get("recorded", {}).items()}).items():
@@ -242,7 +238,7 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        trained, asked = card.get("simulator") or card["simulator_hash"], model_hash(robot)
+        trained, asked = card["simulator"], model_hash(robot)
         if trained != asked:
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "

@@ -37,7 +37,6 @@ class Calibration:
     """One unit's servo parameters.
 
     Attributes:
-        unit_id: The unit.
         weights: Hash of the model.onnx that they were fitted under.
         servos: Joint → kp N·m/rad, damping N·m·s/rad, frictionloss N·m, offset rad, delay s.
         logs: Content hashes of the recordings used.
@@ -73,9 +72,7 @@ def calibrate(
 
     Args:
         model: Its correction is applied while fitting.
-        simulator: The one that the model corrects.
         sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
-        seconds: How much is used.
         unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
         progress: Called with evaluations done, at most, RMS error in rad.
     """

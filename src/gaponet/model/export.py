@@ -42,8 +42,6 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
 
     Args:
         net: Trained network, normalisers inside.
-        folder: Artifact folder, made if missing.
-        card: What the artifact is; see model/artifact.py.
         samples: Observations [o_t | a_t] to compare on, (k, dim) float32, of states really visited.
 
     Returns:
@@ -96,13 +94,7 @@ def _require(folder: Path, what: str, answer: Array, expected: Array) -> float:
 
 
 def trained_network(run: Path, config: Any, n: int) -> DeltaNet:
-    """The network that a run kept, from its checkpoint.
-
-    Args:
-        run: Folder of gaponet train.
-        config: Shape of the model.
-        n: Operated joints.
-    """
+    """The network that a run kept, from its checkpoint."""
     path = run / "checkpoint.pt"
     if not path.is_file():
         raise ModelError(f"{run}: no checkpoint.pt; give a run folder of gaponet train, not the artifact alone")

@@ -46,11 +46,6 @@ class FusedForward:
     """
 
     def __init__(self, weights: dict[str, Array], batch: int) -> None:
-        """
-        Args:
-            weights: As model/fuse.py made them.
-            batch: Rows of x.
-        """
         self.weights, self.steps = weights, list[Callable[[], object]]()
         kind, n = str(weights["kind"]), len(weights["bias"])
         self.one = np.ones((batch, weights["relative"].shape[0] + 1), np.float32)  # [x | 1]

@@ -41,9 +41,7 @@ class DeltaLoop:
     ) -> None:
         """
         Args:
-            config: Shape of the model.
             qpos_range: Limits of the operated joints, (n, 2) rad.
-            num_envs: Robots side by side.
             network: The model; None where the correction is found elsewhere, as in training: observe and push.
             ask: The simulator, where config.asks_simulator.
             points: x → offsets, where these are learned; without it the fixed probes are asked.

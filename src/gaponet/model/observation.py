@@ -39,8 +39,6 @@ class History:
     def __init__(self, config: ModelConfig, n: int, x: Any) -> None:
         """
         Args:
-            config: Shape of the model.
-            n: Operated joints.
             x: The network's input, (num_envs, dim). Without a stride the frames are kept there and nothing is copied.
         """
         layout = Layout(config, n)

@@ -122,7 +122,7 @@ def export_torchscript(model: GapModel, run: Path, path: Path) -> float:
         temporary.write_bytes(content.getvalue())
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
-            difference = compare(torch.jit.load(str(temporary)), model)
+            difference = largest_difference(torch.jit.load(str(temporary)), model)
         if not difference <= PARITY:
             raise ModelError(
                 f"{path}: TorchScript and {model.path / CARD} differ by {difference:.2e} rad; not written. "
@@ -131,7 +131,7 @@ def export_torchscript(model: GapModel, run: Path, path: Path) -> float:
     return difference
 
 
-def compare(module: Any, model: GapModel, num_envs: int = 3) -> float:
+def largest_difference(module: Any, model: GapModel, num_envs: int = 3) -> float:
     """Largest |TorchScript − artifact| on random motions, one environment beginning anew half-way, rad."""
     rng = np.random.default_rng(0)
     n, loop, worst = len(model.card["joint_names"]), model.loop(num_envs), 0.0

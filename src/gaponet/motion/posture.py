@@ -86,10 +86,10 @@ def _limb(model: mujoco.MjModel, operated: tuple[str, ...], joint: str) -> list[
     """Operated joints on the same chain as `joint`: those it carries and those that carry it."""
     body = {name: int(model.joint(name).bodyid[0]) for name in operated}
     mine = body[joint]
-    return [name for name, b in body.items() if b in _carriers(model, mine) or mine in _carriers(model, b)]
+    return [name for name, b in body.items() if b in carriers(model, mine) or mine in carriers(model, b)]
 
 
-def _carriers(model: mujoco.MjModel, body: int) -> set[int]:
+def carriers(model: mujoco.MjModel, body: int) -> set[int]:
     """The body and all it hangs on, without the world."""
     chain = set()
     while body:

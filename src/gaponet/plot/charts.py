@@ -84,8 +84,6 @@ def against(
         time: (T,) s.
         joints: What the column is called → what it shows.
         looks: Label and colour of each method, of the reference, and of "command".
-        reference: Its key in looks.
-        title: Above all.
         limit: Largest error that has to fit, mrad; default that of this figure.
     """
     some = next(iter(joints.values()))

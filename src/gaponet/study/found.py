@@ -14,9 +14,10 @@ from gaponet.errors import ModelError
 from gaponet.eval.evaluate import split_of_run
 from gaponet.eval.whose import label
 from gaponet.plot.table import Spread, Table
+from gaponet.progress import Running
 from gaponet.sim.model import model_hash
 from gaponet.study.measure import Outcome, evaluate_baselines, train_and_evaluate
-from gaponet.study.pool import RESULT, Cell, Running, run_cells
+from gaponet.study.pool import RESULT, Cell, run_cells
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
 
@@ -45,7 +46,6 @@ class Found:
     Attributes:
         runs: What each finished seed gave, as its cell.json holds it.
         baselines: Errors of the baselines on the same test motions: {"nominal", "delay_offset", maybe "identified"}.
-        cells: The finished cells themselves.
     """
 
     runs: Mapping[Key, ListOf[Outcome]]

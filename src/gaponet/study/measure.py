@@ -37,15 +37,7 @@ def train_and_evaluate(cell: Cell, tell: Tell) -> None:
 def evaluate_model(
     run: Path, dataset: Dataset, robot: RobotSpec, holdout: tuple[str, ...], nthread: int = 0
 ) -> Outcome:
-    """Metrics of a run's artifact on the test motions, by group of units.
-
-    Args:
-        run: Run folder.
-        dataset: The one trained on.
-        robot: The simulator that the model corrects.
-        holdout: Units never trained on.
-        nthread: Threads of the simulator, 0 for all cores.
-    """
+    """Metrics of a run's artifact on the test motions, by group of units."""
     model = GapModel.load(run)
     sequences = dataset.sequences(choose([run], dataset)[0])
     for dt in sorted({s.dt for s in sequences}):

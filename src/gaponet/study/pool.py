@@ -27,13 +27,14 @@ from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.files import write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
+from gaponet.progress import Running
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.study.variant import Variant
 from gaponet.training.budget import Budget
+from gaponet.training.config import TrainConfig
 
 Tell = Callable[[float, str], None]  # share done, what is going on
-Running = dict[str, tuple[float, str]]  # the same of each running cell, by name
 
 SETUP, RESULT = "setup.json", "cell.json"
 POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -106,10 +107,17 @@ def plan(
         if not file.is_file():
             raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
         kept = read_kept(file)
+        kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig()))))
         if kept != wanted:
             changed = ", ".join(k for k in wanted if kept.get(k) != wanted[k])
             raise UsageError(f"{cell.folder}: kept from a comparison with another {changed}; choose another --out")
     return cells
+
+
+def _completed(kept: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """A config written before some of today's fields existed, with their defaults."""
+    nested = {k: _completed(kept[k], v) for k, v in defaults.items() if isinstance(v, dict) and k in kept}
+    return defaults | kept | nested
 
 
 def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
@@ -182,9 +190,7 @@ def run_cells(
     """Do the work of each cell in a process of its own; returns the failures, name → reason.
 
     Args:
-        cells: Those to do, in order.
         work: What to do with one; a module's function, since processes are spawned.
-        workers: Processes at once.
         show: Called with the running cells and how many are done, whenever something changes.
 
     Raises:

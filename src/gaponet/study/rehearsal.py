@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry
+from gaponet.eval.evaluate import evenly
 from gaponet.robot import RobotSpec
 
 MOTIONS, PAYLOADS, UNITS = 6, 3, 2  # a split by motion has 3 + 1 + 2 of 6
@@ -15,7 +16,7 @@ SECONDS = 2.0
 
 def rehearsal(dataset: Dataset) -> list[Entry]:
     """Few motions, payloads and units (evenly spaced), one repetition, all rates: every group stays represented."""
-    payloads = _few(sorted({e.meta.payload_mass for e in dataset.entries}), PAYLOADS)
+    payloads = evenly(sorted({e.meta.payload_mass for e in dataset.entries}), PAYLOADS)
     units = sorted({e.meta.unit_id for e in dataset.entries})[:UNITS]
     motions = hash_order(e.meta.motion for e in dataset.entries)[:MOTIONS]
     first = min(e.meta.repetition for e in dataset.entries)
@@ -34,10 +35,3 @@ def take(dataset: Dataset, robot: RobotSpec, entries: Iterable[Entry], out: Path
         if part.find(start.content_hash()) is None:
             part.append(start)
     return part
-
-
-def _few(values: list[float], most: int) -> list[float]:
-    """So many of them, the first and the last among them."""
-    if len(values) <= most:
-        return values
-    return [values[round(i * (len(values) - 1) / (most - 1))] for i in range(most)]

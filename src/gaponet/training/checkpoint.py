@@ -19,11 +19,11 @@ from gaponet.files import whole
 from gaponet.training.env import DeltaEnv
 from gaponet.training.warm_start import WarmStart
 
-State = dict[str, Any]
+StateDict = dict[str, Any]
 ROWS = ("row", "first", "last", "now", "elapsed")  # of each environment
 
 
-def write_state(path: Path, state: State) -> None:
+def write_state(path: Path, state: StateDict) -> None:
     """Write a checkpoint whole or not at all; OSError where there is no room for it."""
     content = io.BytesIO()  # torch does not say which error it met on a disk
     torch.save(state, content)
@@ -41,7 +41,7 @@ def set_rng(rng: np.random.Generator, text: str) -> None:
     rng.bit_generator.state = json.loads(text)
 
 
-def env_state(env: DeltaEnv) -> State:
+def env_state(env: DeltaEnv) -> StateDict:
     """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
     arrays = {name: getattr(env, name) for name in ROWS} | _inputs(env) | env.sim.state()
     return {
@@ -56,7 +56,7 @@ def _inputs(env: DeltaEnv) -> dict[str, np.ndarray]:
     return {"frames": env.loop.history.frames, "age": env.loop.age, "more": env.loop.more}
 
 
-def restore_env(env: DeltaEnv, state: State) -> None:
+def restore_env(env: DeltaEnv, state: StateDict) -> None:
     """Undo env_state in an environment made alike."""
     arrays = {name: x.numpy() for name, x in state["arrays"].items()}
     for name in ROWS:
@@ -68,13 +68,13 @@ def restore_env(env: DeltaEnv, state: State) -> None:
     set_rng(env.rng, state["rng"])
 
 
-def round_state(warm: WarmStart) -> State:
+def round_state(warm: WarmStart) -> StateDict:
     """What the next round's roll-outs follow from."""
     net = {name: x.clone() for name, x in warm.net.state_dict().items()}
     return {"net": net, "rng": rng_text(warm.env.rng)}
 
 
-def warm_state(warm: WarmStart, rounds: list[State]) -> State:
+def warm_state(warm: WarmStart, rounds: list[StateDict]) -> StateDict:
     """A warm start between rounds; `rounds`: round_state before each of them."""
     return {
         "rounds": rounds,
@@ -84,7 +84,7 @@ def warm_state(warm: WarmStart, rounds: list[State]) -> State:
     }
 
 
-def restore_warm(warm: WarmStart, state: State) -> None:
+def restore_warm(warm: WarmStart, state: StateDict) -> None:
     """Roll the past rounds out again, then undo warm_state; the network is left as it is."""
     present = {name: x.clone() for name, x in warm.net.state_dict().items()}
     for i, before in enumerate(state["rounds"]):

@@ -12,7 +12,7 @@ import torch
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text
 from gaponet.model.layers import DeltaNet
-from gaponet.training.checkpoint import State, write_state
+from gaponet.training.checkpoint import StateDict, write_state
 from gaponet.training.sensor_fit import Report
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
@@ -22,8 +22,8 @@ CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
 class Kept:
     """The best networks so far, what was done, and where the stages stand."""
 
-    best_state: State
-    trained_state: State
+    best_state: StateDict
+    trained_state: StateDict
     best: float = float("inf")
     trained: float = float("inf")
     """Validation error of the best network that was fitted, with gain 1."""
@@ -36,11 +36,11 @@ class Kept:
     anew: bool = False
     """Whether PPO began from the untrained network, the warm start having been worse than no correction."""
     sensor_r2: Report | None = None
-    learner: State | None = None
+    learner: StateDict | None = None
     """Of PPO: its critic and optimisers."""
-    env: State | None = None
+    env: StateDict | None = None
     """State of PPO's environments."""
-    warm: State | None = None
+    warm: StateDict | None = None
     progress: list[dict[str, Any]] = field(default_factory=list)
     """Lines of progress.jsonl."""
     dataset: str = ""
@@ -60,8 +60,6 @@ class Kept:
         """Read a checkpoint: into the network, into torch's random numbers, and the rest.
 
         Args:
-            out: Run folder.
-            net: Takes the weights.
             dataset: Hash of the recordings to go on with.
 
         Raises:

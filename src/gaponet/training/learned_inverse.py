@@ -29,8 +29,6 @@ def visit(robot: RobotSpec, model: GapModel, targets: list[Array], masses: Array
     """What N shadows pass through: x (T, N, dim) float32 and u − a′ (T, N, n) rad.
 
     Args:
-        robot: The simulator that the model corrects.
-        model: What is inverted.
         targets: N motions, (T, n) rad each, cut to the shortest.
         masses: (N,) kg.
     """
@@ -76,10 +74,7 @@ def learn_inverse(
     """Fit and write the inverse of a model, beside it.
 
     Args:
-        robot: The simulator that the model corrects.
-        model: What is inverted.
         motions: Targets at the control period, (T, n) rad each.
-        steps: Gradient steps of the fit.
         seed: Seed of the network, of the payloads and which motions judge.
 
     Returns:

@@ -46,7 +46,7 @@ from gaponet.sim.replay import replay
 from gaponet.structure import validated
 from gaponet.training.budget import Budget, Status
 from gaponet.training.checkpoint import (
-    State,
+    StateDict,
     env_state,
     restore_env,
     restore_warm,
@@ -163,7 +163,7 @@ class Trainer:
         labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
         warm = WarmStart(self.net, env, labels, config, self.config.seed, self.config.threads)
         warm.report = self.kept.sensor_r2
-        rounds: list[State] = []
+        rounds: list[StateDict] = []
         if self.kept.rounds_done == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
@@ -222,7 +222,7 @@ class Trainer:
         self.kept.learner, self.kept.env = learner.state(), env_state(env)
         self._consider()
 
-    def _ppo_start(self) -> State:
+    def _ppo_start(self) -> StateDict:
         """The best of the warm start or, where that is worse than no correction, the untrained network beside it."""
         best = self.kept.trained_state
         self.kept.anew = bool(recipe(self.config).rounds) and self._in_vain()

@@ -27,7 +27,7 @@ Report = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: �
 
 
 @dataclass(frozen=True)
-class Asked:
+class Answers:
     """States, and what the simulator answered there.
 
     Attributes:
@@ -40,9 +40,9 @@ class Asked:
     answers: Tensor
     offsets: Tensor | None
 
-    def __getitem__(self, rows: Any) -> Asked:
+    def __getitem__(self, rows: Any) -> Answers:
         offsets = None if self.offsets is None else self.offsets[rows]
-        return Asked(self.features[rows], self.answers[rows], offsets)
+        return Answers(self.features[rows], self.answers[rows], offsets)
 
     def predicted(self, net: DeltaNet) -> tuple[Tensor, Tensor]:
         """Mean and log-variance, standardised."""
@@ -59,7 +59,7 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
-) -> Asked:
+) -> Answers:
     """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
     "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
@@ -67,13 +67,8 @@ def sensor_labels(
 
     Args:
         net: Its config says the probes.
-        robot: The simulator asked.
         x: What the network was given at those states, (k, dim).
         qpos, qvel: All joints that are not locked, (k, n_free).
-        conditions: Payload and period of each state.
-        locked: Joints clamped in the simulator.
-        seed: Seed of the perturbations.
-        nthread: Threads of the simulator, 0 for all cores.
     """
     rng = np.random.default_rng(seed)
     third = rng.integers(0, 3, len(qpos))
@@ -95,7 +90,7 @@ def sensor_labels(
     answers = oracle(q, v, offsets)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
-    return Asked(
+    return Answers(
         features.clone(),
         torch.from_numpy(answers if offsets is not None else answers.reshape(len(q), -1)),
         None if offsets is None else torch.from_numpy(offsets),
@@ -112,7 +107,7 @@ def shift_positions(shift: Array, at: Layout) -> Array:
     return out
 
 
-def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: int) -> Report:
+def fit_predictor(net: DeltaNet, asked: Answers, joints: tuple[str, ...], seed: int) -> Report:
     """Gaussian likelihood on three quarters of the states; returns R² on the rest.
 
     The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
@@ -141,7 +136,7 @@ def fit_predictor(net: DeltaNet, asked: Asked, joints: tuple[str, ...], seed: in
     return explained(net, asked[:held], joints)
 
 
-def explained(net: DeltaNet, asked: Asked, joints: tuple[str, ...]) -> Report:
+def explained(net: DeltaNet, asked: Answers, joints: tuple[str, ...]) -> Report:
     """R² of the predictor's mean: the share of the answers' variance over these states, averaged over sensor values."""
     with torch.inference_mode():
         truth = net.predictor.outputs(asked.answers)

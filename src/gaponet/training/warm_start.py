@@ -144,10 +144,6 @@ def fit_inputs(
     Args:
         net: With no statistics yet.
         env: Whose simulator is asked.
-        x: Samples of the inputs.
-        states: How many the simulator is asked at.
-        seed: Seed of the choice of states.
-        nthread: Threads of the simulator, 0 for all cores.
 
     Returns:
         Its R² on held-out states; None for a network without one.

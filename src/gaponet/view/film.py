@@ -76,15 +76,7 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
         Number of pictures.
     """
     require_kind(path)
-    with whole(path) as temporary:
-        return _write(camera, clip, temporary, progress)
-
-
-def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int], None]) -> int:
     kind = path.suffix.lower()
-    if kind == ".png":
-        camera.picture(furthest(camera.scene.shown, clip)).save(path)
-        return 1
     hundredths = max(round(100 / clip.fps), 2)  # a GIF counts in 1/100 s, and viewers slow down below 2
     times = clip.times(hundredths / 100 if kind == ".gif" else 1 / clip.fps)
 
@@ -93,11 +85,14 @@ def _write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int]
             yield camera.picture(float(time))
             progress(i + 1, len(times))
 
-    if kind == ".gif":
-        _write_gif(list(pictures()), path, 10 * hundredths)
-    else:
-        _write_mp4(pictures(), path, clip.fps, (camera.layout.width, camera.layout.height))
-    return len(times)
+    with whole(path) as temporary:
+        if kind == ".gif":
+            _write_gif(list(pictures()), temporary, 10 * hundredths)
+        elif kind == ".mp4":
+            _write_mp4(pictures(), temporary, clip.fps, (camera.layout.width, camera.layout.height))
+        else:
+            camera.picture(furthest(camera.scene.shown, clip)).save(temporary)
+    return 1 if kind == ".png" else len(times)
 
 
 def furthest(shown: SideBySide, clip: Clip) -> float:

@@ -61,7 +61,6 @@ class Camera:
         """Open a GL context.
 
         Args:
-            scene: What to render.
             width: Width of the picture, pixels, even; the height follows from the robots.
             speed, magnify: Said on the picture.
             course: Draw the error against time below.

@@ -26,7 +26,6 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
 
     Args:
         robot: Joints that are not operated stand at home.
-        meta: What was recorded.
         dt: Period of the rows, s.
         qpos: By method, "recorded" among them, (T, n operated) rad.
 
@@ -37,14 +36,14 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     from gaponet.view.film import Clip, furthest
     from gaponet.view.picture import Camera
     from gaponet.view.scene import Scene
-    from gaponet.view.side_by_side import Played, SideBySide
+    from gaponet.view.side_by_side import Copy, SideBySide
 
     whole = {}
     for method, q in qpos.items():
         whole[method] = np.tile(robot.qpos_home, (len(q), 1))
         whole[method][:, robot.operated_index] = q
     base = whole["recorded"]
-    motions = tuple(Played(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
+    motions = tuple(Copy(m, q, np.abs(qpos[m] - qpos["recorded"]).mean(axis=1)) for m, q in whole.items())
     shown = SideBySide(Sequence(meta, robot.joint_names, dt, base, base, 0 * base), robot, motions, None)
     clip = Clip.of(shown, None, 8.0)
     moment = furthest(shown, clip)

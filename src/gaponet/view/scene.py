@@ -15,10 +15,11 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.errors import RobotError, UsageError
 from gaponet.motion.collision import Shapes
+from gaponet.motion.posture import carriers
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
 from gaponet.structure import read_toml
-from gaponet.view.side_by_side import Played, SideBySide
+from gaponet.view.side_by_side import Copy, SideBySide
 
 PAYLOAD = (0.93, 0.60, 0.10, 1.0)
 GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
@@ -69,7 +70,6 @@ class Scene:
         """Build and fit.
 
         Args:
-            shown: What to show.
             view: The camera's direction decides the direction of the row.
             ghost: Draw the recording, translucent, into each other copy.
             rows: Frames that have to fit.
@@ -115,7 +115,7 @@ class Scene:
         across, up = self.view.axes
         return across * (left + right) / 2 + up * (bottom + top) / 2
 
-    def _haunted(self) -> list[Played]:
+    def _haunted(self) -> list[Copy]:
         return [m for m in self.shown.motions if m.method != "recorded"]
 
     def _address(self, prefix: str) -> Array:
@@ -234,11 +234,9 @@ def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
     moving = {int(model.jnt_bodyid[model.joint(name).id]) for name in robot.operated}
     found: set[int] = set()
     for body in range(1, model.nbody):
-        chain = [body]
-        while chain[-1]:
-            chain.append(int(model.body_parentid[chain[-1]]))
-        if moving.intersection(chain):
-            found.update(chain)
+        chain = carriers(model, body)
+        if moving & chain:
+            found |= chain
     return found
 
 

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.data.signals import busiest
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.evaluate import Seen, corrected_robot
 from gaponet.model.artifact import GapModel
 from gaponet.plot.methods import colour, method, title
+from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
 
 
 @dataclass(frozen=True)
-class Played:
+class Copy:
     """One copy of the robot.
 
     Attributes:
@@ -57,15 +57,13 @@ class SideBySide:
     """The motions of one recording.
 
     Attributes:
-        real: The recording.
-        robot: Whose.
         motions: Target, nominal, corrected, recorded, in this order.
         seen: Whether a shown model was trained or chosen on this recording; None without a model.
     """
 
     real: Sequence
     robot: RobotSpec
-    motions: tuple[Played, ...]
+    motions: tuple[Copy, ...]
     seen: bool | None
 
     def only(self, methods: tuple[str, ...]) -> SideBySide:
@@ -91,10 +89,8 @@ class SideBySide:
 
     def busiest(self, seconds: float) -> float:
         """Start of the stretch of this length with the most motion, s."""
-        n = max(round(seconds / self.real.dt), 1)
-        op = self.robot.operated_index
-        moved = np.concatenate([[0.0], np.abs(np.diff(self.real.qpos[:, op], axis=0)).sum(axis=1).cumsum()])
-        return 0.0 if len(moved) <= n else float((moved[n:] - moved[:-n]).argmax() * self.real.dt)
+        rows = max(round(seconds / self.real.dt), 1)
+        return busiest(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
 
 
 def pick(
@@ -122,17 +118,9 @@ def side_by_side(
     entry: Entry,
     robot: RobotSpec,
     runs: ListOf[Path] = (),
-    progress: Callable[[str, int, int], None] = lambda method, done, total: None,
+    progress: Progress = silent,
 ) -> SideBySide:
-    """Replay a recording in the nominal simulator, and under each run's shipped model in the simulator it corrects.
-
-    Args:
-        dataset: Where the recording is.
-        entry: Which one.
-        robot: The robot of the dataset.
-        runs: Run folders.
-        progress: Called with method, control steps done, total.
-    """
+    """Replay a recording in the nominal simulator, and under each run's shipped model in the simulator it corrects."""
     dataset.require_robot(robot)
     real = dataset.read(entry)
     simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (nominal_of(robot), None)}
@@ -146,9 +134,9 @@ def side_by_side(
     target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
     shown = {"target": target}
     for name, (simulator, corrector) in simulators.items():
-        told = partial(progress, name)
+        told = noted(progress, name)
         shown[name] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
     op = robot.operated_index
-    motions = tuple(Played(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
+    motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
     return SideBySide(real, robot, motions, any(entry in Seen.by(run) for run in runs) if runs else None)

@@ -25,10 +25,7 @@ class WebScene:
         """Start a server.
 
         Args:
-            scene: What to show.
-            clip: Which part of the recording.
             port: On this machine only.
-            magnify: Said beside the scene.
         """
         try:
             import viser

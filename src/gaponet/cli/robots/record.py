@@ -56,11 +56,8 @@ def record(
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):
         recording, played, spec = perform(screen, name, request, count)
         known = Dataset.create(out, spec)
-        same = [
-            e for e in known.entries
-            if (e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.meta.payload_side)
-            == (played.name, unit_id, payload_mass, side)
-        ]  # fmt: skip
+        slot = (played.name, unit_id, payload_mass, side)
+        same = [e for e in known.entries if e.meta.slot == slot]
         stem = f"{played.name}-{unit_id}-{payload_mass:g}kg-{len(same)}"
         stem = recording.save(out / "recordings", stem).stem
         if recording.fault:

@@ -61,7 +61,7 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
         "robot": config["robot"],
         "virtual": virtual,
         "dataset_hash": config["dataset_hash"],
-        "simulator": card.get("simulator") or card.get("simulator_hash") or metrics.get("simulator_hash"),
+        "simulator": card.get("simulator"),
         "hours": card.get("hours"),
         "steps": card.get("steps", last.get("steps")),
         "seconds": card.get("seconds", last.get("seconds")),

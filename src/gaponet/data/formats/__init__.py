@@ -67,8 +67,6 @@ def read_logs(path: Path, robot: RobotSpec, fmt: str | None = None, **options: A
     """Yield (motion name, Log) for every recording under a path.
 
     Args:
-        path: File or folder.
-        robot: Whose joint names and units apply.
         fmt: One of FORMATS; default by looking.
         options: joint_map {log name: robot name}. For tables also columns (a TOML file that maps column names),
             position_unit and time_unit; for LeRobot sets position_unit. None counts as not given; one that the format

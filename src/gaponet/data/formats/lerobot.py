@@ -43,8 +43,6 @@ def read(
     """Yield (motion name, Log) for every episode.
 
     Args:
-        path: A set, or a folder of sets.
-        robot: Whose joint names and ranges apply.
         joint_map: The set's name of a joint → the robot's.
         position_unit: One of POSITION_UNITS; not for what gaponet exported, which says rad itself.
     """

@@ -30,12 +30,12 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
 from gaponet.files import MARK, sync, writing
+from gaponet.progress import Progress, silent
 
 if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-Progress = Callable[[float, float, str], None]  # sequences done, total, motion
 Group = tuple[float, tuple[str, ...]]  # dt, channels
 
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults
@@ -55,13 +55,11 @@ class Written:
     fps: float
 
 
-def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress | None = None) -> list[Written]:
+def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress = silent) -> list[Written]:
     """Write a dataset as LeRobot sets: into `out` itself where one will do, else into folders named after rate.
 
     Args:
-        dataset: At least one sequence.
         out: New or empty folder; appears when the export is complete.
-        progress: Called after each sequence.
     """
     out = Path(out)
     if not dataset.entries:
@@ -76,8 +74,7 @@ def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress | None 
     def tell(motion: str) -> None:
         nonlocal done
         done += 1
-        if progress:
-            progress(done, len(dataset), motion)
+        progress(done, len(dataset), motion)
 
     temporary = out.with_name(f"{MARK}-{out.name}")
     with writing(temporary, "export"):

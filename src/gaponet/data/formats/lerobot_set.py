@@ -32,7 +32,7 @@ AGAIN = "download or export it again"
 
 Name = Annotated[str, Len(1, 200)]
 Count = Annotated[int, Interval(ge=0, le=10**9)]
-Place = Annotated[int, Interval(ge=0, le=10**6)]
+Chunk = Annotated[int, Interval(ge=0, le=10**6)]
 
 
 class Info(TypedDict):
@@ -55,7 +55,7 @@ class Feature(TypedDict):
 # One row of meta/episodes; beside it, in what gaponet exported, the fields of SequenceMeta.
 Episode = TypedDict("Episode", {
     "episode_index": Count, "length": Annotated[int, Interval(ge=1, le=10**8)],
-    "data/chunk_index": Place, "data/file_index": Place, "tasks": NotRequired[list[str] | None],
+    "data/chunk_index": Chunk, "data/file_index": Chunk, "tasks": NotRequired[list[str] | None],
 })  # fmt: skip
 NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
 

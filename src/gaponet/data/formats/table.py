@@ -85,10 +85,7 @@ def read(
     """Yield (file stem, Log) for every table.
 
     Args:
-        path: A table, or a folder of them.
-        robot: Whose joint names and ranges apply.
         joint_map: The table's name of a joint → the robot's.
-        columns: TOML file with a column map.
         position_unit, time_unit: Win over what the TOML file says.
     """
     mapping = _column_map(robot, columns, position_unit, time_unit)

@@ -71,7 +71,6 @@ def would_send(recording: Recording, limits: Any) -> dict[str, dict[str, float]]
     """What would be sent, by joint: least and greatest command (rad), the fastest (rad/s), the largest torque (N·m).
 
     Args:
-        recording: Recording of a dry run.
         limits: safety.Limits of its commanded joints.
     """
     rows = [row for row in recording.rows if row.ctrl is not None]

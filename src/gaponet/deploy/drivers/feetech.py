@@ -102,7 +102,6 @@ class ServoBus:
     def __init__(self, stream: Stream, timeout: float = 0.01, retries: int = RETRIES) -> None:
         """
         Args:
-            stream: An open port.
             timeout: Silence after which missing replies are given up, s.
             retries: How often those are asked for again.
         """

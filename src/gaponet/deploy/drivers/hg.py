@@ -48,10 +48,8 @@ def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple
     """Every scalar field as (path, type, count, offset), and the offset after the last.
 
     Args:
-        fields: A struct.
         start: Offset at which it begins.
         padded: As C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
-        prefix: Path of the struct.
     """
     out: list[tuple[str, str, int, int]] = []
     at = start

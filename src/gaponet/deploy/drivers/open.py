@@ -17,7 +17,6 @@ def open_driver(kind: str, robot: RobotSpec | str | Path, **options: Any) -> Dri
 
     Args:
         kind: unitree or so101; virtual ones live in the caller's process and are made there (drivers.virtual).
-        robot: The robot, or its name or folder.
         options: Options of the driver's class.
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)

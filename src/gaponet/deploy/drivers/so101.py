@@ -70,8 +70,6 @@ class SO101Driver:
     ) -> None:
         """
         Args:
-            robot: so101.
-            port: Serial port.
             calibration: JSON file that LeRobot's calibration wrote; default what the servos hold of it.
             timeout: Longest silence of the bus while replies are awaited, s.
             silent: `connect` leaves the port alone: for the guard, because a bus has one speaker. `damp` opens it.

@@ -45,7 +45,6 @@ class ArmCalibration:
     def __init__(self, rows: dict[str, ServoRow], robot: RobotSpec) -> None:
         """
         Args:
-            rows: By joint.
             robot: Order of the joints, and the gripper's lower limit.
         """
         ordered = [rows[joint] for joint in robot.joint_names]

@@ -36,8 +36,6 @@ class VirtualSO101:
     ) -> None:
         """
         Args:
-            robot: so101.
-            physics: Hidden physics of the unit.
             payload: kg, and mount.
             link: Another name for the port, a symbolic link; replaced if it is one.
         """
@@ -68,12 +66,9 @@ class VirtualSO101:
         self._buffer = self._said = b""
         self._apply()
 
+    @uncollected()
     def run(self, seconds: float = np.inf) -> None:
         """Live and answer in real time."""
-        with uncollected():
-            self._serve(seconds)
-
-    def _serve(self, seconds: float) -> None:
         began = time.monotonic()
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:

@@ -70,14 +70,9 @@ class VirtualH12:
     ) -> None:
         """
         Args:
-            robot: H1-2.
-            physics: Hidden physics of the unit.
             payload: kg per hand, and side.
-            domain, interface: As UnitreeDriver.
             rate: States per second.
-            fault: What goes wrong.
             fault_at: s after the first command.
-            seed: Seed of its noise.
         """
         from gaponet.deploy.drivers import dds
 
@@ -97,12 +92,9 @@ class VirtualH12:
         self._held: deque[tuple[float, Array]] = deque()
         self._frozen: tuple[Array, ...] | None = None
 
+    @uncollected()
     def run(self, seconds: float = np.inf) -> None:
         """Live in real time, until interrupted."""
-        with uncollected():
-            self._live(seconds)
-
-    def _live(self, seconds: float) -> None:
         start, k = self.clock.now(), 0
         while (passed := k / self.rate) < seconds:
             now = self.clock.wait_until(start + passed)

@@ -33,10 +33,7 @@ class LiveUnit:
     ) -> None:
         """
         Args:
-            robot: The type.
-            physics: Hidden physics of this unit.
             payload: kg per hand, and side.
-            seed: Seed of its noise.
             period: Between two states, s.
         """
         self.robot, self.period = robot, period
@@ -85,12 +82,9 @@ class VirtualDriver:
     ) -> None:
         """
         Args:
-            robot: The type.
             physics: Hidden parameters (virtual.fleet).
             clock: The controller's.
             payload: kg per hand, and side.
-            name: Name of the unit.
-            seed: Seed of its noise.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
         self.kp, self.kd = robot.kp, robot.kd

@@ -67,7 +67,7 @@ class Cost:
 
 
 @dataclass(frozen=True)
-class Example:
+class ShownHand:
     """One hand on one trajectory: its target's place and its true place by method, (T, 3) m; goals (stops, 3) m,
     held from row arrive to row leave."""
 
@@ -89,17 +89,11 @@ def deliver(
     trained: ListOf[Trained],
     tell: Tell = lambda what, share: None,
     folder: Path | None = None,
-) -> tuple[list[Placed], list[Cost], Example]:
+) -> tuple[list[Placed], list[Cost], ShownHand]:
     """Play every trajectory with every payload, by every method.
 
     Args:
-        robot: The nominal robot.
-        unit: Who plays.
-        planner: That made the plans.
-        plans: Trajectories.
         payloads: kg per hand.
-        trained: Models.
-        tell: Called with each method and the share of it that is done.
         folder: Where each method's part is kept when it is done.
     """
     pairs = with_payloads(plans, payloads)
@@ -133,7 +127,7 @@ def deliver(
             places[method] = np.array(part["place"])
     plan, payload = pairs[shown]
     target = asked[id(plan)][:, 0]
-    return found, costs, Example(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, target, places)
+    return found, costs, ShownHand(payload, robot.dt, plan.goals[:, 0], plan.arrive, plan.leave, target, places)
 
 
 def _placed(

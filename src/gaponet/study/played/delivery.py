@@ -20,7 +20,7 @@ from gaponet.plot.charts import draw_bars
 from gaponet.plot.methods import colour, title
 from gaponet.plot.style import DASHED, figure, legend, styled
 from gaponet.plot.table import Spread, Table
-from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Example, Placed, deliver
+from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Placed, ShownHand, deliver
 from gaponet.study.played.goals import STOPS, Planner
 from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, over_seeds, payloads, percent, series
 from gaponet.study.played.session import Playing, Session, Tell
@@ -71,7 +71,7 @@ class Delivery(Playing):
         return result(session, *found, config=HOLD, goals_per_payload=len(plans) * each, hold_s=self.hold)
 
 
-def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: Example, **told: Any) -> Result:
+def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: ShownHand, **told: Any) -> Result:
     """Everything, ready to be written."""
     heading = "Goal-directed delivery: hands at goals under load (VIRTUAL robot)"
     figures = {"offsets": draw_offsets(found), "example": draw_example(example)}
@@ -173,7 +173,7 @@ def draw_offsets(found: ListOf[Placed]) -> Figure:
 
 
 @styled
-def draw_example(shown: Example) -> Figure:
+def draw_example(shown: ShownHand) -> Figure:
     """The hand's true place over time, axis by axis, goals with 1 cm on both sides."""
     fig = figure(10.2, 3.4)
     time = np.arange(len(shown.target)) * shown.dt

@@ -13,6 +13,7 @@ from gaponet.motion.arm import Arm, HandIK
 from gaponet.motion.feasible import Feasibility
 from gaponet.motion.minjerk import move_time, through
 from gaponet.motion.motion import GRID
+from gaponet.motion.posture import carriers
 from gaponet.motion.upper_body import Kit
 from gaponet.robot import RobotSpec
 
@@ -53,11 +54,8 @@ def hands(robot: RobotSpec, model: mujoco.MjModel) -> list[Arm]:
     """
     found = []
     for mount in robot.payload_mounts:
-        body, carriers = model.body(f"payload_{mount.side}").id, set()
-        while body:
-            carriers.add(body)
-            body = int(model.body_parentid[body])
-        names = [name for name in robot.operated if int(model.joint(name).bodyid[0]) in carriers]
+        chain = carriers(model, model.body(f"payload_{mount.side}").id)
+        names = [name for name in robot.operated if int(model.joint(name).bodyid[0]) in chain]
         found.append(Arm(mount.side, 1.0, robot.index(names), f"payload_{mount.side}"))
     if not found:
         raise UsageError(f"{robot.name} has no [[payload_mount]]: it has no hand that could deliver anything")
@@ -88,9 +86,7 @@ class Planner:
     def __init__(self, robot: RobotSpec, max_payload: float, seed: int, hold: float = 3.0, front: float = 0.1) -> None:
         """
         Args:
-            robot: The nominal robot.
             max_payload: What must be held everywhere, kg per hand.
-            seed: Seed of everything drawn.
             hold: At each goal, s.
             front: Goals lie at least so far in front of the base, m.
         """

@@ -34,14 +34,13 @@ class KeptParts:
 
         Args:
             facts: What this part depends on besides; functions are called for theirs, when something is kept.
-            make: Does the work.
         """
         if self.folder is None:
-            return json.loads(json.dumps(finite(plain(make()))))
+            return json.loads(json.dumps(finite(make())))
         known = [f() if callable(f) else f for f in facts]
         file = self.folder / f"{_digest([self._common, known])[:16]}.json"
         if not file.is_file():
-            found = plain(make())
+            found = make()
             self.folder.mkdir(parents=True, exist_ok=True)
             write_json(file, found)
         return read_kept(file)
@@ -53,22 +52,11 @@ class KeptParts:
 
 
 def _digest(facts: Any) -> str:
-    return hashlib.sha256(json.dumps(finite(plain(facts)), sort_keys=True).encode()).hexdigest()
-
-
-def plain(value: Any) -> Any:
-    """Dataclasses, at any depth, as dicts."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    return value
+    return hashlib.sha256(json.dumps(finite(facts), sort_keys=True).encode()).hexdigest()
 
 
 def revived(kind: type[T], record: dict[str, Any]) -> T:
-    """A dataclass of numbers, text and arrays from what `plain` and JSON made of it."""
+    """A dataclass of numbers, text and arrays from what JSON made of it."""
     number = {f.name for f in dataclasses.fields(kind) if f.type in ("float", float)}  # type: ignore[arg-type]
     values = {k: np.array(v) if isinstance(v, list) else v for k, v in record.items()}
     return kind(**{k: np.nan if v is None and k in number else v for k, v in values.items()})

@@ -38,7 +38,6 @@ class Driven:
 
     Attributes:
         model: What the compensator asks; None to send targets as they are.
-        robot: The simulator that the model corrects.
         config: Settings of the compensator; iterations 0 leaves the model out.
     """
 
@@ -113,8 +112,6 @@ def play(
     Limbs without an operated joint stay at home: with a fixed base they share no dynamics with the others.
 
     Args:
-        robot: The nominal type.
-        unit: Its hidden physics.
         targets: (T, N, n) rad at the robot's control period.
         mass: Payload in each hand, (N,) kg, told to the compensator.
         seeds: Seeds of each row's noise and rest position, (N,).

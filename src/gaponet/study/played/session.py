@@ -61,13 +61,8 @@ class Session:
     """Everything that is there before a unit is played.
 
     Attributes:
-        asked: The question.
         data, whole: What the models were trained on; and what that was cut from, if it was.
-        robot: The nominal one.
-        trained: Models.
         out: Folder of the results; what each method did is kept in its folder parts.
-        quick: Whether it is a rehearsal.
-        began: When.
     """
 
     asked: Playing

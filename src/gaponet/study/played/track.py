@@ -34,7 +34,6 @@ class Score:
         part: alignment or compensation.
         method, seed: Seed of the model; seed None where nothing was trained.
         source: generated or files, of the motion.
-        motion: Name.
         payload: kg per hand.
         q_dis: Q_dis of each operated joint, (n) rad·s.
         seconds: The motion's length.
@@ -51,7 +50,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Example:
+class ShownMotion:
     """One motion of the compensation: targets and where the joints were by method, (T, n operated) rad."""
 
     motion: str
@@ -70,16 +69,11 @@ def track(
     trained: ListOf[Trained],
     tell: Tell = lambda what, share: None,
     folder: Path | None = None,
-) -> tuple[list[Score], Example]:
+) -> tuple[list[Score], ShownMotion]:
     """Play every motion with every payload on the unit, raw and compensated, and in every simulator.
 
     Args:
-        robot: The nominal simulator.
-        unit, unit_id: Who plays.
-        motions: What.
         payloads: kg per hand.
-        trained: Models.
-        tell: Called with each method and the share of it that is done.
         folder: Where each method's part is kept when it is done.
     """
     pairs, op, rest = with_payloads(motions, payloads), robot.operated_index, round(REST / robot.dt)
@@ -113,7 +107,7 @@ def track(
         if seed in (None, trained[0].seed):
             example[method] = np.array(part["qpos"])
     target = targets[rest : lengths[shown], shown][:, op]
-    return scores, Example(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
+    return scores, ShownMotion(pairs[shown][0].name, float(mass[shown]), robot.dt, target, example)
 
 
 def align(
@@ -128,11 +122,7 @@ def align(
 
     Args:
         recorded: What the robot did; asked for when there is something to do.
-        sources: Source of each motion.
-        robot: The nominal simulator.
         trained: Models; the identified simulator comes from those that correct it.
-        tell: Called with each method and the share of it that is done.
-        kept: What is done already.
     """
     simulators: list[tuple[str, int | None, RobotSpec, Trained | None]] = [("nominal", None, robot, None)]
     simulators += [("identified", None, t.robot, None) for t in trained if t.robot.nominal is not None][:1]

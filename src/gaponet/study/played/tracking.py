@@ -26,7 +26,7 @@ from gaponet.robot import RobotSpec
 from gaponet.study.played.measured import LEFT_OUT, cut, duel, methods, of, over_seeds, payloads, percent, series
 from gaponet.study.played.play import PLANNED
 from gaponet.study.played.session import Playing, Session, Tell
-from gaponet.study.played.track import Example, Score, align, track
+from gaponet.study.played.track import Score, ShownMotion, align, track
 from gaponet.study.played.unseen import Unseen, from_files, generated, require_unseen
 from gaponet.study.result import Result
 
@@ -82,7 +82,7 @@ class Tracking(Playing):
 
 
 def result(
-    session: Session, scores: ListOf[Score], example: Example | None, motions: ListOf[Unseen], **told: Any
+    session: Session, scores: ListOf[Score], example: ShownMotion | None, motions: ListOf[Unseen], **told: Any
 ) -> Result:
     """Everything, ready to be written; no example where recordings of a real robot are all there is."""
     robot, parts = session.robot, list(dict.fromkeys(s.part for s in scores))
@@ -216,7 +216,7 @@ def over_motions(scores: ListOf[Score]) -> list[Spread]:
     return [replace(f, std=f.error) for f in found]
 
 
-def draw_example(shown: Example, robot: RobotSpec, tag: str) -> Figure:
+def draw_example(shown: ShownMotion, robot: RobotSpec, tag: str) -> Figure:
     """Targets and joints by method, and the error below: of joints that move the three with the largest raw error."""
     moves = np.ptp(shown.target, axis=0) > 0.1
     raw = np.abs(shown.qpos["raw"] - shown.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)

@@ -22,9 +22,6 @@ class Trained:
 
     Attributes:
         method: Kind of model, with identified+ in front where it corrects an identified simulator.
-        seed: Seed of its training.
-        run: Its folder.
-        model: What ships.
         robot: The simulator that it corrects.
     """
 
@@ -41,7 +38,6 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
     Args:
         folders: Run folders, or folders of them such as the cells of gaponet experiment compare, of which those that
             change something of a model are passed over.
-        robot: The nominal robot.
 
     Raises:
         UsageError: Nothing there, the same method and seed twice, or a model that no loop can ask.

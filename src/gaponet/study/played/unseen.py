@@ -15,6 +15,7 @@ from gaponet.errors import UsageError
 from gaponet.eval.evaluate import split_of_run
 from gaponet.motion.files import SUFFIXES, read_motion
 from gaponet.motion.library import Library
+from gaponet.motion.motion import Motion
 from gaponet.motion.upper_body import BUILDERS
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import idle_joints
@@ -30,7 +31,6 @@ class Unseen:
     """A motion at the robot's control period.
 
     Attributes:
-        name: Name of the motion.
         source: generated, or files.
         ctrl: Targets, (T, n) rad; limbs without an operated joint at home, since with a fixed base they share no
             dynamics with the others.
@@ -89,10 +89,6 @@ def require_unseen(
     """The motions, each with its nearest motion of training or validation, over the time that both last.
 
     Args:
-        motions: Motions of the experiment.
-        dataset: That the models were trained on.
-        robot: Nominal.
-        trained: Models.
         whole: What the recordings of dataset were cut from, if they were: many motions begin in the same rest.
 
     Raises:
@@ -127,10 +123,8 @@ def trained_on(dataset: Dataset, trained: ListOf[Trained]) -> set[str]:
 
 def _at(dataset: Dataset, entry: Entry, dt: float) -> Array:
     """Targets of a recording at another period, (T, n) rad."""
-    ctrl = dataset.channels(entry, ("ctrl",))["ctrl"].astype(float)
-    time = np.arange(len(ctrl)) * entry.dt
-    grid = np.arange(int(time[-1] / dt + 1e-9) + 1) * dt
-    return np.stack([np.interp(grid, time, column) for column in ctrl.T], axis=1)
+    ctrl = dataset.channels(entry, ("ctrl",))["ctrl"]
+    return Motion(entry.meta.motion, entry.meta.level, entry.dt, ctrl).sample(dt)
 
 
 def _rms(a: Array, b: Array) -> float:
