@@ -59,7 +59,7 @@ def main(
 def play(domain: int, served: list[str], options: list[str]) -> dict[str, Any]:
     """Serve a robot, run the motion, and give what gaponet run says."""
     bus = ["--domain", str(domain)]
-    command = [*GAPONET, "virtual", "serve", "--robot", "h1_2", "--transport", "dds", *bus, *served]
+    command = [*GAPONET, "virtual", "serve", "--robot", "h1_2", *bus, *served]
     robot = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert robot.stdout is not None

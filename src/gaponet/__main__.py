@@ -13,7 +13,6 @@ def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
 
 
 def entry() -> None:
-    """Console script."""
     try:
         signal.signal(signal.SIGINT, _leave)
         from gaponet.cli.main import main

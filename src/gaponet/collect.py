@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.data.pair import Twin
-from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import write_text, writing
@@ -45,8 +45,6 @@ ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small,
 
 @dataclass(frozen=True)
 class Collected:
-    """What a call to collect did."""
-
     dataset: str
     written: int
     present: int  # takes that were there before
@@ -95,7 +93,9 @@ def collect(
         dataset = Dataset.create(out, robot)
         require_kept(dataset.path, robot, DatasetError, MOVE_KEPT)
         _claim(dataset, robot, fleet, recipe, seed)
-        present = {_key(m.motion, m.unit_id, m.payload_mass, dt, m.repetition) for m, dt in _listed(dataset)}
+        present = {
+            _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition) for e in dataset.entries
+        }
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
         written, seconds = 0, 0.0
         nproc = nproc or os.cpu_count() or 1
@@ -125,10 +125,6 @@ def _claimed(path: Path) -> dict[str, Any]:
 def _key(motion: str, unit: str, payload: float, dt: float, repetition: int) -> tuple[object, ...]:
     """What a sequence is, apart from its samples; two of the same key would be the same recording."""
     return motion, unit, payload, round(dt * 1e9), repetition
-
-
-def _listed(dataset: Dataset) -> list[tuple[SequenceMeta, float]]:
-    return [(entry.meta, entry.dt) for entry in dataset.entries]
 
 
 def _claim(dataset: Dataset, robot: RobotSpec, fleet: Fleet, recipe: Recipe, seed: int) -> None:

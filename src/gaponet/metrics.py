@@ -6,7 +6,6 @@ number is the mean over its sequences.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +50,7 @@ def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec
 def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
     """All metrics of a method: totals, and by joint, motion, payload, unit and horizon."""
     columns = {j: [i] for i, j in enumerate(robot.operated)}
-    by = lambda key: {str(k): metrics([r for r in part if key(r) == k]) for k in _keys(part, key)}  # noqa: E731
+    by = lambda key: {str(k): metrics([r for r in part if key(r) == k]) for k in sorted({key(r) for r in part})}  # noqa: E731
     return metrics(part) | {
         "by_joint": {j: metrics(part, c) for j, c in columns.items()},
         "by_motion": by(lambda r: r.real.meta.motion),
@@ -112,7 +111,3 @@ def horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
             out[f"{seconds:g}"] = {"mpjae": float(np.mean(values))}
     out["whole"] = {"mpjae": float(np.mean([np.abs(r.error).mean() for r in part]))}
     return out
-
-
-def _keys(part: ListOf[Run], key: Callable[[Run], str]) -> list[str]:
-    return sorted({key(r) for r in part})

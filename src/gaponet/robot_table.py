@@ -16,8 +16,6 @@ Metres = Annotated[float, Interval(ge=-100, le=100)]
 
 @dataclass(frozen=True)
 class Joint:
-    """One [[joint]]."""
-
     name: Name
     kp: Gain  # N·m/rad
     effort_limit: Gain  # N·m
@@ -97,8 +95,6 @@ class Table:
 
 @dataclass(frozen=True)
 class RobotTable:
-    """The whole file."""
-
     name: Name
     dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s

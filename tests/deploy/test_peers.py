@@ -20,7 +20,8 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
-from gaponet.motion.files import write_motion
+from motion_files import write_motion
+
 from gaponet.motion.motion import Motion
 from gaponet.robot import load_robot
 

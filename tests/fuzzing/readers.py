@@ -12,13 +12,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from arm import write_arm
 from logs import arm_columns, arm_sequence, late, stock, table_text, wave, write_bam, write_so101
+from motion_files import write_motion
 
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
 from gaponet.data.formats.lerobot_export import export_lerobot
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
-from gaponet.motion.files import read_motion, write_motion
+from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
 from gaponet.motion.recipe import load_recipe, takes
 from gaponet.robot import RobotSpec, load_robot

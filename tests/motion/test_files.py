@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from motion_files import write_motion
 
 from gaponet.errors import JointMismatchError, LogError
-from gaponet.motion.files import read_motion, write_motion
+from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
 from gaponet.robot import load_robot
 

@@ -63,6 +63,5 @@ class SimulatedClock:
         return self._now
 
     def wait_until(self, deadline: float) -> float:
-        """Be there at once."""
         self._now = max(self._now, deadline)
         return self._now

@@ -90,10 +90,8 @@ class AlignedActions(gymnasium.Wrapper):
         self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)
 
     def reset(self, **how: Any) -> tuple[Any, dict[str, Any]]:
-        """Another episode."""
         self.align.reset()
         return self.env.reset(**how)
 
     def step(self, action: Any) -> Any:
-        """The action, corrected."""
         return self.env.step(self.align(self.env.unwrapped.data, action))  # type: ignore[attr-defined]

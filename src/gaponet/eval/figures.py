@@ -20,12 +20,10 @@ WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:
-    """MPJAE per joint, one bar per method."""
     return _bars(methods, "by_joint", "MPJAE by joint", joint_label)
 
 
 def by_payload(methods: dict[str, Any]) -> Figure:
-    """MPJAE per payload, one bar per method."""
     return _bars(methods, "by_payload", "MPJAE by payload", "{} kg".format)
 
 

@@ -64,7 +64,6 @@ def element(name: str, *content: str, css: str = "") -> Markup:
 
 
 def page(title: str, body: Markup) -> str:
-    """A whole document."""
     head = (
         Markup('<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">')
         + element("title", title)
@@ -75,7 +74,6 @@ def page(title: str, body: Markup) -> str:
 
 
 def facts_table(rows: list[list[str]]) -> Markup:
-    """Name and value in each row."""
     return element("table", *(element("tr", *(element("td", c) for c in row)) for row in rows), css="facts")
 
 

@@ -251,7 +251,6 @@ def _facts_line(card: dict[str, Any], metrics: dict[str, Any]) -> list[str]:
 
 
 def _both(value: float) -> str:
-    """rad → mrad and degrees."""
     return f"{mrad(value)} ({np.degrees(value):.2f}°)"
 
 

@@ -67,8 +67,6 @@ class Delta(TypedDict):
 
 
 class Metrics(TypedDict):
-    """metrics.json."""
-
     methods: dict[Method, Scores]
     ratio_to_nominal: dict[Method, Number]
     dataset: str
@@ -101,8 +99,6 @@ class Model(TypedDict):
 
 
 class Config(TypedDict):
-    """config.json."""
-
     model: Model
     ppo: PPO
     seed: int
@@ -192,8 +188,6 @@ class Panel(TypedDict):
 
 
 class Gap(Panel):
-    """gap.json."""
-
     by_joint: dict[str, Panel]
     virtual: bool
     unseen: bool

@@ -1,4 +1,4 @@
-"""Motion files: SAGE motion txt, csv and npz, read into a Motion and written from one.
+"""Motion files: SAGE motion txt, csv and npz, read into a Motion.
 
 SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample in
 rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: joint_names, ctrl (T, k) rad and dt s.
@@ -16,7 +16,6 @@ from gaponet.arrays import Array
 from gaponet.data.formats import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.errors import LogError
-from gaponet.files import whole, write_text
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
 
@@ -55,24 +54,6 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
     ctrl[:, columns] = rows
     return Motion(path.stem, level_of(ctrl, robot), period, ctrl)
-
-
-def write_motion(path: str | Path, motion: Motion, robot: RobotSpec) -> None:
-    """Write a motion: .txt at 50 Hz as SAGE reads it, .csv and .npz at the motion's own period."""
-    path = Path(path)
-    if path.suffix == ".npz":
-        with whole(path) as temporary:
-            np.savez(temporary, joint_names=np.array(robot.joint_names), ctrl=motion.ctrl, dt=motion.dt)
-        return
-    if path.suffix not in SUFFIXES:
-        raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
-    names, ctrl = list(robot.joint_names), motion.ctrl
-    if path.suffix == ".txt":
-        ctrl = motion.sample(SAGE_DT)
-    else:
-        names, ctrl = ["time", *names], np.column_stack([np.arange(len(ctrl)) * motion.dt, ctrl])
-    lines = [",".join(names), *(",".join(f"{v:.9g}" for v in row) for row in ctrl)]
-    write_text(path, "\n".join(lines) + "\n")
 
 
 def level_of(ctrl: Array, robot: RobotSpec) -> str:

@@ -37,25 +37,18 @@ class Recipe:
     """
 
     name: str
-    payloads: Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(0, 1000)]
-    units: Names
+    payloads: Annotated[tuple[Annotated[float, Interval(ge=0, le=100)], ...], Len(1, 1000)]
+    units: Annotated[Names, Len(1, 1000)]
     motions: Names = ()
     files: Names = ()
-    rates: Annotated[tuple[Annotated[float, Interval(ge=1, le=10_000)], ...], Len(0, 1000)] = (50.0,)
+    rates: Annotated[tuple[Annotated[float, Interval(ge=1, le=10_000)], ...], Len(1, 1000)] = (50.0,)
     repetitions: Count = 1
     variants: Count = 1
     payload_side: Name = "both"
 
     def __post_init__(self) -> None:
-        for field in ("payloads", "units", "rates"):
-            if not getattr(self, field):
-                raise UsageError(f"recipe '{self.name}': {field} is empty; name at least one")
         if not (self.motions or self.files):
             raise UsageError(f"recipe '{self.name}': name motions, files, or both")
-        if min(self.rates) <= 0:
-            raise UsageError(f"recipe '{self.name}': rates are in Hz and positive, got {min(self.rates)}")
-        if self.repetitions < 1 or self.variants < 1:
-            raise UsageError(f"recipe '{self.name}': repetitions and variants are counts, 1 or more")
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,6 @@ class Ablation:
         return made + (study.cells(bound, seeds) if bound and seeds else [])
 
     def result(self, study: Study, found: Found) -> Result:
-        """A row per setting."""
         lines, missing = rows(study)
         if study.rehearsal or not self.bound_seeds:
             missing.append("Oracle and learned sensors were left out (--bound-seeds 0, --quick).")

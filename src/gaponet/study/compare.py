@@ -46,7 +46,6 @@ class Compare:
     """Identify the simulator first, on the training motions, and show it beside; kept in OUT/identified."""
 
     def cells(self, study: Study) -> list[Cell]:
-        """Every model with every seed."""
         return study.cells(self.models)
 
     def result(self, study: Study, found: Found) -> Result:

@@ -46,7 +46,6 @@ class Data:
         return study.cells([at(word, share) for word in self.models for share in sorted(set(self.shares))])
 
     def result(self, study: Study, found: Found) -> Result:
-        """A row per share."""
         motions, minutes = _recorded(self, found)
         error = {w: {s: found.spread(at(w, s), "known", "mpjae") for s in minutes} for w in self.models}
         for name in BASELINES:

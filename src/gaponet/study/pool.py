@@ -20,7 +20,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset, dataset_hash
@@ -237,7 +237,7 @@ def run_cells(
 def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, parent: int) -> None:
     """A cell's process. Ctrl-C in the terminal reaches parent and children: the parent tells the children, once."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     last = 0.0
 
     def tell(share: float, note: str) -> None:
@@ -265,10 +265,6 @@ def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, par
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, traceback.format_exc())
         pipe.send(f"{type(error).__name__}: {error} (see {file})")
-
-
-def _interrupt(signum: int, frame: object) -> NoReturn:
-    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -36,7 +36,6 @@ class Unit:
         return [cell for fold in folds for cell in fold]
 
     def result(self, study: Study, found: Found) -> Result:
-        """A row per unit left out."""
         units = [u for u in units_of(study.data) if any(left_out == u for _, left_out in found.runs)]
         never = {w: [found.spread(w, "new", "mpjae", left_out=u) for u in units] for w in self.models}
         known = {w: [seen(found, u, w) for u in units] for w in self.models}

@@ -57,7 +57,6 @@ def parse_variant(text: str, base: TrainConfig) -> Variant:
 
 
 def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
-    """Set one FIELD=VALUE."""
     field, equals, value = setting.partition("=")
     places = dict(_places(config))
     if not equals or field not in places:
@@ -86,7 +85,6 @@ def _places(config: TrainConfig) -> Iterator[tuple[str, tuple[str, str]]]:
 
 
 def _read(text: str, hint: Any, where: str) -> Any:
-    """A value of a field's type."""
     if type(None) in get_args(hint):
         return None if text == "none" else _read(text, get_args(hint)[0], where)
     if get_origin(hint) is tuple:

@@ -37,7 +37,6 @@ def rng_text(rng: np.random.Generator) -> str:
 
 
 def set_rng(rng: np.random.Generator, text: str) -> None:
-    """Undo rng_text."""
     rng.bit_generator.state = json.loads(text)
 
 

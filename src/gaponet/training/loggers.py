@@ -28,7 +28,6 @@ class Loggers:
             write(numbers, line["steps"])
 
     def close(self) -> None:
-        """Flush and end."""
         for _, close in self.writers:
             close()
 

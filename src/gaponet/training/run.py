@@ -260,7 +260,6 @@ class Trainer:
         return GapModel.load(self.out)
 
     def _env(self, num_envs: int, episode_steps: int, seed: int) -> DeltaEnv:
-        """The training environment over the training motions."""
         c = self.config
         return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, c.reward, seed, c.threads)
 

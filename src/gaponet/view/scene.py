@@ -19,7 +19,7 @@ from gaponet.motion.posture import carriers
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_spec
 from gaponet.structure import read_toml
-from gaponet.view.side_by_side import Copy, SideBySide
+from gaponet.view.side_by_side import SideBySide
 
 PAYLOAD = (0.93, 0.60, 0.10, 1.0)
 GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
@@ -91,7 +91,9 @@ class Scene:
         self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
         if self.ghosts:
             last = next(i for i, m in enumerate(shown.motions) if m.method == "recorded")
-            self.address += [(last, self._address(f"{m.method}-ghost")) for m in self._haunted()]
+            self.address += [
+                (last, self._address(f"{m.method}-ghost")) for m in shown.motions if m.method != "recorded"
+            ]
 
     def pose(self, time: float) -> None:
         """Put every copy where it is at a time of the recording, s; between rows positions are interpolated."""
@@ -114,9 +116,6 @@ class Scene:
         left, right, bottom, top = self.box
         across, up = self.view.axes
         return across * (left + right) / 2 + up * (bottom + top) / 2
-
-    def _haunted(self) -> list[Copy]:
-        return [m for m in self.shown.motions if m.method != "recorded"]
 
     def _address(self, prefix: str) -> Array:
         names = self.shown.robot.joint_names

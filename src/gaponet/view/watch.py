@@ -35,7 +35,6 @@ class Playback:
         self.time = self.clip.start + (self.time + by - self.clip.start) % self.clip.duration
 
     def key(self, code: int) -> None:
-        """A key was pressed."""
         if code == SPACE:
             self.paused = not self.paused
         elif code in (RIGHT, LEFT):
@@ -56,7 +55,9 @@ def watch(scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
         raise UsageError(f"{error}. Run: mjpython -m gaponet view …, or use --render or --web") from None
     with window:
         with window.lock():
-            _aim(window.cam, scene)
+            window.cam.azimuth, window.cam.elevation = scene.view.azimuth, scene.view.elevation
+            window.cam.lookat[:] = scene.middle
+            window.cam.distance = 1.7 * scene.extent
         before = time.monotonic()
         while window.is_running():
             now = time.monotonic()
@@ -68,12 +69,6 @@ def watch(scene: Scene, clip: Clip, magnify: float = 1.0) -> None:
             window.set_texts((None, mujoco.mjtGridPos.mjGRID_TOPLEFT, *_texts(scene, play, magnify)))
             window.sync()
             time.sleep(max(0.0, FRAME - (time.monotonic() - now)))
-
-
-def _aim(camera: mujoco.MjvCamera, scene: Scene) -> None:
-    camera.azimuth, camera.elevation = scene.view.azimuth, scene.view.elevation
-    camera.lookat[:] = scene.middle
-    camera.distance = 1.7 * scene.extent
 
 
 def _label(extra: mujoco.MjvScene, scene: Scene, now: float) -> None:

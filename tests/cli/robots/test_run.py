@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 from arm import TOML, commands, write_arm
+from motion_files import write_motion
 from runs import untrained
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 
 FAST = ["--fast", "--yes", "--json", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from arm import TOML, XML, commands
+from motion_files import write_motion
 
 from gaponet.cli.main import main
 from gaponet.deploy.clock import SimulatedClock
@@ -12,7 +13,6 @@ from gaponet.deploy.drivers.link import measure
 from gaponet.deploy.drivers.open import open_driver
 from gaponet.deploy.drivers.virtual import VirtualDriver
 from gaponet.deploy.phases import ControlConfig
-from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 from gaponet.robot import load_robot
 from gaponet.virtual.fleet import load_fleet

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import commands, record
+from motion_files import write_motion
 from weak_arm import trained
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.motion.files import write_motion
 from gaponet.motion.motion import Motion
 from gaponet.study.played.unseen import Unseen, from_files, generated, require_unseen
 

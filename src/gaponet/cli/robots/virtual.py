@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,6 @@ def virtual(
     unit: str = "4",
     payload_mass: float = 0.0,
     payload_side: str = "both",
-    transport: Literal["dds", "serial"] | None = None,
     fleet: str = "hard",
     domain: int = 0,
     interface: str = "lo",
@@ -38,7 +38,6 @@ def virtual(
         unit: Unit of the fleet: its number or its name.
         payload_mass: kg in each hand named by payload_side.
         payload_side: both, or one hand.
-        transport: dds for h1_2, serial for so101; default the robot's.
         fleet: Virtual units: hard, easy, shifted, or a .toml file.
         domain: DDS domain.
         interface: Network interface; lo reaches this machine only.
@@ -49,56 +48,38 @@ def virtual(
         heard: Write every command that arrived, and where the joints were, to this .npz at the end.
         link: Serial: also give the pseudo-terminal this name, e.g. /tmp/so101.
     """
+    from gaponet.deploy.drivers.so101_virtual import VirtualSO101
     from gaponet.robot import load_robot
     from gaponet.virtual.fleet import load_fleet
 
     out, spec = Out(), load_robot(robot)
     if heard and not heard.parent.is_dir():  # said now, not when all has been heard
         raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
-    natural = "serial" if spec.name == "so101" else "dds"
-    if (transport or natural) != natural:
-        raise UsageError(f"--transport {transport}: {spec.name} speaks {natural}")
     name = f"virtual-{unit}" if unit.isdigit() else unit
     physics = load_fleet(fleet, spec).unit(name)
     for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
+        signal.signal(number, signal.default_int_handler)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
-    if natural == "dds":
+    served: VirtualH12 | VirtualSO101
+    if spec.name != "so101":
         payload = (payload_mass, payload_side)
         served = VirtualH12(spec, physics, payload, domain, interface, rate, fault, fault_at)
-        out.say(f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}; Ctrl-C ends it")
-        _flush()
-        try:
-            served.run(float("inf") if seconds is None else seconds)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            if heard:
-                served.heard.save(heard)
-        out.say(
-            f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods"
-        )
-        return
-    from gaponet.deploy.drivers.so101_virtual import VirtualSO101
-
-    side = payload_side if payload_side != "both" else "hand"
-    arm = VirtualSO101(spec, physics, (payload_mass, side), link=link)
-    out.say(f"{label}: servo bus on {arm.port}; Ctrl-C ends it")
-    _flush()
+        where = f"rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}"
+    else:
+        served = VirtualSO101(spec, physics, (payload_mass, payload_side if payload_side != "both" else "hand"), link)
+        where = f"servo bus on {served.port}"
+    out.say(f"{label}: {where}; Ctrl-C ends it")
+    sys.stdout.flush()  # whoever started us through a pipe waits for this line
     try:
-        arm.run(float("inf") if seconds is None else seconds)
+        served.run(float("inf") if seconds is None else seconds)
     except KeyboardInterrupt:
         pass
     finally:
-        arm.close()
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
-
-
-def _flush() -> None:
-    """Whoever started us through a pipe waits for this line."""
-    import sys
-
-    sys.stdout.flush()
+        if isinstance(served, VirtualSO101):
+            served.close()
+        elif heard:
+            served.heard.save(heard)
+    if isinstance(served, VirtualH12):
+        out.say(
+            f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods"
+        )

@@ -47,8 +47,6 @@ PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 @dataclass(frozen=True)
 class Written:
-    """One set of an export."""
-
     path: Path
     episodes: int
     frames: int

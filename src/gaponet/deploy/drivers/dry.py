@@ -34,7 +34,6 @@ class DryRun:
         self._moved: Array | float = 0.0
 
     def connect(self) -> None:
-        """Connect the robot."""
         self.driver.connect()
         self._adopt()
 
@@ -49,7 +48,6 @@ class DryRun:
         return replace(self._real, qpos=self._real.qpos + self._moved)
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
-        """Send nothing."""
         self._base = self._real.qpos if self._base is None else self._base
         moved = np.zeros_like(self._base)
         moved[self._at] = (ctrl - self._base)[self._at]

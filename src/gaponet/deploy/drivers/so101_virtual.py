@@ -84,7 +84,6 @@ class VirtualSO101:
                     self.live.step()
 
     def close(self) -> None:
-        """The cable is out."""
         for descriptor in (self._master, self._slave):
             os.close(descriptor)
         if self._link is not None and self._link.is_symlink():

@@ -79,33 +79,34 @@ class VirtualDriver:
         payload: tuple[float, str] = (0.0, "both"),
         name: str = "unit",
         seed: int = 0,
+        period: float = STATE_PERIOD,
     ) -> None:
         """
         Args:
             physics: Hidden parameters (virtual.fleet).
             clock: The controller's.
             payload: kg per hand, and side.
+            period: Between two states, s.
         """
         robot = robot.nominal or robot  # the hidden physics replaces what was identified
         self.kp, self.kd = robot.kp, robot.kd
         self.facts: dict[str, Any] = {}
         self.address = f"virtual {robot.name} {name} in process {os.getpid()}"
         self.joint_names = robot.joint_names
-        self.clock, self._given = clock, (robot, physics, payload, seed)
+        self.clock, self.period, self._given = clock, period, (robot, physics, payload, seed, period)
         locked = idle_joints(robot, robot.operated) if len(robot.operated) < len(robot.joint_names) else ()
         self.commanded = tuple(joint for joint in robot.joint_names if joint not in locked)
         self._at = robot.index(self.commanded)
 
     def connect(self) -> None:
-        """Wake it up."""
         self.live = LiveUnit(*self._given)
         self._begun = self.clock.now()
         self._state = self._sense()
 
     def read(self) -> State:
         """Let it live until now."""
-        due = int((self.clock.now() - self._begun) / STATE_PERIOD + 1e-6)
-        if (due - self.live.steps) * STATE_PERIOD > LAG:
+        due = int((self.clock.now() - self._begun) / self.period + 1e-6)
+        if (due - self.live.steps) * self.period > LAG:
             raise DriverError(f"{self.address}: this machine cannot simulate it in real time; run without real time")
         if due > self.live.steps:
             while self.live.steps < due:
@@ -114,7 +115,7 @@ class VirtualDriver:
         return self._state
 
     def _sense(self) -> State:
-        return State(self._begun + self.live.steps * STATE_PERIOD, *self.live.read())
+        return State(self._begun + self.live.steps * self.period, *self.live.read())
 
     def write(self, ctrl: Array, weight: float = 1.0) -> None:
         """Takes effect after the unit's own command delay."""

@@ -40,11 +40,9 @@ class DelayOffset:
         return read_json(cls, run / "delay_offset.json", ModelError, hint)
 
     def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
-        """The corrector for sim.replay."""
         return DelayOffsetCorrector(self, robot)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
         return asdict(self)
 
 

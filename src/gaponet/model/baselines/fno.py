@@ -71,7 +71,6 @@ class DeltaFNO(DeltaNet):
         self.head = dense(width, (4 * width,), n, zero=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        """Features → Δa, (B, n) rad."""
         v = self.tokens(prepared)
         for spectral, pointwise in zip(self.spectral, self.pointwise, strict=True):
             v = gelu(spectral(v) + pointwise(v))

@@ -20,7 +20,6 @@ class DeltaMLP(DeltaNet):
         self.net = dense(self.features.dim, config.mlp_hidden if hidden is None else hidden, n, zero=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        """Features → Δa, (B, n) rad."""
         return self.bounded(self.net(prepared))
 
 

@@ -42,6 +42,5 @@ class DeltaTransformer(DeltaNet):
         self.head = dense(width, (), n, zero=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        """Features → Δa, (B, n) rad."""
         tokens = self.blocks(self.tokens(prepared))
         return self.bounded(self.head(self.norm(tokens[:, -1])))

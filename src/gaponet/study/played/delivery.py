@@ -72,7 +72,6 @@ class Delivery(Playing):
 
 
 def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: ShownHand, **told: Any) -> Result:
-    """Everything, ready to be written."""
     heading = "Goal-directed delivery: hands at goals under load (VIRTUAL robot)"
     figures = {"offsets": draw_offsets(found), "example": draw_example(example)}
     tables = [offsets(found), moving(found), spent(costs)]

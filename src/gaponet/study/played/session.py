@@ -45,7 +45,6 @@ class Playing:
         """Refuse what cannot be played, before anything takes time."""
 
     def play(self, session: Session, tell: Tell) -> Result:
-        """Play and measure."""
         raise NotImplementedError
 
 

@@ -68,6 +68,5 @@ def load_trained(folders: ListOf[Path], robot: RobotSpec) -> list[Trained]:
 
 
 def _changed(run: Path) -> bool:
-    """Whether a cell is of a model with changed fields."""
     file = run / "cell.json"
     return file.is_file() and bool(set(read_kept(file)["changes"]) - set(SAME))
