@@ -52,7 +52,7 @@ def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
 def test_every_runtime_is_measured(run, monkeypatch):
     monkeypatch.setattr(latency, "BATCH", 16)
     threads = torch.get_num_threads()
-    result = latency.measure(run, calls=100)
+    result = latency.measure(run, calls=100, threads=0)
     torch.set_num_threads(threads)
     assert set(result["microseconds"]) == {
         "network, onnxruntime", "network, numpy", "network, torch", "network, TorchScript",
