@@ -51,7 +51,8 @@ def artifact(robot, tmp_path_factory):
         {"payload_input": False}, {"payload_input": False, "coupling": "full"},
         {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensor_hidden": (16,)},
         {"branch_hidden": (16, 8), "trunk_hidden": (8,)}, {"kind": "shared_mlp"},
-        {"kind": "shared_mlp", "sensors": "off", "payload_input": False}, {"kind": "shared_mlp", "branch_history": False},
+        {"kind": "shared_mlp", "sensors": "off", "payload_input": False},
+        {"kind": "shared_mlp", "branch_history": False},
     ],
 )  # fmt: skip
 def test_the_fused_form_is_the_network(how):

@@ -31,7 +31,8 @@ def test_a_unit_is_known_in_the_folds_that_left_out_another(make_study, make_fou
     assert texts[1] == ["b", "10.00", "8.00", "6.00 ± 1.41", "2.00", "0.60 ± 0.14"]
     assert texts[2][3] == "5.00 ± 1.41"  # 4 and 6: over units
     assert made.sentences == (
-        "MLP, full coupling leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when trained on.",
+        "MLP, full coupling leaves 0.50 of the nominal error on a unit never seen and 0.20 on the same units when "
+        "trained on.",
     )
 
 

@@ -24,10 +24,11 @@ class ModelConfig:
     """Shape of a delta-action model; every dimension is derived from it and the number of operated joints n."""
 
     kind: Kind = "gaponet"
-    """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as its
-    branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form. transformer: attention over
-    the past frames and the present. fno: Fourier neural operator over the same time axis. inverse: the mlp fitted once
-    to the inverse labels on the recorded motions, without roll-outs of its own and without PPO."""
+    """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as
+    its branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form.
+    transformer: attention over the past frames and the present. fno: Fourier neural operator over the same time axis.
+    inverse: the mlp fitted once to the inverse labels on the recorded motions, without roll-outs of its own and without
+    PPO."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1
