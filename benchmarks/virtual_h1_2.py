@@ -1,6 +1,6 @@
 """The ladder on virtual H1-2 robots: what each step leaves of the gap of a unit that no step has seen.
 
-    python benchmarks/virtual_h1_2.py WORK [--seeds 3] [--budget 76800]
+    python benchmarks/virtual_h1_2.py WORK [--seeds 3] [--budget 230400]
 
 Fitted and trained on virtual-1 to virtual-3 of the fleet `hard`, measured on virtual-4 playing other motions, at every
 payload, whole-motion free run:
@@ -8,7 +8,7 @@ payload, whole-motion free run:
 1. nominal; delay + offset; four scalars for all joints and units (kp, damping, dry friction, delay); pooled
    identification, classic and with the terms of the servo's law that validation keeps;
 2. GAPONet on that: a supervised start, no PPO; then `gaponet calibrate` with 30 s of virtual-4, training motions;
-3. the untrained steps on the fleet `easy`.
+3. beside it, what four scalars and classic identification leave of the fleet `easy`.
 
 Writes docs/results/virtual_h1_2.{md,json,csv,svg,png}. What is found in WORK is kept. Every number is
 from VIRTUAL robots.
@@ -38,21 +38,24 @@ from gaponet.plot.methods import shade
 from gaponet.plot.table import Spread, Table
 from gaponet.robot import LAW, RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
-from gaponet.sim.evolve import evolve
 from gaponet.sim.identify import DEFAULT_TERMS, identify
-from gaponet.sim.joint_runs import JointRuns
+from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
+from gaponet.sim.multistart import descend
 from gaponet.sim.refit import cut
 from gaponet.sim.replay import Corrector, replay
 from gaponet.study.found import Found, answer
+from gaponet.study.options import TRAINING
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
+from gaponet.training.config import WarmStartConfig
 
 RECIPE = Path(__file__).with_suffix(".toml")
 UNIT, WORD = "virtual-4", "identified+gaponet"
+START = WarmStartConfig(rounds=6, num_envs=128, steps=300, gradient_steps=200)
 SCALES = {"kp": (0.2, 0.2, 3.0), "damping": (1.0, 0.0, 10.0), "frictionloss": (2.0, 0.0, 40.0)}  # unit, low, high
-GENERATIONS, WINDOWS = 60, 24  # of the four scalars; of 8 s, of every fit
+ITERATIONS, WINDOWS = 15, 24  # of the four scalars; of 8 s, of every fit
 STEPS = {  # → colour
     "nominal": "#8c8c8c", "delay + offset": "#d99000", "four scalars": "#3b7dd8", "identification, classic": "#2a9d6f",
     "identification": "#17543c", "identification + GAPONet": "#c8102e", "… calibrated": shade("#c8102e", -0.4),
@@ -100,20 +103,15 @@ class Bench:
         fit = lambda: identify(self.train, self.nominal, self.val, WINDOWS, terms).robot  # noqa: E731
         return self.kept("law" if terms else "classic", fit)
 
-    def simulators(self) -> dict[str, RobotSpec]:
-        """What was identified on the training units, step by step."""
-        return {
-            "four scalars": self.kept("four", lambda: four_scalars(self.train, self.nominal)),
-            "identification, classic": self.identified(()),
-            "identification": self.identified(DEFAULT_TERMS),
-        }
-
     def untrained(self) -> dict[str, Errors]:
-        """The steps without a network."""
-        late = delay_offset.fit(self.train, self.nominal)
-        first = {"nominal": [self.errors(self.nominal)],
-                 "delay + offset": [self.errors(self.nominal, late.corrector(self.nominal))]}  # fmt: skip
-        return first | {name: [self.errors(robot)] for name, robot in self.simulators().items()}
+        """The steps without a network; of the easy fleet without delay + offset and the servo's law."""
+        hard, steps = self.fleet == "hard", {"nominal": [self.errors(self.nominal)]}
+        if hard:
+            late = delay_offset.fit(self.train, self.nominal)
+            steps["delay + offset"] = [self.errors(self.nominal, late.corrector(self.nominal))]
+        four = self.kept("four", lambda: four_scalars(self.train, self.nominal))
+        steps |= {"four scalars": [self.errors(four)], "identification, classic": [self.errors(self.identified(()))]}
+        return steps | ({"identification": [self.errors(self.identified(DEFAULT_TERMS))]} if hard else {})
 
 
 def four_scalars(sequences: list[Sequence], robot: RobotSpec) -> RobotSpec:
@@ -131,9 +129,9 @@ def four_scalars(sequences: list[Sequence], robot: RobotSpec) -> RobotSpec:
         fixed = {f: np.broadcast_to(v, (len(x), n)) for f, v in still.items()}
         return scaled | fixed | {"delay": np.repeat(factors[:, [3]], n, axis=1)}
 
-    cost = lambda x: parts.cost(parts.errors(values(x))).sum(axis=1, keepdims=True)  # noqa: E731
-    start = np.array([[1.0, 1.0, 1.0, 0.01]])
-    best = values(evolve(start / unit, low / unit, high / unit, cost, GENERATIONS)[None])
+    errors = lambda x: np.moveaxis(parts.errors(values(x)), 1, 0).reshape(len(x), 1, -1) / SOFT  # noqa: E731
+    x, _ = descend(np.array([[[1.0, 1.0, 1.0, 0.01]]]) / unit, low / unit, high / unit, errors, ITERATIONS)
+    best = values(x)
     return robot.with_servos({j: {f: float(v[0, i]) for f, v in best.items()} for i, j in enumerate(robot.operated)})
 
 
@@ -241,13 +239,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--budget", default="76800", help="of each run, as in gaponet train")
+    parser.add_argument("--budget", default="230400", help="of each run, as in gaponet train")
     parser.add_argument("--recipe", type=Path, default=RECIPE)
     args = parser.parse_args()
     question = Ladder(*(Bench.of(fleet, args.recipe, args.work) for fleet in ("hard", "easy")))
-    study = Study(question.hard.data, question.hard.nominal, args.work / "study", budget=args.budget, seeds=args.seeds,
-                  holdout_units=question.holdout_units)  # fmt: skip
-    study = replace(study, identified=question.hard.identified(DEFAULT_TERMS))
+    config = replace(TRAINING, warm_start=START)
+    hard, out = question.hard, args.work / "study"
+    study = Study(hard.data, hard.nominal, out, config, args.budget, args.seeds, question.holdout_units)
+    study = replace(study, identified=hard.identified(DEFAULT_TERMS))
     publish(answer(question, study, say), args.work / "results")
 
 

@@ -24,12 +24,12 @@ MOTIONS = (
 )
 
 
-def play(fleet, unit, simulators):
+def play(fleet, unit, simulators, most=450):
     """Robot, commands, and positions of a unit and of simulators, (T, motions, payloads, 27); ended motions rest."""
     robot = load_robot("h1_2")
     library, locked = Library(robot), idle_joints(robot, robot.operated)
     free = robot.index([name for name in robot.joint_names if name not in locked])
-    motions = [library.make(name).sample(robot.dt)[:450] for name in MOTIONS]
+    motions = [library.make(name).sample(robot.dt)[:most] for name in MOTIONS]
     rows = max(len(m) for m in motions)
     ctrl = np.stack([np.concatenate([m, np.repeat(m[-1:], rows - len(m), axis=0)]) for m in motions], axis=1)
     ctrl = np.repeat(ctrl, len(PAYLOADS), axis=1)  # motion by motion, payloads within
@@ -103,3 +103,23 @@ def test_the_loaded_hand_is_off_by_centimetres(played):
     assert 1.0 < vertical < 3.5
     assert 0.4 < sideways < 2.0
     assert forward < 3.0
+
+
+def four_numbers(robot):
+    """What benchmarks/virtual_h1_2.py fits to the hard fleet, the same for all joints."""
+    return robot.with_servos(
+        {
+            j: {"kp": 0.79 * kp, "frictionloss": 1.74, "damping": 1.007, "delay": 0.011}
+            for j, kp in zip(robot.operated, robot.kp[robot.operated_index], strict=True)
+        }
+    )
+
+
+def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave():
+    """The nominal gap and what is left are of the size of a real SO-101's (19 and 4.4 mrad) and the paper's H1-2 (12)."""
+    robot, _, real, nominal, four = play("hard", "virtual-4", [lambda robot: robot, four_numbers], 200)
+    gap, left = (np.abs(real - sim)[..., robot.operated_index].mean(axis=(0, 1, 3)) * 1e3 for sim in (nominal, four))
+    assert (gap > 10).all(), gap
+    assert (gap < 30).all(), gap
+    assert (left > 4).all(), left
+    assert (left < 15).all(), left
