@@ -116,7 +116,7 @@ def four_numbers(robot):
 
 
 def test_four_numbers_leave_of_the_hard_fleet_what_real_arms_leave():
-    """The nominal gap and what is left are of the size of a real SO-101's (19 and 4.4 mrad) and the paper's H1-2 (12)."""
+    """Gap and rest are of the size of a real SO-101's (19 and 4.4 mrad) and of the paper's H1-2 (12 to 15 left)."""
     robot, _, real, nominal, four = play("hard", "virtual-4", [lambda robot: robot, four_numbers], 200)
     gap, left = (np.abs(real - sim)[..., robot.operated_index].mean(axis=(0, 1, 3)) * 1e3 for sim in (nominal, four))
     assert (gap > 10).all(), gap
