@@ -66,7 +66,7 @@ def facts(fit: Identified) -> dict[str, object]:
     touch = fit.touch
     table = None if touch is None else {
         "before": (1e3 * touch.before).tolist(), "after": (1e3 * touch.after).tolist(), "kept": touch.kept,
-        "motions": touch.motions,
+        "motions": touch.motions, "std": touch.std,
     }  # fmt: skip
     return {"terms": terms, "table": table, "std": fit.std, "warnings": fit.warnings}
 
@@ -183,11 +183,23 @@ def recovered(work: Path) -> None:
             mine = [r for r in rows if field in (r["field"], "all")]
             if mine:
                 print(f"| {field} | {' | '.join(counts(mine))} |")
-    for t in told:
-        print(
-            t["tables"],
-            [(r["joint"], round(r["true"], 4), round(r["found"], 4)) for r in t["back"] if r["field"] == "zero"],
-        )
+    print("\n| arm | height, mm | friction | stiffness, N/m | zero of shoulder_lift, mrad |")
+    print("| --- |" + " ---: |" * 4)
+    for file, t in zip(files, told, strict=True):
+        true, found = t["tables"]
+        zero = next(r for r in t["back"] if (r["joint"], r["field"]) == ("shoulder_lift", "zero"))
+        std = (t["table"] or {}).get("std")
+        if not std or found is None:
+            print(f"| {file.stem} | not kept |")
+            continue
+        cells = [
+            f"{k * v:.3g} ± {k * std[f]:.2g} for {k * w:.3g}"
+            for f, k, v, w in (
+                *((f, 1e3 if f == "height" else 1.0, found[f], true[f]) for f in ("height", "friction", "stiffness")),
+                ("shoulder_lift", 1e3, zero["found"], zero["true"]),
+            )
+        ]
+        print(f"| {file.stem} | {' | '.join(cells)} |")
 
 
 def counts(rows: list[dict[str, Any]]) -> list[str]:
@@ -211,6 +223,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.page:
         page(args.work)
+        recovered(args.work)
         return
     args.work.mkdir(parents=True, exist_ok=True)
     data = Dataset(args.dataset)
