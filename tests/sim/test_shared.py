@@ -7,6 +7,7 @@ import pytest
 from arm import TOML, recordings, write_arm
 
 from gaponet.errors import RobotError
+from gaponet.sim.identify import identify
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.shared import far_from_published, same_servos, share
 
@@ -47,3 +48,14 @@ def test_a_servo_that_is_not_described_is_refused(tmp_path):
         write_arm(tmp_path, TWO.replace(SERVO, ""))
     robot = write_arm(tmp_path / "own", TOML)
     assert same_servos(robot) == {} == same_servos(replace(robot, servos=()))
+
+
+def test_identify_shares_a_law_when_asked_and_says_what_it_costs(tmp_path):
+    robot = write_arm(tmp_path, TWO)
+    motions = recordings(robot, 3, rows=80, kp=0.8)
+    fit = identify(motions[:2], robot, motions[2:], windows=2, terms=(), shared=True)
+    assert fit.robot.kp[0] == pytest.approx(fit.robot.kp[1])
+    np.testing.assert_allclose(fit.robot.kp, 0.8 * robot.kp, rtol=0.1)
+    (law,) = fit.shared
+    assert (law.name, law.before.shape, law.after.shape) == ("S1", (1,), (1,))
+    assert law.after.mean() < 5e-3

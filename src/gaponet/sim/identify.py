@@ -88,7 +88,7 @@ class Identified:
         robot: The same robot with identified parameters.
         before, after: Mean |error| of the windows, rad, joints on their own.
         warnings: What the recordings do not determine, or what ended at a bound.
-        std: Joint → field → standard error.
+        std: Joint → field → standard error; none of a shared law.
         tried: The terms of the law in the order tried.
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
@@ -158,11 +158,11 @@ def identify(
             values = richer
     std = fit.uncertainty(values, tell("standard errors", before_shared - AGAIN_STEPS))
     common = []
-    for i, (servo, places) in enumerate(same.items()):
-        armature, step = float(fit.first["armature"][places].mean()), before_shared + SHARED_ITERATIONS * i
+    for k, (servo, places) in enumerate(same.items()):
+        armature, step = float(fit.first["armature"][places].mean()), before_shared + SHARED_ITERATIONS * k
         mine = share(fit.runs, values, places, armature, tell(f"one {servo}", step))
         common.append(Tried(servo, *(motion_errors(judge or fit.runs, v) for v in (values, mine))))
-        values = mine
+        values, std = mine, std | {robot.operated[i]: {} for i in places}
     found = fit.robot(values)
     touch = None
     if table and robot.tips:
@@ -314,7 +314,7 @@ class Fit:
         ahead = axes.values(x + 1)
         for i, joint in enumerate(self.base.operated):
             for k, f in enumerate(names):
-                value, error = values[f][i], std[joint][f]
+                value, error = values[f][i], std[joint].get(f, 0.0)
                 if edge[i, k]:
                     found.append(f"{joint}: {f} ended at its bound ({value:.4g}); the model's form does not fit")
                 elif error > WIDE * max(abs(value), ahead[f][i] - value):
