@@ -102,14 +102,12 @@ def figures(
 def export(
     dataset: Data,
     out: Path,
-    format: Literal["lerobot"] = "lerobot",
     json: Json = False,
 ) -> None:
-    """Write a dataset in another format; gaponet import reads it back without loss.
+    """Write a dataset as LeRobotDataset v3.0, one set for each rate; gaponet import reads it back without loss.
 
     Args:
         out: New folder.
-        format: lerobot: LeRobotDataset v3.0, one set for each rate and choice of channels.
     """
     from gaponet.data.formats.lerobot_export import export_lerobot
 

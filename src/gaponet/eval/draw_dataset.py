@@ -48,26 +48,22 @@ def draw_all(
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     with writing(out, "figures"):
-        return _draw(dataset, robot, out, progress)
+        written: list[Path] = []
+        left_out: dict[str, str] = {}
+        for i, (name, make) in enumerate(PICTURES.items()):
+            progress(i, len(PICTURES), name)
 
+            def tell(done: int, total: int, i: int = i, name: str = name) -> None:
+                progress(i + done / max(total, 1), len(PICTURES), f"{name}: replaying")
 
-def _draw(dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress) -> tuple[list[Path], dict[str, str]]:
-    written: list[Path] = []
-    left_out: dict[str, str] = {}
-    for i, (name, make) in enumerate(PICTURES.items()):
-        progress(i, len(PICTURES), name)
-
-        def tell(done: int, total: int, i: int = i, name: str = name) -> None:
-            progress(i + done / max(total, 1), len(PICTURES), f"{name}: replaying")
-
-        try:
-            fig = make(dataset, robot, tell)
-        except _Nothing as reason:
-            left_out[name] = str(reason)
-            continue
-        written += save(fig, out / name)
-    progress(len(PICTURES), len(PICTURES), "")
-    return written, left_out
+            try:
+                fig = make(dataset, robot, tell)
+            except _Nothing as reason:
+                left_out[name] = str(reason)
+                continue
+            written += save(fig, out / name)
+        progress(len(PICTURES), len(PICTURES), "")
+        return written, left_out
 
 
 class _Nothing(Exception):  # noqa: N818

@@ -51,28 +51,24 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         ModelError: The difference is above 1e-5 rad; nothing is written.
     """
     with writing(folder, "model"):
-        return _export(net, folder, card, samples)
-
-
-def _export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) -> float:
-    frozen = copy.deepcopy(net).eval()
-    weights, names = fuse(frozen), ["delta", "offsets"][: 1 + net.config.learns_points]
-    with whole(folder / WEIGHTS) as onnx:
-        write_onnx(Ships(frozen) if weights is None else FusedNet(weights), onnx, samples[:2], names)
-        with torch.inference_mode():
-            expected = [y.numpy() for y in Ships(frozen)(torch.from_numpy(samples))]
-        answers = [OnnxNetwork(onnx, output=name)(samples) for name in names]
-        difference = max(_require(folder, "ONNX", *pair) for pair in zip(answers, expected, strict=True))
-        if weights is not None:
-            answer = fused.FusedForward(weights, len(samples))(samples)
-            difference = max(difference, _require(folder, "numpy", answer, expected[0]))
-            with whole(folder / fused.FILE) as npz:
-                np.savez(npz, **weights)  # type: ignore[arg-type]
-        else:
-            (folder / fused.FILE).unlink(missing_ok=True)
-    files = {name: sha256(folder / name) for name in (WEIGHTS, fused.FILE) if (folder / name).is_file()}
-    write_card(folder / CARD, card | {"parity_rad": difference, "sha256": files})
-    return difference
+        frozen = copy.deepcopy(net).eval()
+        weights, names = fuse(frozen), ["delta", "offsets"][: 1 + net.config.learns_points]
+        with whole(folder / WEIGHTS) as onnx:
+            write_onnx(Ships(frozen) if weights is None else FusedNet(weights), onnx, samples[:2], names)
+            with torch.inference_mode():
+                expected = [y.numpy() for y in Ships(frozen)(torch.from_numpy(samples))]
+            answers = [OnnxNetwork(onnx, output=name)(samples) for name in names]
+            difference = max(_require(folder, "ONNX", *pair) for pair in zip(answers, expected, strict=True))
+            if weights is not None:
+                answer = fused.FusedForward(weights, len(samples))(samples)
+                difference = max(difference, _require(folder, "numpy", answer, expected[0]))
+                with whole(folder / fused.FILE) as npz:
+                    np.savez(npz, **weights)  # type: ignore[arg-type]
+            else:
+                (folder / fused.FILE).unlink(missing_ok=True)
+        files = {name: sha256(folder / name) for name in (WEIGHTS, fused.FILE) if (folder / name).is_file()}
+        write_card(folder / CARD, card | {"parity_rad": difference, "sha256": files})
+        return difference
 
 
 def write_onnx(net: nn.Module, path: Path, x: Array, names: list[str]) -> None:

@@ -20,8 +20,7 @@ from gaponet.plot.table import Spread, Table, text
 from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import identify
-from gaponet.study.found import Found
-from gaponet.study.found import spread as over
+from gaponet.study.found import Found, spread
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
@@ -84,11 +83,6 @@ def identified(study: Study, tell: Callable[[float, float, str], None]) -> Study
 Runs = dict[str, list[dict[str, Any]]]  # method → what each seed gave; a baseline has none
 
 
-def spread(runs: Runs, method: str, units: str, *path: str, scale: float = 1e3) -> Spread:
-    """One number of a method over its seeds; mrad of rad unless scale says otherwise."""
-    return over(runs[method], units, *path, scale=scale)
-
-
 def keys(runs: Runs, units: str, group: str) -> list[str]:
     """Payloads, units or joints that there are; payloads in order of mass."""
     found = list(runs["nominal"][0].get(units, {}).get(group, {}))
@@ -98,20 +92,20 @@ def keys(runs: Runs, units: str, group: str) -> list[str]:
 def _totals(runs: Runs) -> Table:
     """A row per method."""
     payloads, new = keys(runs, "known", "by_payload"), keys(runs, "new", "by_unit")
-    nominal = spread(runs, "nominal", "known", "mpjae").mean
+    nominal = spread(runs["nominal"], "known", "mpjae").mean
     columns = ["method", "weights", "MPJAE mrad", "of nominal", "Q_dis rad·s", *["worst payload"] * (len(payloads) > 1),
                *["new unit"] * bool(new), "min"]  # fmt: skip
     rows = []
     for m, found in runs.items():
-        error = spread(runs, m, "known", "mpjae")
+        error = spread(runs[m], "known", "mpjae")
         row = [title(m), _count(found[0].get("parameters")), error, error.mean / nominal if nominal else None,
-               spread(runs, m, "known", "q_dis", scale=1).mean]  # fmt: skip
+               spread(runs[m], "known", "q_dis", scale=1).mean]  # fmt: skip
         if len(payloads) > 1:
-            by = {p: spread(runs, m, "known", "by_payload", p, "mpjae") for p in payloads}
+            by = {p: spread(runs[m], "known", "by_payload", p, "mpjae") for p in payloads}
             worst = max(by, key=lambda p: by[p].mean)
             row.append(f"{text(by[worst])} ({worst} kg)")
         if new:
-            row.append(spread(runs, m, "new", "mpjae"))
+            row.append(spread(runs[m], "new", "mpjae"))
         minutes = Spread.of([run["seconds"] for run in found if "seconds" in run], 1 / 60).mean
         rows.append((*row, text(minutes, 1)))
     note = f"Units never trained on: {', '.join(new)}; all other columns are of the units trained on." if new else ""
@@ -125,20 +119,15 @@ def _groups(runs: Runs) -> Table:
                                 ("new", "by_unit", "{}, never trained on"), ("known", "by_joint", "{}")):  # fmt: skip
         found = keys(runs, units, group)
         if len(found) > 1 or (units == "new" and found):
-            rows += [(name.format(k), *(spread(runs, m, units, group, k, "mpjae") for m in runs)) for k in found]
+            rows += [(name.format(k), *(spread(runs[m], units, group, k, "mpjae") for m in runs)) for k in found]
     return Table("groups", ("MPJAE, mrad", *(title(m) for m in runs)), tuple(rows))
 
 
 def _horizons(runs: Runs) -> Table:
     """A row per time since the common start."""
     times = list(runs["nominal"][0]["known"].get("by_horizon", {}))
-    rows = [
-        (
-            f"{t} s" if t != "whole" else "whole motion",
-            *(spread(runs, m, "known", "by_horizon", t, "mpjae") for m in runs),
-        )
-        for t in times
-    ]
+    name = lambda t: f"{t} s" if t != "whole" else "whole motion"  # noqa: E731
+    rows = [(name(t), *(spread(f, "known", "by_horizon", t, "mpjae") for f in runs.values())) for t in times]
     note = "MPJAE in mrad by time since the common start, of the last half of that time."
     return Table("horizons", ("after", *(title(m) for m in runs)), tuple(rows), note)
 
@@ -162,7 +151,7 @@ def _figure(runs: Runs, who: str) -> Any:
               for k in keys(runs, "known", group)}  # fmt: skip
     places |= {f"{unit}\n(new unit)": ("new", "by_unit", unit) for unit in keys(runs, "new", "by_unit")}
     colours = palette(runs)
-    methods = {title(m): (colours[m], [spread(runs, m, *path, "mpjae") for path in places.values()]) for m in runs}
+    methods = {title(m): (colours[m], [spread(runs[m], *path, "mpjae") for path in places.values()]) for m in runs}
     return bars(list(places), methods, "MPJAE, mrad", f"Held-out motions, whole-motion free run, {who}")
 
 

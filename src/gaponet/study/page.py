@@ -62,27 +62,23 @@ def write(result: Result, folder: Path) -> list[Path]:
         FolderError: folder is somebody else's, or another process writes into it.
     """
     with writing(folder, KIND):
-        return _write(result, folder)
-
-
-def _write(result: Result, folder: Path) -> list[Path]:
-    files: list[Path] = []
-    for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
-        files.append(folder / f"{stem}.csv")
-        write_text(files[-1], table.csv())
-    pictures = stems(result.name, list(result.figures))
-    for figure, stem in zip(result.figures.values(), pictures, strict=True):
-        files += save(figure, folder / f"{stem}.svg")
-    files += [folder / f"{result.name}.md", folder / f"{result.name}.json"]
-    write_text(files[-2], _markdown(result, pictures))
-    figures = dict(zip(result.figures, pictures, strict=True))
-    record = {
-        "format": FORMAT, "name": result.name, "title": result.title, "virtual": result.virtual,
-        "facts": dict(result.facts), "sentences": list(result.sentences),
-        "tables": [t.record() for t in result.tables if t.shown], "figures": figures,
-    }  # fmt: skip
-    write_json(files[-1], record)
-    return [*files, write_report(folder)]
+        files: list[Path] = []
+        for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
+            files.append(folder / f"{stem}.csv")
+            write_text(files[-1], table.csv())
+        pictures = stems(result.name, list(result.figures))
+        for figure, stem in zip(result.figures.values(), pictures, strict=True):
+            files += save(figure, folder / f"{stem}.svg")
+        files += [folder / f"{result.name}.md", folder / f"{result.name}.json"]
+        write_text(files[-2], _markdown(result, pictures))
+        figures = dict(zip(result.figures, pictures, strict=True))
+        record = {
+            "format": FORMAT, "name": result.name, "title": result.title, "virtual": result.virtual,
+            "facts": dict(result.facts), "sentences": list(result.sentences),
+            "tables": [t.record() for t in result.tables if t.shown], "figures": figures,
+        }  # fmt: skip
+        write_json(files[-1], record)
+        return [*files, write_report(folder)]
 
 
 def stems(name: str, parts: list[str]) -> list[str]:
