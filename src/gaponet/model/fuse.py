@@ -20,7 +20,7 @@ def fuse(net: nn.Module) -> dict[str, Array] | None:
     """
     if type(net) is DeltaMLP:
         weights = _mlp(net)
-    elif type(net) in (OperatorNet, SharedMLP) and _plain(net):
+    elif isinstance(net, OperatorNet) and type(net) in (OperatorNet, SharedMLP) and _plain(net):
         weights = (_joint if net.per_joint else _full)(net)
     else:
         return None
@@ -80,7 +80,7 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
     ).astype(int)
     weights = _named(_features(net, columns), n)
     alone = isinstance(net, SharedMLP)  # one net is a branch whose trunk answers 1
-    branch = dense_layers(net.net if alone else _sequential(net.branch))
+    branch = dense_layers(net.net if isinstance(net, SharedMLP) else _sequential(net.branch))
     trunk = [(np.zeros((1 + payload + n, 1)), np.ones(1))] if alone else dense_layers(net.trunk)
     predictor: Layers = []
     (w, b), sensed = branch[0], 0
