@@ -5,7 +5,6 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,7 +59,7 @@ def import_logs(
     from gaponet.sim.kept import require_kept
     from gaponet.sim.model import model_hash
 
-    spec = _robot(robot)
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if Dataset.peek(out, spec) is not None:
         require_kept(Path(out), spec, DatasetError, MOVE_KEPT)
     with bar("importing") as update:
@@ -157,16 +156,12 @@ def _gap_by_step(
     run: Path, dataset: Dataset | Place, robot: RobotSpec | Place | None, motions: tuple[str, ...]
 ) -> dict[str, Any]:
     from gaponet.eval.gap import gap_by_step
-    from gaponet.eval.gap_figure import waterfall
-    from gaponet.files import write_text, writing
-    from gaponet.plot.style import save
+    from gaponet.eval.gap_figure import write_gap
 
     data, spec = open_dataset(dataset, robot, run)
     with bar("gap") as update:
         found = gap_by_step(run, data, spec, motions, update)
-    with writing(run, "run"):
-        write_text(run / "gap.json", json.dumps(found, indent=1) + "\n")
-        save(waterfall(found), run / "gap")
+    write_gap(found, run)
     return found
 
 
@@ -290,11 +285,8 @@ def train(
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
     with bar(f"training {config.model.kind}") as update, writing(Path(out), "run"):
 
-        def show(s: Status) -> None:
-            reward = "" if s.reward != s.reward else f"reward {s.reward:.4f}, "
-            held = "" if s.val_mpjae != s.val_mpjae else f"held-out {s.val_mpjae * 1e3:.2f} mrad"
-            best = f" (best {s.best_mpjae / s.nominal_mpjae:.2f} of nominal)" if held else ""
-            update(s.fraction, 1.0, f"{s.stage}: {reward}{held}{best}, {s.throughput:,.0f} steps/s")
+        def show(status: Status) -> None:
+            update(status.fraction, 1.0, status.note)
 
         return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
 
@@ -366,13 +358,7 @@ def calibrate(
     data, spec = open_dataset(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
-    units = sorted({e.meta.unit_id for e in data.entries})
-    if unit not in units and (unit or len(units) != 1):
-        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
-    entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
-    if not motions:
-        trained = set(model.card["motions"]["train"])
-        entries = [e for e in entries if e.meta.motion in trained] or entries
+    entries = calibration.choose(data, model, unit, motions)
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
     with bar("calibrating") as update:
@@ -382,10 +368,6 @@ def calibrate(
         )  # fmt: skip
     calibration.save(found, folder)
     return found
-
-
-def _robot(robot: RobotSpec | Place) -> RobotSpec:
-    return robot if isinstance(robot, RobotSpec) else load_robot(robot)
 
 
 def _run(run: GapModel | Place) -> Path:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
 from matplotlib.figure import Figure
 
+from gaponet.files import write_text, writing
 from gaponet.plot.methods import colour, shade, title
-from gaponet.plot.style import figure, joint_label, styled
+from gaponet.plot.style import figure, joint_label, save, styled
 
 COLUMNS = 4  # at most
 FLOOR = "#1f7a56"
+
+
+def write_gap(found: dict[str, Any], run: Path) -> None:
+    """What eval.gap.gap_by_step found, as gap.json, gap.svg and gap.png of the run."""
+    with writing(run, "run"):
+        write_text(run / "gap.json", json.dumps(found, indent=1) + "\n")
+        save(waterfall(found), run / "gap")
 
 
 @styled

@@ -19,6 +19,7 @@ from annotated_types import Interval
 
 from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset, Entry
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import writing
 from gaponet.model.artifact import GapModel
@@ -58,6 +59,20 @@ class Calibration:
     def robot(self, simulator: RobotSpec) -> RobotSpec:
         """The simulator of this unit."""
         return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
+
+
+def choose(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
+    """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
+
+    Raises:
+        UsageError: No such unit, or none is named and the dataset holds several.
+    """
+    units = sorted({e.meta.unit_id for e in data.entries})
+    if unit not in units and (unit or len(units) != 1):
+        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
+    entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
+    trained = [e for e in entries if e.meta.motion in model.card["motions"]["train"]]
+    return entries if motions else trained or entries
 
 
 def calibrate(

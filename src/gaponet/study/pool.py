@@ -140,8 +140,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
         data = Dataset(cell.dataset)
 
         def show(s: Status) -> None:
-            held = "" if s.val_mpjae != s.val_mpjae else f", held-out {s.best_mpjae / s.nominal_mpjae:.2f} of nominal"
-            tell(s.fraction, f"{s.stage}{held}, {s.throughput:,.0f} steps/s")
+            tell(s.fraction, s.note)
 
         budget = Budget.parse(cell.budget)
         with writing(cell.folder, "run", wait=PATIENCE):

@@ -53,3 +53,11 @@ class Status:
     def throughput(self) -> float:
         """Control steps per second, validation and set-up included."""
         return self.steps / max(self.seconds, 1e-9)
+
+    @property
+    def note(self) -> str:
+        """Stage, reward, held-out error and speed, what there is of them."""
+        reward = "" if self.reward != self.reward else f", reward {self.reward:.4f}"
+        best = f"{self.best_mpjae / self.nominal_mpjae:.2f} of nominal"
+        held = "" if self.val_mpjae != self.val_mpjae else f", held-out {self.val_mpjae * 1e3:.2f} mrad (best {best})"
+        return f"{self.stage}{reward}{held}, {self.throughput:,.0f} steps/s"
