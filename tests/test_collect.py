@@ -202,8 +202,9 @@ def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
         collect(spec, fleet, replace(RECIPE, motions=("reach-*",)), tmp_path / "a", nproc=1)
     with pytest.raises(UsageError, match="fleet 'easy' has no unit 'virtual-9'"):
         collect(spec, fleet, replace(RECIPE, units=("virtual-9",)), tmp_path / "a", nproc=1)
-    with pytest.raises(UsageError, match="repetitions and variants are counts"):
-        replace(RECIPE, repetitions=0)
+    for wrong in ({"repetitions": 0}, {"units": ()}, {"rates": (0.0,)}):
+        with pytest.raises(UsageError, match=f"recipe: {next(iter(wrong))}.*should"):
+            collect(spec, fleet, replace(RECIPE, **wrong), tmp_path / "a", nproc=1)
     file = tmp_path / "mine.toml"
     file.write_text('motions = ["*"]\npayloads = [0]\nunit = ["virtual-1"]\n')
     with pytest.raises(UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"):

@@ -28,9 +28,9 @@ LOG_UNITS = ("rad", "deg", "fraction")
 STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
-IDENTIFIED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
+FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
-SERVO = ("kp", "effort_limit", *IDENTIFIED)  # what identification may change
+SERVO = ("kp", "effort_limit", *FITTED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
 
 
@@ -108,7 +108,7 @@ class RobotSpec:
             if np.shape(getattr(self, name)) != (n,):
                 shape = np.shape(getattr(self, name))
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
-        for name in ("kp", "kd", "effort_limit", "qpos_home", *IDENTIFIED):
+        for name in ("kp", "kd", "effort_limit", "qpos_home", *FITTED):
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
             if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")

@@ -32,8 +32,8 @@ from gaponet.files import write_text
 from gaponet.robot import RobotSpec
 from gaponet.structure import Json, read_json
 
-Condition = tuple[float, str]  # payload_mass kg, payload_side
-Setting = tuple[float, str, tuple[float, ...] | None]  # the same, and kp while recording where it is known
+Carried = tuple[float, str]  # payload_mass kg, payload_side
+Load = tuple[float, str, tuple[float, ...] | None]  # the same, and kp while recording where it is known
 Gravity = Callable[
     [Array, float, str], Array
 ]  # qpos (k, n) rad, payload_mass, payload_side → holding torque (k, n) N·m
@@ -102,7 +102,7 @@ def fit_unit(
 ) -> UnitOffsets:
     """Fit the offsets of one unit from all its sequences; those whose rests are known, by hash, are not read again."""
     known = known or {}
-    found: dict[Setting, list[Holds]] = {}
+    found: dict[Load, list[Holds]] = {}
     for entry in dataset.entries:
         if entry.meta.unit_id == unit_id:
             key = (entry.meta.payload_mass, entry.meta.payload_side, entry.meta.known_gains[0])
@@ -112,7 +112,7 @@ def fit_unit(
     return fit_offsets({key: join(parts, n) for key, parts in found.items()}, robot, gravity)
 
 
-def fit_offsets(holds: dict[Setting, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
+def fit_offsets(holds: dict[Load, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
     """Fit the offsets of the operated joints.
 
     Args:
@@ -154,7 +154,7 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     return {**read_json(OffsetsFile, file, DatasetError, hint, more=True)}
 
 
-def _nominal_sag(qpos: Array, setting: Setting, robot: RobotSpec, gravity: Gravity) -> Array:
+def _nominal_sag(qpos: Array, setting: Load, robot: RobotSpec, gravity: Gravity) -> Array:
     """Static error of the nominal model, (k, n) rad; 0 for a joint without gain."""
     kp = robot.with_gains(setting[2], None).kp
     return -gravity(qpos, *setting[:2]) / np.where(kp > 0, kp, np.inf)
@@ -183,7 +183,7 @@ def _rests(holds: Holds, robot: RobotSpec, most: int) -> _Rests:
 
 
 def _fit_zeros(
-    rests: dict[Setting, _Rests], robot: RobotSpec, gravity: Gravity
+    rests: dict[Load, _Rests], robot: RobotSpec, gravity: Gravity
 ) -> tuple[dict[str, dict[str, Any]], float]:
     """Zero offsets by joint as fields of JointOffset, and kp_real / kp."""
     fixed, cov = _least_squares(rests, robot, gravity, free_stiffness=False)
@@ -210,7 +210,7 @@ def _fit_zeros(
 
 
 def _least_squares(
-    rests: dict[Setting, _Rests], robot: RobotSpec, gravity: Gravity, free_stiffness: bool
+    rests: dict[Load, _Rests], robot: RobotSpec, gravity: Gravity, free_stiffness: bool
 ) -> tuple[Array, Array]:
     """Parameters [z (m), half_band (m), ln stiffness or 0] and their covariance.
 

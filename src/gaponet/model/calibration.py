@@ -61,7 +61,7 @@ class Calibration:
         return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
 
 
-def choose(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
+def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
     """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
 
     Raises:

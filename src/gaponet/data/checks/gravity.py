@@ -16,11 +16,11 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding
-from gaponet.data.offsets import Condition, Gravity
+from gaponet.data.offsets import Carried, Gravity
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
-Loads = dict[Condition, tuple[Array, Array]]  # angles and torques, (k, n) each
+Loads = dict[Carried, tuple[Array, Array]]  # angles and torques, (k, n) each
 
 TURNS = (0.3, 0.6, 1.0, 1.5708, 2.3, 3.1416)  # of a zero, rad, both ways
 # How a joint may be wrong: sign and turn of its angle, sign of its torque.
@@ -105,7 +105,7 @@ def _rests(surveys: list[Survey], robot: RobotSpec) -> Loads:
 
 
 def _joined(parts: Iterable[tuple[Survey, tuple[Array, Array]]]) -> Loads:
-    found: dict[Condition, list[tuple[Array, Array]]] = defaultdict(list)
+    found: dict[Carried, list[tuple[Array, Array]]] = defaultdict(list)
     for s, load in parts:
         found[s.entry.meta.payload_mass, s.entry.meta.payload_side].append(load)
     return {
@@ -113,7 +113,7 @@ def _joined(parts: Iterable[tuple[Survey, tuple[Array, Array]]]) -> Loads:
     }
 
 
-def _as_if(model: Gravity, qpos: Array, key: Condition, j: int, sign: int, turn: float, torque_sign: int) -> Array:
+def _as_if(model: Gravity, qpos: Array, key: Carried, j: int, sign: int, turn: float, torque_sign: int) -> Array:
     """Gravity torque in the log's own signs, were joint j mirrored, its zero elsewhere or its torque negated."""
     other = qpos.copy()
     other[:, j] = sign * other[:, j] + turn
@@ -122,7 +122,7 @@ def _as_if(model: Gravity, qpos: Array, key: Condition, j: int, sign: int, turn:
     return torque
 
 
-def _unexplained(gravity: dict[Condition, Array], loads: Loads, loaded: Array) -> Array:
+def _unexplained(gravity: dict[Carried, Array], loads: Loads, loaded: Array) -> Array:
     """Share of the torques' square that gravity, times a scale ≥ 0 for each joint, leaves, (loaded)."""
     x = np.concatenate([gravity[key][:, loaded] for key in loads])
     y = np.concatenate([torque[:, loaded] for _, torque in loads.values()])

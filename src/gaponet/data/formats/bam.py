@@ -28,7 +28,7 @@ MOTORS = {"xl330": 4096 / (2 * np.pi) / 256 / 885 * 0.52 / 5}
 Size = Annotated[float, Gt(0), Interval(le=1e3)]
 
 
-class Entry(TypedDict):
+class Sample(TypedDict):
     """One sample; rad, rad/s, s, °C."""
 
     timestamp: float
@@ -39,7 +39,7 @@ class Entry(TypedDict):
     temp: NotRequired[float]
 
 
-class Recording(TypedDict):
+class BamFile(TypedDict):
     """One file; kg, m, V."""
 
     mass: Annotated[float, Interval(ge=0, le=100)]
@@ -49,7 +49,7 @@ class Recording(TypedDict):
     vin: Size
     motor: str
     trajectory: str
-    entries: Annotated[list[Entry], Len(2)]
+    entries: Annotated[list[Sample], Len(2)]
 
 
 def find(path: Path) -> list[Path]:
@@ -63,11 +63,11 @@ def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) 
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
     for file in files:
-        told = read_json(Recording, file, LogError, "record it again, or leave the file out", more=True)
+        told = read_json(BamFile, file, LogError, "record it again, or leave the file out", more=True)
         yield told["trajectory"], refuse_absurd(_log(file, told, robot, joint_map), robot)
 
 
-def _log(file: Path, told: Recording, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
+def _log(file: Path, told: BamFile, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
     if told["motor"] not in MOTORS:
         raise LogError(
             f"{file}: motor is '{told['motor']}': what its kp {told['kp']:g} means in N·m/rad is known of "

@@ -16,7 +16,7 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.study.played.goals import Plan, Planner
 from gaponet.study.played.kept import KeptParts, revived
-from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, side_by_side, with_payloads
+from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, stacked, with_payloads
 from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
 from gaponet.virtual.physics import Physics
@@ -97,7 +97,7 @@ def deliver(
         folder: Where each method's part is kept when it is done.
     """
     pairs = with_payloads(plans, payloads)
-    lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), side_by_side([p.ctrl for p, _ in pairs])
+    lengths, targets = np.array([len(p.ctrl) for p, _ in pairs]), stacked([p.ctrl for p, _ in pairs])
     mass, seeds = np.array([p for _, p in pairs]), list(range(len(pairs)))
     asked = {id(plan): planner.places(plan.ctrl) for plan in plans}
     last, shown = round(LAST / robot.dt), len(pairs) // 2 // len(payloads) * len(payloads) + len(payloads) - 1

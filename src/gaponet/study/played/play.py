@@ -91,7 +91,7 @@ def with_payloads(motions: ListOf[M], payloads: tuple[float, ...]) -> list[tuple
     return [(m, p) for m in sorted(motions, key=lambda m: -len(m.ctrl)) for p in payloads]
 
 
-def side_by_side(ctrl: ListOf[Array]) -> Array:
+def stacked(ctrl: ListOf[Array]) -> Array:
     """Targets of unequal length as one (T, N, n), each held at its end."""
     longest = max(len(c) for c in ctrl)
     return np.stack([np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1)

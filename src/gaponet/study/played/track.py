@@ -17,7 +17,7 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 from gaponet.study.played.kept import KeptParts, revived
-from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, side_by_side, with_payloads
+from gaponet.study.played.play import Driven, Played, compensations, of_seed, play, stacked, with_payloads
 from gaponet.study.played.session import Tell
 from gaponet.study.played.trained import Trained
 from gaponet.study.played.unseen import Unseen
@@ -78,7 +78,7 @@ def track(
     """
     pairs, op, rest = with_payloads(motions, payloads), robot.operated_index, round(REST / robot.dt)
     ctrl = [np.concatenate([np.repeat(m.ctrl[:1], rest, axis=0), m.ctrl]) for m, _ in pairs]
-    lengths, targets = np.array([len(c) for c in ctrl]), side_by_side(ctrl)
+    lengths, targets = np.array([len(c) for c in ctrl]), stacked(ctrl)
     mass = np.array([p for _, p in pairs])
     kept = KeptParts(folder, "tracking", model_hash(robot), unit, unit_id, list(motions), payloads)
 
