@@ -7,7 +7,7 @@ payload, whole-motion free run:
 
 1. nominal; delay + offset; four scalars for all joints and units (kp, damping, dry friction, delay); pooled
    identification, classic and with the terms of the servo's law that validation keeps;
-2. GAPONet on that: a supervised start, no PPO; then `gaponet calibrate` with 30 s of virtual-4, training motions;
+2. GAPONet on that, a supervised start and PPO; then `gaponet calibrate` with 30 s of virtual-4, training motions;
 3. beside it, what four scalars and classic identification leave of the fleet `easy`.
 
 Writes docs/results/virtual_h1_2.{md,json,csv,svg,png}. What is found in WORK is kept. Every number is
@@ -160,7 +160,8 @@ class Ladder:
         law = [f for f in LAW if getattr(simulator, f)[simulator.operated_index].any()]
         told = (
             f"MPJAE in mrad on {UNIT}, ± standard error over {len(motions)} motions; seeds: std over {len(cells)}. "
-            "GAPONet: a supervised start, no PPO. Calibrated: with 30 s of the unit playing training motions."
+            "GAPONet: a supervised start, then PPO, the best on validation. Calibrated: with 30 s of the unit "
+            "playing training motions."
         )
         tables = (table("ladder", steps, self.hard.test, told), lines(steps, self.hard.test),
                   table("easy", easy, self.easy.test, f"The fleet `easy`, its {UNIT}."))  # fmt: skip
