@@ -156,7 +156,7 @@ def recover(work: Path, train: list[Sequence], held: list[Sequence], seeds: list
         fit = identify(recorded(train, arm, rng), nominal, recorded(held, arm, rng), progress=tell)
         back = []
         for joint, i in zip(nominal.operated, nominal.operated_index, strict=True):
-            named = [w for w in fit.warnings if w.startswith(f"{joint}:")]
+            named = [w for w in fit.warnings if w.startswith(f"{joint}: not determined")]
             for field in (*KNOWN, "offset", "zero"):
                 true, found = (float(getattr(r, field)[i]) for r in (arm, fit.robot))
                 back.append({

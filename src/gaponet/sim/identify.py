@@ -40,7 +40,7 @@ SEARCH = (10, 8, 15)  # iterations: of all starts on short runs, of all on whole
 FIRST_DELAY = 0.02  # s: a delay of zero hides what it does
 MAX_DELAY = 0.15  # s
 AGAIN, AGAIN_STEPS, BESIDE = 8, 6, 1.0  # fits for the standard errors, their iterations, how far beside they begin
-WIDE = 0.25  # a standard error so large, of the value and of its scale: not determined
+WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
 PRICES = {"kp": 2e-3, "armature": 2e-4}  # of e times the given one: both trade against all the others
 CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 TERMS: dict[str, tuple[str, ...]] = {
@@ -313,12 +313,15 @@ class Fit:
         edge = ((x - axes.low < 0.02) & (axes.low != 0)) | (axes.high - x < 0.02)
         ahead = axes.values(x + 1)
         for i, joint in enumerate(self.base.operated):
+            wide = []
             for k, f in enumerate(names):
                 value, error = values[f][i], std[joint].get(f, 0.0)
                 if edge[i, k]:
                     found.append(f"{joint}: {f} ended at its bound ({value:.4g}); the model's form does not fit")
                 elif error > WIDE * max(abs(value), ahead[f][i] - value):
-                    found.append(f"{joint}: {f} {value:.4g} ± {error:.2g} is not determined by these logs")
+                    wide.append(f"{f} {value:.3g} ± {error:.2g}")
+            if wide:
+                found.append(f"{joint}: not determined by these logs: {', '.join(wide)}")
         return tuple(found)
 
 
