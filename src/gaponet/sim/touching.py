@@ -33,7 +33,6 @@ SEARCH = (4, 6)  # iterations: of all starts, of the better half
 STEP = 0.005  # m between them
 HEIGHT = 0.003  # m: a standard error above is named
 ZERO, PRICE = 0.02, 2e-4  # rad: an ordinary zero, and what it costs (soft square of one for a window)
-SQUARES = 400  # parts of a price, each so small that it counts as a square, as errors below SOFT do
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
@@ -150,12 +149,11 @@ def fit_table(
     high = np.array([starts[0, 0] + 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
     if measured is not None:
         low[0] = high[0] = measured.height
-    price = np.sqrt(2 * PRICE * scene.counted.sum() * n / SQUARES)
+    price = np.sqrt(2 * PRICE * scene.counted.sum() * n)
 
     def errors(xs: Array) -> Array:
         x = xs[:, 0] * unit
-        prices = np.repeat(price * x[:, 3:] / ZERO, SQUARES, axis=1)
-        return np.append(scene.soft_errors(x), prices, axis=1)[:, None].astype(np.float32)
+        return np.append(scene.soft_errors(x), price * x[:, 3:] / ZERO, axis=1)[:, None].astype(np.float32)
 
     def tell(cost: Array) -> None:
         progress(SOFT * float(np.sqrt(2 * cost.mean() / (scene.counted.sum() * n))))
@@ -182,13 +180,13 @@ def spread_of(here: Array, jac: Array, windows: int, n: int) -> Array:
     """Standard errors, (P,), of how much windows disagree: a sandwich estimate clustered by window, prices included.
 
     Args:
-        here, jac: Errors (1, 1, rows · windows · n + SQUARES · n), prices last, and their slopes (…, P).
+        here, jac: Errors (1, 1, rows · windows · n + n) and their slopes (…, P); the last n are prices.
         windows, n: Windows and joints.
     """
     error, slope = here[0, 0].astype(float), jac[0, 0].astype(float)
     weighted = slope / np.sqrt(1 + error**2)[:, None]
     bread = np.linalg.pinv(weighted.T @ slope)
-    pulls = (weighted * error[:, None])[: -n * SQUARES].reshape(-1, windows, n, slope.shape[1]).sum(axis=(0, 2))
+    pulls = (weighted * error[:, None])[:-n].reshape(-1, windows, n, slope.shape[1]).sum(axis=(0, 2))
     free = max(windows - slope.shape[1], 1)
     return np.asarray(np.sqrt(np.maximum((bread @ pulls.T @ pulls @ bread).diagonal(), 0.0) * windows / free))
 
