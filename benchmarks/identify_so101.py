@@ -66,7 +66,7 @@ def facts(fit: Identified) -> dict[str, object]:
     touch = fit.touch
     table = None if touch is None else {
         "before": (1e3 * touch.before).tolist(), "after": (1e3 * touch.after).tolist(), "kept": touch.kept,
-        "motions": touch.motions, "std": touch.std,
+        "motions": touch.motions,
     }  # fmt: skip
     return {"terms": terms, "table": table, "std": fit.std, "warnings": fit.warnings}
 
@@ -188,15 +188,14 @@ def recovered(work: Path) -> None:
     for file, t in zip(files, told, strict=True):
         true, found = t["tables"]
         zero = next(r for r in t["back"] if (r["joint"], r["field"]) == ("shoulder_lift", "zero"))
-        std = (t["table"] or {}).get("std")
-        if not std or found is None:
+        if found is None:
             print(f"| {file.stem} | not kept |")
             continue
         cells = [
-            f"{k * v:.3g} ± {k * std[f]:.2g} for {k * w:.3g}"
-            for f, k, v, w in (
-                *((f, 1e3 if f == "height" else 1.0, found[f], true[f]) for f in ("height", "friction", "stiffness")),
-                ("shoulder_lift", 1e3, zero["found"], zero["true"]),
+            f"{k * v:.3g} for {k * w:.3g}"
+            for k, v, w in (
+                *((1e3 if f == "height" else 1.0, found[f], true[f]) for f in ("height", "friction", "stiffness")),
+                (1e3, zero["found"], zero["true"]),
             )
         ]
         print(f"| {file.stem} | {' | '.join(cells)} |")

@@ -56,8 +56,5 @@ def test_a_table_comes_back(tmp_path, monkeypatch):
     assert found.after.mean() < 0.2 * found.before.mean()
     assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
     assert np.abs(found.robot.zero).max() < 0.02
-    assert 0 < found.std["height"] < 0.003
-    named = replace(found, std=dict.fromkeys(found.std, 1e6)).doubts()
-    assert sum("not determined" in d for d in named) == 3 + len(robot.operated)
     free = played(robot, robot, 2, 100)
     assert not touching.fit_table(free, robot, -0.1, 1, lambda error: None).kept

@@ -74,7 +74,6 @@ def identify(
         },
         "table": vars(found.robot.table) if found.robot.table else None,
         "touching": list(found.touch.motions) if found.touch else [],
-        "table_std": found.touch.std if found.touch else {},
         "warnings": list(found.warnings), "seconds": made.seconds, "robot": str(out),
     })  # fmt: skip
 
@@ -118,11 +117,7 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
         touch, table = found.touch, found.robot.table
         what = "none that explains them"
         if touch.kept and table is not None:
-            std = touch.std
-            what = (
-                f"height {table.height:.4f} ± {std['height']:.2g} m, friction {table.friction:.2f} ± "
-                f"{std['friction']:.2g}, {table.stiffness:.0f} ± {std['stiffness']:.2g} N/m"
-            )
+            what = f"height {table.height:.4f} m, friction {table.friction:.2f}, {table.stiffness:.0f} N/m"
         screen.say(
             f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
             f"{', '.join(touch.motions)}"

@@ -169,7 +169,7 @@ def identify(
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
         touch = fit_table(low, found, lowest, nthread, tell("table", before_table))
         found = touch.robot
-    doubts = (*fit.doubts(values, std), *(touch.doubts() if touch is not None else ()), *far_from_published(found))
+    doubts = (*fit.doubts(values, std), *far_from_published(found))
     return Identified(found, before, fit.mean_error(values), doubts, std, tuple(tried), touch, tuple(common))
 
 

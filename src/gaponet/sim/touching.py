@@ -19,7 +19,7 @@ from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
-from gaponet.sim.multistart import better_half, descend, slopes, soft
+from gaponet.sim.multistart import better_half, descend, soft
 from gaponet.sim.replay import idle_limbs
 from gaponet.sim.table import write_table
 
@@ -31,7 +31,6 @@ WINDOWS, PER_MOTION = 14, 2
 HEIGHTS, STARTS = 10, 4  # tried first, from the lowest tip upwards, and from how many of them fits start
 SEARCH = (4, 6)  # iterations: of all starts, of the better half
 STEP = 0.005  # m between them
-HEIGHT = 0.003  # m: a standard error above is named
 ZERO, PRICE = 0.02, 2e-4  # rad: an ordinary zero, and what it costs (soft square of one for a window)
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
@@ -47,7 +46,6 @@ class Touch:
         kept: Whether they do.
         before, after: Mean |error| without and with, rad, of the windows, (windows,).
         motions: Motions in which a tip comes near.
-        std: Standard errors of what is kept: height (m), friction, stiffness (N/m), and the zeros by joint (rad).
     """
 
     robot: RobotSpec
@@ -55,23 +53,6 @@ class Touch:
     before: Array
     after: Array
     motions: tuple[str, ...]
-    std: dict[str, float]
-
-    def doubts(self) -> tuple[str, ...]:
-        """What the recordings do not determine of it."""
-        table, robot = self.robot.table, self.robot
-        if not self.std or table is None:
-            return ()
-        found = {
-            "height": (table.height, HEIGHT),
-            "friction": (table.friction, 0.0),
-            "stiffness": (table.stiffness, 0.0),
-        }
-        wide = [f for f, (v, least) in found.items() if self.std[f] > max(least, 0.25 * abs(v))]
-        named = [f"table: {f} {found[f][0]:.4g} ± {self.std[f]:.2g} is not determined by these logs" for f in wide]
-        zeros = {j: robot.zero[robot.index([j])[0]] for j in robot.operated}
-        return (*named, *(f"{j}: zero {z:.4g} ± {self.std[j]:.2g} is not determined by these logs"
-                          for j, z in zeros.items() if self.std[j] > ZERO / 2))  # fmt: skip
 
 
 def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
@@ -133,7 +114,7 @@ def fit_table(
         progress: Called in each iteration with the root mean square error, rad.
     """
     if not parts:
-        return Touch(robot, False, np.zeros(0), np.zeros(0), (), {})
+        return Touch(robot, False, np.zeros(0), np.zeros(0), ())
     n, measured = len(robot.operated), robot.table
     with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
@@ -164,31 +145,13 @@ def fit_table(
     best = x[0, 0] * unit
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
     kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
-    found, std = robot, {}
+    found = robot
     if kept:
-        spread = unit * spread_of(*slopes(x[:1], high[None] / unit, errors), len(scene.parts), n)
-        std = dict(zip(("height", "friction", "stiffness", *robot.operated), spread.tolist(), strict=True))
-        std["stiffness"] *= float(np.exp(best[2]))
         zeros = robot.zero[robot.operated_index] + best[3:]
         servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
         height, friction, stiffness = (float(f"{x:.4g}") for x in (best[0], best[1], np.exp(best[2])))
         found = replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
-    return Touch(found, kept, without, within, motions, std)
-
-
-def spread_of(here: Array, jac: Array, windows: int, n: int) -> Array:
-    """Standard errors, (P,), of how much windows disagree: a sandwich estimate clustered by window, prices included.
-
-    Args:
-        here, jac: Errors (1, 1, rows · windows · n + n) and their slopes (…, P); the last n are prices.
-        windows, n: Windows and joints.
-    """
-    error, slope = here[0, 0].astype(float), jac[0, 0].astype(float)
-    weighted = slope / np.sqrt(1 + error**2)[:, None]
-    bread = np.linalg.pinv(weighted.T @ slope)
-    pulls = (weighted * error[:, None])[:-n].reshape(-1, windows, n, slope.shape[1]).sum(axis=(0, 2))
-    free = max(windows - slope.shape[1], 1)
-    return np.asarray(np.sqrt(np.maximum((bread @ pulls.T @ pulls @ bread).diagonal(), 0.0) * windows / free))
+    return Touch(found, kept, without, within, motions)
 
 
 class Scene:
