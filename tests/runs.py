@@ -6,12 +6,13 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from gaponet.data.store import Dataset
-from gaponet.model.artifact import make_card
+from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.model.export import export
+from gaponet.model.export import drawn_states, export
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import save_robot
 
@@ -30,3 +31,15 @@ def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gapone
     )
     save_robot(robot, folder / "robot")
     return folder
+
+
+def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
+    """A run whose operator adds the same to every target, rad: what it is told makes no difference."""
+    config = ModelConfig(history=2, num_probes=2, branch_hidden=(8,), trunk_hidden=(8,), sensor_hidden=(8,))
+    net = build_network(config, len(robot.operated)).eval()
+    torch.nn.init.zeros_(net.trunk[-1].weight)
+    torch.nn.init.zeros_(net.trunk[-1].bias)
+    torch.nn.init.constant_(net.bias, delta)
+    export(net, folder / "model", make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]), drawn_states(net))
+    save_robot(robot, folder / "robot")
+    return GapModel.load(folder)

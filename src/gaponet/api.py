@@ -105,7 +105,7 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> in
     Raises:
         DatasetError, JointMismatchError: The folder is no dataset, or one of another robot.
     """
-    from gaponet.sim.pairing import pair_dataset
+    from gaponet.sim.replay import pair_dataset
 
     data, spec = open_dataset(dataset, robot)
     data.require_robot(spec)
@@ -305,18 +305,25 @@ def evaluate(
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these.
-        robot: Another robot than the one that the dataset keeps.
+        robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
+            in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
 
     Raises:
-        DatasetError, ModelError: A recording is not there or was used in training, or a model fits another robot.
+        DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
+            transfer was never measured so far from the simulator of the run.
     """
     from gaponet.eval.evaluate import evaluate as step
     from gaponet.eval.evaluate import save
+    from gaponet.robot_folder import keeps_robot, kept_robot
+    from gaponet.sim.model import model_hash
 
     folder = _run(run)
     data, spec = open_dataset(dataset, robot, folder)
+    target, kept = None, kept_robot(folder, spec.name) if robot is not None and keeps_robot(folder) else spec
+    if model_hash(kept) != model_hash(spec):
+        target, spec = spec, kept.nominal or kept
     with bar("evaluating") as update:
-        found = step([folder, *map(Path, also)], data, spec, motions, update)
+        found = step([folder, *map(Path, also)], data, spec, motions, update, target)
     save(found, folder)
     return found
 

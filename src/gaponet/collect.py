@@ -30,8 +30,7 @@ from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import MOVE_KEPT
 from gaponet.sim.kept import require_kept
-from gaponet.sim.pairing import pair_dataset
-from gaponet.sim.replay import replay
+from gaponet.sim.replay import pair_dataset, replay
 from gaponet.structure import read_json, validated
 from gaponet.virtual.fleet import Fleet
 from gaponet.virtual.play import Job, library, play

@@ -9,8 +9,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.robot import load_robot
 from gaponet.sim.model import model_hash
-from gaponet.sim.pairing import pair_dataset
-from gaponet.sim.replay import idle_limbs, replay
+from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 
 
 def test_the_twin_of_a_nominal_robot_is_itself_bit_for_bit(tmp_path):

@@ -39,7 +39,7 @@ def show_methods(out: Out, result: dict[str, Any]) -> None:
         f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
         result["robot"],
     )
-    out.show("Totals", totals(methods))
+    out.show("Totals", totals(methods, simulators=result.get("simulators")))
     for group in ("joint", "payload", "unit", "horizon", "motion"):
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
             out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))

@@ -1,10 +1,15 @@
-"""AlignedSim: the simulator that behaves like the robot. A target becomes target + Δa on its way to the servos."""
+"""AlignedSim: the simulator that behaves like the robot. A target becomes target + Δa on its way to the servos.
+
+In the simulator that the model was trained in, Δa is the model's; in another one, what makes it move as the corrected
+one would (deploy/transfer.py).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gaponet.arrays import Array
+from gaponet.deploy.transfer import Inverse, Reference, Transfer, of_simulator, periods_of
 from gaponet.errors import UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
@@ -25,7 +30,7 @@ class AlignedSim:
     def __init__(
         self,
         robot: RobotSpec,
-        model: GapModel | None,
+        model: Reference | None,
         payload_mass: Array | float = 0.0,
         payload_side: str = "both",
         dt: float | None = None,
@@ -33,29 +38,37 @@ class AlignedSim:
         nthread: int = 0,
         locked: tuple[str, ...] = (),
         extrapolate: bool = False,
+        simulator_payload: Array | float | None = None,
+        inverse: Inverse = "closed",
     ) -> None:
-        """Refuse a robot, simulator, gains, joints, rate or payload that the model was not trained on.
+        """Refuse another robot, joints, rate or payload than trained on, or a simulator too far from that of training.
 
         Args:
-            robot: The simulator that the model corrects: the package's robot, or RUN/robot after an identification.
-            model: What training made; None for the nominal simulator behind the same calls.
+            robot: The simulator. In one that the model was not trained in, commands are transferred.
+            model: What training made; or an identified robot without a model, which the simulator then moves like; None
+                for the simulator as it is behind the same calls.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
             payload_side: "both", or the side of one mount.
             dt: Control period, s; default the robot's.
             num_envs: Simulations side by side; None for one, with arrays (n,).
             nthread: Threads, 0 for all cores.
             locked: Joints clamped at home (sim.model.idle_joints): quicker; arrays are without them.
-            extrapolate: Take payloads beyond those trained on.
+            extrapolate: Take payloads beyond those trained on, and simulators beyond those measured.
+            simulator_payload: kg that the simulator has in its hands, where it does not know of payload_mass.
+            inverse: How a simulator that is not the model's is inverted: closed form, or by its answers to probes.
         """
         self.dt = robot.dt if dt is None else dt
-        if model is not None:
-            model.require(robot, self.dt)
+        if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
         self.robot, self.model, self.single = robot, model, num_envs is None
         self.num_envs = 1 if num_envs is None else num_envs
         self.payload_mass = np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs))
         conditions = [Condition(float(mass), payload_side, self.dt) for mass in self.payload_mass]
-        self.sim = BatchSim(robot, conditions, nthread, locked)
+        own, told = conditions, simulator_payload is not None
+        if told:
+            masses = np.broadcast_to(np.asarray(simulator_payload, float), self.num_envs)
+            own = [c._replace(payload_mass=float(m)) for c, m in zip(conditions, masses, strict=True)]
+        self.sim = BatchSim(robot, own, nthread, locked)
         self.joint_names, self.n = self.sim.joint_names, self.sim.n
         free = robot.index(self.joint_names)
         self.qpos_home, self.qpos_range = robot.qpos_home[free], self.sim.range
@@ -63,8 +76,14 @@ class AlignedSim:
         if missing:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
-        self.loop = None if model is None else model.loop(self.num_envs)
-        self._depth = 1 + int(np.ceil(robot.delay.max() / self.dt))
+        self.loop, self.transfer = None, None
+        if isinstance(model, GapModel) and not told and model.corrects(robot) and periods_of(model, self.dt) == 1:
+            self.loop = model.loop(self.num_envs)
+        elif model is not None:
+            inverted = of_simulator(self.sim, robot, own, locked, inverse, nthread)
+            self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
+        late = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
+        self._depth = 1 + int(np.ceil(late / self.dt))
         self.target = np.zeros((self.num_envs, self.n))
         self.reset()
 
@@ -103,9 +122,11 @@ class AlignedSim:
         q = np.broadcast_to(self.qpos_home if qpos is None else np.asarray(qpos, float), (count, self.n))
         v = np.broadcast_to(np.asarray(qvel, float), (count, self.n))
         u = q if ctrl is None else np.broadcast_to(np.asarray(ctrl, float), (count, self.n))
-        self.sim.reset(ids, q, v, past=np.repeat(u[:, None], self._depth, axis=1))
+        self.sim.reset(ids, q, v, past=self._past(u))
         if self.loop is not None:
             self.loop.reset(ids)
+        if self.transfer is not None:
+            self.transfer.reset(ids, q, v, self._past(u))
         self.target[ids] = u
         self._asked = self.target[:, self.op]
 
@@ -117,4 +138,9 @@ class AlignedSim:
         if self.loop is not None:
             self.loop.delta(sim.qpos[:, op], sim.qvel[:, op], self._asked, self.payload_mass)
             target[:, op] = self.loop.applied
+        if self.transfer is not None:
+            target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
         sim.step(target)
+
+    def _past(self, target: Array) -> Array:
+        return np.repeat(target[:, None], self._depth, axis=1)

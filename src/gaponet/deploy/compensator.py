@@ -103,7 +103,8 @@ class Compensator:
     ) -> None:
         """
         Args:
-            robot: The simulator that the model corrects (AlignedSim).
+            robot: The robot. How it should move is known from the simulator that the model was trained in, whichever
+                other one is given here; with aim simulator no other one is taken.
             model: What training made.
             config: How the robot is made to follow.
             dt: Control period, s; default the robot's.
@@ -115,7 +116,14 @@ class Compensator:
             calibration: What `calibrate` found for the unit that is commanded; the shadow is then that unit.
         """
         self.dt = robot.dt if dt is None else dt
-        model.require(robot, self.dt)
+        model.require_rate(self.dt)
+        if not model.corrects(robot):
+            if config.aim == "simulator":
+                raise ModelError(
+                    f"{model.path}: aim simulator is the simulator trained in, {model.card['simulator']}; for "
+                    f"{robot.folder} train there, or give RUN/robot, or aim at the target"
+                )
+            robot = model.simulator()
         if model.config.delta_hold > 1:
             raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
         robot = robot if calibration is None else calibration.robot(robot)

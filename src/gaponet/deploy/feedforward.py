@@ -11,6 +11,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim
+from gaponet.sim.inverse import Inertia
 
 SPEED, ACCELERATION = 4.0, 40.0  # rad/s, rad/s²: as far as targets are believed; a step of theirs asks for more
 FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; none where nothing moves
@@ -32,13 +33,7 @@ class Feedforward:
         self.dt, self.share = dt, min(1.0, dt / max(acceleration_time, dt))
         self.damping = robot.kd[robot.operated_index] + model.dof_damping[at]
         self.friction = model.dof_frictionloss[at]
-        place = np.full(model.nv, -1)
-        place[at] = np.arange(len(at))
-        row = place[np.repeat(np.arange(model.nv), model.M_rownnz)]  # MuJoCo keeps the lower triangle, row by row
-        column = place[model.M_colind]
-        self.kept = np.flatnonzero((row >= 0) & (column >= 0))
-        self.row, self.column = row[self.kept], column[self.kept]
-        self.sparse: Array = sim.batch.bind("M")
+        self.inertia = Inertia(sim.batch, model, at)
 
     def reset(self, target: Array) -> None:
         """At rest at targets (num, n operated), rad."""
@@ -55,12 +50,5 @@ class Feedforward:
     def torque(self) -> Array:
         """N·m, (num, n operated)."""
         friction = self.friction * np.tanh(self.qvel / FRICTION_SPEED)
-        return self._times_inertia(self.qacc) + self.damping * self.qvel + friction
-
-    def _times_inertia(self, qacc: Array) -> Array:
-        num, n = qacc.shape
-        full = np.zeros((num, n, n))
-        values = self.sparse[:num, self.kept]
-        full[:, self.row, self.column] = values
-        full[:, self.column, self.row] = values
-        return np.einsum("kij,kj->ki", full, qacc)
+        inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
+        return inertial + self.damping * self.qvel + friction

@@ -84,7 +84,7 @@ class AlignedActions(gymnasium.Wrapper):
     def __init__(
         self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "", extrapolate: bool = False
     ) -> None:
-        """Refuses other gains, joints, rates or payloads, as deploy.mujoco_loop does."""
+        """Transfers or refuses as deploy.mujoco_loop does."""
         super().__init__(env)
         scene: Any = env.unwrapped
         self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import copy
+from collections.abc import Callable
 
+import mujoco
 import numpy as np
+from mujoco.batch import Batch
 
 from gaponet.arrays import Array
+from gaponet.deploy.transfer import Inverse, Transfer, periods_of
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
+from gaponet.robot_folder import keeps_robot
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.inverse import ClosedForm, Probed, alike
 
-if TYPE_CHECKING:
-    import mujoco
-
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 GAIN_TOLERANCE = 1e-3  # of kp and kd
 
 
@@ -22,6 +27,10 @@ class MujocoAligner:
     align = MujocoAligner(GapModel.load("run"), mj_model, dt=0.02, payload_mass=3.0)
     data.ctrl[:] = align(data, target)                    # once per control period
     mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
+
+    A scene whose robot does not move as in the simulator of training gets the commands that make it do so
+    (deploy/transfer.py): other gains, friction, inertias, actuators, a payload that it does not have. Its base and
+    whatever else is in it are taken as they stand in each period.
     """
 
     def __init__(
@@ -32,54 +41,141 @@ class MujocoAligner:
         payload_mass: float,
         prefix: str = "",
         extrapolate: bool = False,
+        inverse: Inverse = "closed",
     ) -> None:
-        """Refuse a scene in which a joint, its actuator or its gains are not those trained on; another rate or payload.
+        """Refuse a scene without the joints trained on, too far from the simulator of training; other rates, payloads.
 
         Args:
-            model: What training made.
+            model: What training made. Without its run folder around it, the scene must have the gains trained with.
             mj_model: The compiled scene.
             dt: Control period, s.
-            payload_mass: kg in each hand. Give the scene that mass as well.
+            payload_mass: kg in each hand of the robot that the scene is to move like.
             prefix: What stands before the robot's names in the scene ("left/").
-            extrapolate: Take a payload beyond those trained on.
+            extrapolate: Take a payload beyond those trained on, and a scene beyond those measured.
+            inverse: How a scene is inverted: in closed form, which needs position actuators, or by answers of copies.
         """
-        model.require_rate(dt)
         model.require_payload(payload_mass, extrapolate)
-        self.loop, self.payload_mass = model.loop(), payload_mass
-        card, names = model.card, [prefix + name for name in model.card["joint_names"]]
+        self.payload_mass = payload_mass
         known = [mj_model.joint(j).name for j in range(mj_model.njnt)]
-        for name in names:
-            if name not in known:
+        for name in model.card["joint_names"]:
+            if prefix + name not in known:
                 raise ModelError(
-                    f"{model.path}: corrects joint '{name}', the scene has {', '.join(known)}; give prefix"
+                    f"{model.path}: corrects joint '{prefix + name}', the scene has {', '.join(known)}; give prefix"
                 )
+        self.transfer: Transfer | None = None
+        self._stand: Callable[[mujoco.MjData], None] = lambda data: None
+        if not keeps_robot(model.path.parent):
+            _require_gains(model, mj_model, prefix)
+        else:
+            self._invert(model, mj_model, Condition(payload_mass, "both", dt), prefix, extrapolate, inverse)
+        if self.transfer is None:
+            model.require_rate(dt)
+            self.loop = model.loop()
+        joints = model.card["joint_names"] if self.transfer is None else self.transfer.joint_names
+        names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
-        joint_of = mj_model.actuator_trnid[:, 0]
-        self.actuator = np.zeros(len(names), int)
-        for k, name in enumerate(names):
-            mine = np.flatnonzero(joint_of == mj_model.joint(name).id)
-            if len(mine) != 1:
-                raise ModelError(
-                    f"joint '{name}' has {len(mine)} actuators in the scene; the model needs one, position"
-                )
-            self.actuator[k] = mine[0]
-            kp, kd = mj_model.actuator_gainprm[mine[0], 0], -mj_model.actuator_biasprm[mine[0], 2]
-            for what, is_, was in (("kp", kp, card["kp"][k]), ("kd", kd, card["kd"][k])):
-                if abs(is_ - was) > GAIN_TOLERANCE * max(abs(was), 1.0):
-                    raise ModelError(
-                        f"joint '{name}': {what} is {is_:g} in the scene, the model was trained with {was:g}; "
-                        "set the gains trained with (card.json), or train again"
-                    )
+        self.actuator = np.array([_actuator(mj_model, name) for name in names])
+        self._fresh = True
 
     def reset(self) -> None:
         """Forget the past, because another motion begins."""
-        self.loop.reset()
+        self._fresh = True
 
     def __call__(self, data: mujoco.MjData, ctrl: Array) -> Array:
         """Targets to apply, (nu,) rad, given those asked for; once per control period."""
         out = np.array(ctrl, float)
-        a = out[self.actuator]
-        self.loop.delta(data.qpos[self.qpos], data.qvel[self.qvel], a, self.payload_mass)
-        out[self.actuator] = self.loop.applied[0]
+        q, v, a = data.qpos[None, self.qpos], data.qvel[None, self.qvel], out[None, self.actuator]
+        if self.transfer is None:
+            if self._fresh:
+                self.loop.reset()
+            self.loop.delta(q, v, a, self.payload_mass)
+            out[self.actuator] = self.loop.applied[0]
+        else:
+            if self._fresh:
+                self.transfer.reset(slice(None), q, v, a[:, None])
+            self._stand(data)
+            out[self.actuator] = self.transfer.command(q, v, a)[0]
+        self._fresh = False
         return out
+
+    def _invert(
+        self, model: GapModel, scene: mujoco.MjModel, told: Condition, prefix: str, extrapolate: bool, how: Inverse
+    ) -> None:
+        """Transfer, unless the scene moves as the simulator that the model was trained in."""
+        robot = model.simulator()
+        driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
+        locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
+        reference = BatchSim(robot, [told], 1, locked)
+        joints = tuple(prefix + name for name in reference.joint_names)
+        inverse: ClosedForm | Probed
+        if how == "closed":
+            inverse = of_scene(scene, joints, told.dt)
+            if periods_of(model, told.dt) == 1 and alike(inverse, ClosedForm.of(reference), reference.range):
+                return
+            self._stand = inverse.stand
+        else:
+            copies = SceneCopies(scene, joints, told.dt)
+            inverse = Probed(copies, told.dt)
+            self._stand = copies.stand
+        self.transfer = Transfer(model, inverse, [told], locked, 1, extrapolate)
+
+
+class SceneCopies:
+    """Where targets would lead the robot of a scene, asked of copies of its MjData in which nothing touches."""
+
+    def __init__(self, scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> None:
+        self.scene, self.steps = _untouched(scene), round(dt / scene.opt.timestep)
+        self.qpos = [scene.joint(name).qposadr[0] for name in joints]
+        self.qvel = [scene.joint(name).dofadr[0] for name in joints]
+        self.actuator = [_actuator(scene, name) for name in joints]
+        self.copy, self.seen = mujoco.MjData(self.scene), mujoco.MjData(self.scene)
+
+    def stand(self, data: mujoco.MjData) -> None:
+        """The scene is here now."""
+        self.seen = data
+
+    def __call__(self, targets: Array) -> tuple[Array, Array]:
+        """Targets (k, 1, n) rad → next qpos and qvel, each (k, 1, n)."""
+        qpos, qvel = np.empty_like(targets), np.empty_like(targets)
+        state = np.empty(mujoco.mj_stateSize(self.scene, STATE))
+        mujoco.mj_getState(self.scene, self.seen, state, STATE)
+        for k, target in enumerate(targets[:, 0]):
+            mujoco.mj_setState(self.scene, self.copy, state, STATE)
+            self.copy.ctrl[self.actuator] = target
+            mujoco.mj_step(self.scene, self.copy, self.steps)
+            qpos[k, 0], qvel[k, 0] = self.copy.qpos[self.qpos], self.copy.qvel[self.qvel]
+        return qpos, qvel
+
+
+def of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> ClosedForm:
+    """The inverse of a robot in a scene."""
+    model, h = _untouched(scene), scene.opt.timestep
+    return ClosedForm(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))
+
+
+def _untouched(scene: mujoco.MjModel) -> mujoco.MjModel:
+    free = copy.copy(scene)
+    free.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return free
+
+
+def _actuator(scene: mujoco.MjModel, joint: str) -> int:
+    mine = np.flatnonzero(scene.actuator_trnid[:, 0] == scene.joint(joint).id)
+    if len(mine) != 1:
+        raise ModelError(f"joint '{joint}' has {len(mine)} actuators in the scene; the model needs one, position")
+    return int(mine[0])
+
+
+def _require_gains(model: GapModel, scene: mujoco.MjModel, prefix: str) -> None:
+    for joint, *trained in zip(model.card["joint_names"], model.card["kp"], model.card["kd"], strict=True):
+        i = _actuator(scene, prefix + joint)
+        for what, is_, was in zip(
+            ("kp", "kd"), (scene.actuator_gainprm[i, 0], -scene.actuator_biasprm[i, 2]), trained, strict=True
+        ):
+            if abs(is_ - was) > GAIN_TOLERANCE * max(abs(was), 1.0):
+                raise ModelError(
+                    f"joint '{prefix + joint}': {what} is {is_:g} in the scene, the model was trained with {was:g}; "
+                    "load the model with its run folder, so that commands can be transferred, or set the gains trained "
+                    "with (card.json)"
+                )

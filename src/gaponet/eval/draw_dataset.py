@@ -22,7 +22,7 @@ from gaponet.plot.style import save
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
-from gaponet.sim.pairing import pair_dataset
+from gaponet.sim.replay import pair_dataset
 
 RANGE_SEQUENCES, RANGE_ROWS = 400, 40_000  # most read for joint ranges, and rows kept of each joint
 GAP_SEQUENCES = 240  # most paired for the gap against payload

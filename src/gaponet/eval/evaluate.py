@@ -6,7 +6,7 @@ import itertools
 import shlex
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +20,7 @@ from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
+from gaponet.deploy.transfer import TransferCorrector
 from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.files import whole, writing
 from gaponet.metrics import Run, runs, summary
@@ -37,7 +38,15 @@ from gaponet.structure import read_json
 T = TypeVar("T")
 SHOWN = 8  # sequences whose trajectories are kept for the report
 LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "fno", "gaponet")  # kinds of model
-ORDER = ("nominal", "delay_offset", "identified", *LEARNED, "calibrated")  # of tables and figures
+ORDER = (
+    "nominal",
+    "delay_offset",
+    "identified",
+    *LEARNED,
+    "calibrated",
+    "uncorrected",
+    "transfer",
+)  # of tables and figures
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,7 @@ def evaluate(
     robot: RobotSpec,
     motions: tuple[str, ...] = (),
     progress: Progress = silent,
+    target: RobotSpec | None = None,
 ) -> Evaluation:
     """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
 
@@ -73,6 +83,7 @@ def evaluate(
         robot: The dataset's, which must be the one that the runs keep: the baseline is theirs.
         motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
             trained on.
+        target: Another simulator, to be shown as it is and with the first run transferred into it.
     """
     dataset.require_robot(robot)
     models: dict[str, GapModel] = {}
@@ -93,7 +104,10 @@ def evaluate(
     op = robot.operated_index
     ctrl = [s.ctrl[:, op] for s in sequences]
     moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
-    for name, simulator, corrector in _methods(runs_dirs[0], models, nominal, robots):
+    simulators: dict[str, str] = {}
+    ways = _methods(runs_dirs[0], models, nominal, robots)
+    for name, simulator, corrector in itertools.chain(ways, _transferred(target, next(iter(models.values())), nominal)):
+        simulators[name] = model_hash(simulator)
         twins = replay(sequences, simulator, corrector, progress=noted(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
@@ -103,6 +117,7 @@ def evaluate(
         name = next(iter(models))
         twins = _by_unit(sequences, models[name], robots[name], calibrated, noted(progress, "calibrated"))
         done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
+        simulators["calibrated"] = simulators[name]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}
     result = {
         "methods": methods,
@@ -115,6 +130,7 @@ def evaluate(
         "virtual": any(s.meta.virtual for s in sequences),
         "robot": robot.name,
         "simulator_hash": model_hash(nominal),
+        "simulators": simulators,
         "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
         "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
@@ -238,6 +254,18 @@ def _methods(
         yield "identified", robot, None
     for name in sorted(models, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
         yield name, robots[name], models[name].corrector(robots[name])
+
+
+def _transferred(
+    target: RobotSpec | None, model: GapModel, nominal: RobotSpec
+) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """The same of another simulator, whose gains, where a log says others, change by as much as the nominal ones."""
+    if target is None:
+        return
+    simulator = replace(target, nominal=target.nominal or nominal)
+    if model_hash(target) != model_hash(nominal):
+        yield "uncorrected", simulator, None
+    yield "transfer", simulator, TransferCorrector(model, simulator)
 
 
 def _by_unit(

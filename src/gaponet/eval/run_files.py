@@ -76,6 +76,8 @@ class Metrics(TypedDict):
     virtual: bool
     robot: str
     simulator_hash: str
+    simulators: NotRequired[dict[Method, str]]
+    """In which simulator each method ran."""
     delta: dict[Method, Delta]
     artifacts: dict[Method, Artifact]
     shown: NotRequired[Annotated[list[Shown], Len(0, 100)]]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gaponet.plot.methods import title
@@ -14,15 +14,20 @@ def mrad(value: float | None) -> str:
     return "–" if value is None else f"{value * 1e3:.2f}"
 
 
-def totals(methods: dict[str, Any], angle: Callable[[float], str] = mrad) -> Table:
-    """A row per method, from its metrics (metrics.summary); angle says how an MPJAE is written."""
+def totals(
+    methods: dict[str, Any], angle: Callable[[float], str] = mrad, simulators: Mapping[str, str] | None = None
+) -> Table:
+    """A row per method, from its metrics (metrics.summary); angle says how an MPJAE is written.
+
+    With the simulators in which they ran, by hash, in a last column.
+    """
     base = methods["nominal"]["mpjae"]
     columns = ("method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad", "Q_dis, rad·s",
-               "≥ 0.05 rad", "≥ 0.1 rad", "correlation")  # fmt: skip
+               "≥ 0.05 rad", "≥ 0.1 rad", "correlation", *["simulator"] * bool(simulators))  # fmt: skip
     return Table("totals", columns, tuple(
         (title(name), angle(m["mpjae"]), m["mpjae"] / base if base else "–", mrad(m["rmse"]), mrad(m["static"]),
          mrad(m["dynamic"]), f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %", f"{m['large_0.1'] * 100:.2f} %",
-         f"{m['correlation']:.4f}")
+         f"{m['correlation']:.4f}", *([simulators[name]] if simulators else []))
         for name, m in methods.items()
     ))  # fmt: skip
 

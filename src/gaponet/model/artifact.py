@@ -24,6 +24,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
+from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.structure import Json, Name, Number, read_format, read_json, validated
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
@@ -228,8 +229,8 @@ class GapModel:
         """
         return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
-    def require(self, robot: RobotSpec, dt: float | None = None) -> None:
-        """Refuse a robot, simulator, gains or rate the model was not trained on."""
+    def corrects(self, robot: RobotSpec) -> bool:
+        """Whether this is the simulator that it was trained in; refuses another robot."""
         from gaponet.sim.model import model_hash
 
         card = self.card
@@ -238,8 +239,14 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        trained, asked = card["simulator"], model_hash(robot)
-        if trained != asked:
+        return bool(card["simulator"] == model_hash(robot))
+
+    def require(self, robot: RobotSpec, dt: float | None = None) -> None:
+        """Refuse a robot, simulator, gains or rate the model was not trained on."""
+        from gaponet.sim.model import model_hash
+
+        if not self.corrects(robot):
+            trained, asked = self.card["simulator"], model_hash(robot)
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
                 "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
@@ -247,6 +254,21 @@ class GapModel:
             )
         if dt is not None:
             self.require_rate(dt)
+
+    def simulator(self) -> RobotSpec:
+        """The simulator that it corrects, as its run keeps it beside the model.
+
+        Raises:
+            ModelError: The model lies in no run, or in one that keeps another simulator.
+        """
+        if not keeps_robot(self.path.parent):
+            raise ModelError(
+                f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie beside it; "
+                "commands cannot be transferred to another simulator or rate; give the whole run folder"
+            )
+        kept = kept_robot(self.path.parent, self.card["robot"])
+        self.require(kept)
+        return kept
 
     @property
     def heaviest(self) -> float:

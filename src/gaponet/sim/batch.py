@@ -72,9 +72,10 @@ class BatchSim:
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
         self.law = ServoLaw(self.batch, first) if robot.has_law or law else None
         self._late = CommandHistory(self.batch, first) if first.nhistory else None
-        self._nstep = np.array([robot.steps_per(c[2]) for c in conditions])
-        self._one_rate = bool((self._nstep == self._nstep[0]).all())
-        self._timestep = np.array([self.models[c].opt.timestep for c in conditions])
+        # Physics steps per control period, and their length in s, of each simulation.
+        self.nstep = np.array([robot.steps_per(c[2]) for c in conditions])
+        self._one_rate = bool((self.nstep == self.nstep[0]).all())
+        self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
@@ -92,7 +93,7 @@ class BatchSim:
         if self._late is not None:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
-            self._late.fill(ids, past, self._nstep[ids], self._timestep[ids])
+            self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.law is not None:
             self.law.reset(ids, self.qpos[ids] if past is None else past[:, 0])
 
@@ -105,11 +106,11 @@ class BatchSim:
         """
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
-            self._advance(ids, int(self._nstep[0]))
+            self._advance(ids, int(self.nstep[0]))
             return
         moving = np.arange(self.num_envs) if ids is None else ids
-        for n in np.unique(self._nstep[moving]):
-            self._advance(moving[self._nstep[moving] == n], int(n))
+        for n in np.unique(self.nstep[moving]):
+            self._advance(moving[self.nstep[moving] == n], int(n))
 
     def _advance(self, ids: Array | None, count: int) -> None:
         if self.law is None:

@@ -10,12 +10,14 @@ import numpy as np
 
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset, Entry
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints, loosen_friction, model_hash
 
 Array = np.ndarray
 CHUNK = 256  # simulations side by side
+BATCH = 64  # sequences paired together; what an interruption can cost
 
 Progress = Callable[[int, int], None]  # control steps done, total
 
@@ -137,3 +139,40 @@ def _free_run(
             progress(finished)
     digest = model_hash(robot)
     return [Twin(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
+
+
+def pair_dataset(
+    dataset: Dataset,
+    robot: RobotSpec,
+    progress: Progress | None = None,
+    entries: list[Entry] | None = None,
+    lock_idle: bool = False,
+) -> int:
+    """Replay the sequences that have no twin for this simulator yet, and store the twins; returns how many.
+
+    All sequences, or only some; `lock_idle` as in replay.
+    Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
+    """
+    dataset.require_robot(robot)
+    digest = model_hash(robot)
+    todo = sorted((e for e in entries or dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
+    if not todo:
+        return 0
+    with dataset.writing():
+        _pair(dataset, robot, todo, progress, lock_idle)
+    return len(todo)
+
+
+def _pair(dataset: Dataset, robot: RobotSpec, todo: list[Entry], progress: Progress | None, lock_idle: bool) -> None:
+    total, done = sum(e.rows - 1 for e in todo), 0
+    for start in range(0, len(todo), BATCH):
+        part = todo[start : start + BATCH]
+
+        def tell(k: int, of: int, before: int = done) -> None:
+            if progress is not None:
+                progress(before + k, total)
+
+        twins = replay(dataset.sequences(part), robot, progress=tell, lock_idle=lock_idle)
+        for entry, twin in zip(part, twins, strict=True):
+            dataset.write_twin(entry, twin)
+        done += sum(e.rows - 1 for e in part)

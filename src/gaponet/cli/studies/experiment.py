@@ -22,6 +22,7 @@ from gaponet.study.payload import Payload
 from gaponet.study.played.delivery import Delivery
 from gaponet.study.played.session import Playing, Session, study_to_play
 from gaponet.study.played.tracking import Tracking
+from gaponet.study.simulators import Simulators
 from gaponet.study.study import Study, expected_s
 from gaponet.study.unit import Unit
 from gaponet.study.variant import parse_variant
@@ -65,18 +66,18 @@ def _ask(kind: type[Any], dataset: Path, out: Path, question: Any, options: Opti
         _play(question, data, robot, out, options)
         return
     study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
-    if kind is Compare:
+    if kind in (Compare, Simulators):
         study = _prepared(question, study)
     _carry_out(question, study, options.json)
 
 
-def _prepared(question: Compare, study: Study) -> Study:
+def _prepared(question: Compare | Simulators, study: Study) -> Study:
     """The study with what is asked to be identified first; models that cannot be are refused before that."""
     if not question.identify:
         return study
     if study.robot.nominal is not None:
         raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
-    for word in question.models:
+    for word in question.models if isinstance(question, Compare) else ():
         parse_variant(word, study.config)
     with bar("identifying") as update:
         return identified(study, update)
@@ -124,5 +125,5 @@ def experiment(action: None) -> None:
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.
-ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Ablation, Payload, Unit, Data, *PLAYED))]  # noqa: UP007
+ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Ablation, Payload, Unit, Data, Simulators, *PLAYED))]  # noqa: UP007
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

@@ -1,0 +1,180 @@
+"""A simulator is told to move as another one does, whatever differs between them."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from arm import TOML, XML, commands, write_arm
+from runs import corrects_by
+
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.errors import ModelError
+from gaponet.robot import Table, Tip
+from gaponet.sim.model import build_model
+
+STRONG = TOML.replace("effort_limit = 5.0", "effort_limit = 50.0")
+ONE_STEP = STRONG.replace("timestep = 0.005", "timestep = 0.02")  # a period: nothing happens within it
+HEAVY = XML.replace('armature="0.02"', 'armature="0.1"')
+TARGETS = np.concatenate([commands(60, 5), commands(60, 6)])  # with a jump
+PUSHED = slice(30, 40)
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"), STRONG, HEAVY)
+
+
+@pytest.fixture(scope="module")
+def model(robot, tmp_path_factory):
+    return corrects_by(0.05, robot, tmp_path_factory.mktemp("run"))
+
+
+def other(robot, **factors):
+    """The robot with some of its numbers multiplied."""
+    model = build_model(robot)
+    own = {f: getattr(model, f"dof_{f}") for f in ("damping", "frictionloss", "armature")} | {"kp": robot.kp}
+    return replace(robot, **{f: factor * own[f] for f, factor in factors.items()})
+
+
+def follow(sim, targets=TARGETS, push=0.0, repeat=1):
+    """Positions at each row under targets, from rest; a push is a torque on both joints for a while."""
+    sim.reset(targets[0], ctrl=targets[0])
+    applied, out = sim.sim.batch.bind("qfrc_applied"), []
+    for t, target in enumerate(targets):
+        applied[:] = push * (PUSHED.start <= t < PUSHED.stop)
+        for _ in range(repeat):
+            sim.step(target)
+        out.append(sim.qpos.copy())
+    return np.array(out)
+
+
+def test_twice_the_gain_follows_the_reference_to_a_microradian(tmp_path):
+    reference = write_arm(tmp_path / "arm", ONE_STEP, HEAVY)
+    target, there = other(reference, kp=2.0), follow(AlignedSim(reference, None))
+    assert np.abs(follow(AlignedSim(target, None)) - there).max() > 0.05
+    np.testing.assert_allclose(follow(AlignedSim(target, reference, extrapolate=True)), there, atol=1e-6)
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
+@pytest.mark.parametrize(
+    "factors", [{"kp": 0.5}, {"kp": 2.2, "frictionloss": 3.0}, {"damping": 2.0, "armature": 2.0}, {"frictionloss": 0.0}]
+)
+def test_it_moves_as_the_reference_with_its_operator(robot, model, factors, how):
+    there, target = follow(AlignedSim(robot, model)), other(robot, **factors)
+    apart = np.abs(follow(AlignedSim(target, model, inverse=how)) - there).mean()
+    assert (
+        apart < {"closed": 0.002, "probes": 0.004}[how] < 0.1 * np.abs(follow(AlignedSim(target, None)) - there).mean()
+    )
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
+def test_a_payload_that_the_simulator_does_not_know_of(robot, model, how):
+    there = follow(AlignedSim(robot, model, 0.2))
+    sim = AlignedSim(robot, model, 0.2, simulator_payload=0.0, inverse=how)
+    assert np.abs(follow(sim) - there).mean() < 0.001
+    assert np.abs(follow(AlignedSim(robot, model, 0.0)) - there).mean() > 0.01
+
+
+def test_a_loop_twice_as_quick_asks_the_operator_as_often(robot, model):
+    there = follow(AlignedSim(robot, model))
+    quick = AlignedSim(other(robot, kp=2.0), model, dt=robot.dt / 2)
+    assert np.abs(follow(quick, repeat=2) - there).mean() < 0.001
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 40\.0 Hz"):
+        AlignedSim(robot, model, dt=0.025)
+
+
+def test_another_integrator_and_offsets(robot, model, tmp_path):
+    there = follow(AlignedSim(robot, model))
+    euler = write_arm(tmp_path, STRONG, HEAVY.replace("implicitfast", "Euler"))
+    for target in (euler, replace(robot, offset=np.array([0.05, -0.03]))):
+        assert np.abs(follow(AlignedSim(target, model)) - there).mean() < 0.001
+
+
+def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot):
+    reference = replace(robot, delay=np.array([0.03, 0.02]))
+    there = follow(AlignedSim(reference, None))
+    same = follow(AlignedSim(replace(other(robot, kp=1.5), delay=reference.delay), reference))
+    assert np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
+    later = replace(robot, delay=np.array([0.06, 0.06]))  # cannot be followed, but must not be made worse
+    apart = [np.abs(follow(AlignedSim(later, given)) - there).mean() for given in (reference, None)]
+    assert apart[0] <= apart[1]
+
+
+def test_it_knows_nothing_of_targets_to_come(robot, model):
+    target = other(robot, kp=2.0)
+    changed = TARGETS.copy()
+    changed[80:] += 0.3
+    for how in ("closed", "probes"):
+        np.testing.assert_array_equal(*(
+            follow(AlignedSim(target, model, inverse=how), targets)[:80] for targets in (TARGETS, changed)
+        ))  # fmt: skip
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
+@pytest.mark.parametrize("factors", [{"kp": 2.0}, {"kp": 0.5}, {"damping": 0.5}, {"frictionloss": 3.0}])
+def test_on_a_plane_and_pushed_it_is_nearer_to_the_reference_there(robot, factors, how):
+    tipped = replace(robot, tips=(Tip("fore", (0.2, 0.0, 0.0), 0.01),))
+    reference, target = other(tipped, kp=0.8, damping=1.5), other(tipped, **factors)
+    for plane, push in ((Table(-0.1, 0.3, 2e3), 0.0), (None, 1.0)):
+        there = follow(AlignedSim(replace(reference, table=plane), None), push=push)
+        given, alone = (
+            np.abs(follow(AlignedSim(replace(target, table=plane), like, inverse=how), push=push) - there).mean()
+            for like in (reference, None)
+        )
+        assert given < 0.2 * alone
+
+
+def test_in_its_own_simulator_the_operator_alone_is_at_work(robot, model):
+    assert AlignedSim(robot, model).transfer is None
+    assert AlignedSim(other(robot, kp=1.5), model).transfer is not None
+
+
+def test_a_simulator_further_off_than_any_measured_is_refused(robot, model):
+    far = other(robot, kp=9.0)
+    with pytest.raises(ModelError, match=r"joint 'shoulder': kp, as a ratio .* is 9; transfer was measured from 0\.15"):
+        AlignedSim(far, model)
+    AlignedSim(far, model, extrapolate=True)
+
+
+def scene(robot):
+    """The robot in a compiled scene of somebody else's, with a ball lying about."""
+    spec = mujoco.MjSpec.from_string(robot.mjcf.read_text())
+    for name in robot.joint_names:
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator.set_to_position(kp=40.0)
+    ball = spec.worldbody.add_body(name="ball", pos=(3.0, 0.0, 0.0))
+    ball.add_freejoint()
+    ball.add_geom(size=(0.02, 0.0, 0.0), mass=0.1)
+    spec.option.timestep = 0.002
+    return spec.compile()
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
+def test_a_scene_of_ones_own_moves_as_the_reference_with_its_operator(robot, model, how):
+    there, mj_model = follow(AlignedSim(robot, model, 0.2)), scene(robot)
+    align, apart = MujocoAligner(model, mj_model, 0.02, payload_mass=0.2, inverse=how), []
+    for correct in (align, lambda data, target: target):
+        data = mujoco.MjData(mj_model)
+        data.qpos[:2] = TARGETS[0]
+        out = []
+        for target in TARGETS:
+            data.ctrl[:] = correct(data, target)
+            mujoco.mj_step(mj_model, data, 10)
+            out.append(data.qpos[:2].copy())
+        apart.append(np.abs(np.array(out) - there).mean())
+    assert apart[0] < 0.1 * apart[1]
+
+
+def test_a_scene_that_is_the_simulator_of_training_gets_the_operator_alone(robot, model):
+    assert MujocoAligner(model, build_model(robot), 0.02, 0.0).transfer is None
+    assert MujocoAligner(model, build_model(robot), 0.02, payload_mass=0.2).transfer is not None
+
+
+def test_the_compensator_takes_the_simulator_of_the_run(robot, model):
+    stiff = other(robot, kp=2.0)
+    assert Compensator(stiff, model).robot.kp[0] == robot.kp[0]
+    with pytest.raises(ModelError, match="aim simulator is the simulator trained in"):
+        Compensator(stiff, model, CompensatorConfig(aim="simulator"))

@@ -1,0 +1,79 @@
+"""The inverse of a simulator is the target that was given to it, and the label of the warm start."""
+
+import numpy as np
+import pytest
+from arm import TOML, XML, commands, record, write_arm
+
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.inverse import ClosedForm, Inertia, Period, mean_before
+from gaponet.sim.model import build_model
+from gaponet.training.inverse import inverse_targets
+
+CONDITION = Condition(0.2, "both", 0.02)
+
+
+def smooth(robot):
+    """A recording of slow motion, so that filters and steps take nothing away."""
+    return record(robot, 0.3 * commands(200, 2), "slow", payload=0.2)
+
+
+def periods(sequence, friction):
+    return [
+        Period(q[None], v[None], nq[None], nv[None], friction * np.sign(nq - q)[None])
+        for q, v, nq, nv in zip(
+            sequence.qpos[:-1].astype(float), sequence.qvel[:-1].astype(float), sequence.qpos[1:].astype(float),
+            sequence.qvel[1:].astype(float), strict=True,
+        )
+    ]  # fmt: skip
+
+
+def test_it_gives_back_the_command_where_friction_is_known(tmp_path):
+    robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0"'))
+    sequence, inverse = smooth(robot), ClosedForm.of(BatchSim(robot, [CONDITION]))
+    told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 0.0)])
+    np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
+
+
+def test_it_is_the_label_of_the_warm_start(tmp_path):
+    robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0.01"'))
+    sequence, inverse = smooth(robot), ClosedForm.of(BatchSim(robot, [CONDITION]))
+    low, high = (0.5 * (x[:-1] + x[1:]) for x in inverse_targets(sequence, robot))  # over a period, not at its start
+    moving = (np.abs(sequence.qvel[:-1]) > 0.1).all(axis=1)
+    told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 1.0)])
+    inside = slice(20, -20)  # filters know neither the past nor the future of a recording
+    far = np.maximum(low - told, told - high)[inside][moving[inside]]
+    assert moving.sum() > 20
+    assert far.max() < 1e-3
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 10])
+def test_the_mean_of_positions_before_steps_of_parabolic_speeds(count):
+    h, i = 0.005, np.arange(count + 1)
+    speed = 0.3 + 0.2 * i - 0.03 * i**2
+    position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
+    first, last, whole = mean_before(count)
+    mean = h * (first * speed[0] + last * speed[-1]) + whole * position[-1]
+    assert mean == pytest.approx(position[:-1].mean(), abs=1e-12)
+
+
+def test_inertia_is_mujocos(tmp_path):
+    import mujoco
+
+    robot = write_arm(tmp_path)
+    sim = BatchSim(robot, [CONDITION])
+    inertia = Inertia(sim.batch, next(iter(sim.models.values())), np.arange(2))
+    sim.qpos[:] = [[0.3, -0.4]]
+    sim.batch.forward()
+    model = build_model(robot, 0.2)
+    data, full = mujoco.MjData(model), np.zeros((2, 2))
+    data.qpos[:] = [0.3, -0.4]
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, full)
+    np.testing.assert_allclose(inertia.matrix(1)[0], full, atol=1e-12)
+
+
+def test_torque_limits_bound_what_is_asked_for(tmp_path):
+    weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.1"))
+    inverse = ClosedForm.of(BatchSim(weak, [CONDITION]))
+    still = Period(*np.zeros((5, 1, 2)))
+    assert np.abs(inverse([still], still.qpos)).max() <= 0.1 / 20.0 + 1e-12
