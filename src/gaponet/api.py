@@ -136,7 +136,14 @@ def gap(
     from gaponet.sim.model import model_hash
 
     if run is not None:
-        return _gap_by_step(_run(run), dataset, robot, motions)
+        from gaponet.eval.gap import gap_by_step
+        from gaponet.eval.gap_figure import write_gap
+
+        data, spec = open_dataset(dataset, robot, folder := _run(run))
+        with bar("gap") as update:
+            found = gap_by_step(folder, data, spec, motions, update)
+        write_gap(found, folder)
+        return found
     data, spec = open_dataset(dataset, robot)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
@@ -150,19 +157,6 @@ def gap(
         "robot": spec.name,
         "simulator_hash": simulator,
     }
-
-
-def _gap_by_step(
-    run: Path, dataset: Dataset | Place, robot: RobotSpec | Place | None, motions: tuple[str, ...]
-) -> dict[str, Any]:
-    from gaponet.eval.gap import gap_by_step
-    from gaponet.eval.gap_figure import write_gap
-
-    data, spec = open_dataset(dataset, robot, run)
-    with bar("gap") as update:
-        found = gap_by_step(run, data, spec, motions, update)
-    write_gap(found, run)
-    return found
 
 
 @dataclass(frozen=True)

@@ -220,6 +220,22 @@ def write_split(dataset: Dataset, parts: Parts, by: str, holdout: tuple[str, ...
     return path
 
 
+def parts_of(dataset: Dataset, split: str, *rule: Any) -> Parts:
+    """The parts by a split file, where one is given, else by the fixed rule; `rule` as split_entries takes it.
+
+    Raises:
+        UsageError: Both are given.
+    """
+    if not split:
+        return split_entries(dataset, *rule)
+    if rule != ((), (), (), 1):
+        raise UsageError(
+            f"--split {split} says already who is for training: leave out --holdout-units, --holdout-payloads, "
+            "--rates and --train-share, or make another split with gaponet data split"
+        )
+    return read_split(split, dataset)
+
+
 def read_split(path: str | Path, dataset: Dataset) -> Parts:
     """Entries of a dataset by a split file; sequences found are those with the same content, whatever their name.
 

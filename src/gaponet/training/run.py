@@ -27,7 +27,7 @@ import torch
 
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import require_same_gains
-from gaponet.data.split import Parts, read_split, split_entries, spread
+from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text, writing
@@ -92,7 +92,8 @@ class Trainer:
             raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / KEPT}")
         self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
         self.budget, self.show = budget, show
-        self.parts = _parts(dataset, config, holdout_units)
+        rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
+        self.parts = parts_of(dataset, config.split, *rule)
         if not config.mixed_gains:
             together = (e.meta for part in self.parts.values() for e in part)
             require_same_gains(together, dataset.joint_names, robot.operated)
@@ -299,7 +300,8 @@ class Trainer:
             line |= vars(self.found)
         self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
-        self._save()
+        self.kept.seconds, self.began = self.seconds(), time.monotonic()
+        self.kept.write(self.out, self.net)
         self._tick()
 
     def seconds(self) -> float:
@@ -315,10 +317,6 @@ class Trainer:
         share = min(spent, 1.0)
         self.show(Status(self.stage, share, k.steps, self.seconds(), self.found.reward, k.val, k.best, self.nominal))
         return spent
-
-    def _save(self) -> None:
-        self.kept.seconds, self.began = self.seconds(), time.monotonic()
-        self.kept.write(self.out, self.net)
 
     def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
         config = asdict(self.config) | {
@@ -375,15 +373,3 @@ class Trainer:
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
         )
-
-
-def _parts(dataset: Dataset, config: TrainConfig, holdout_units: tuple[str, ...]) -> Parts:
-    """The parts by the split file, where one is given, else by the fixed rule."""
-    if not config.split:
-        return split_entries(dataset, holdout_units, config.holdout_payloads, config.rates, config.train_share)
-    if holdout_units or config.holdout_payloads or config.rates or config.train_share != 1:
-        raise UsageError(
-            f"--split {config.split} says already who is for training: leave out --holdout-units, --holdout-payloads, "
-            "--rates and --train-share, or make another split with gaponet data split"
-        )
-    return read_split(config.split, dataset)
