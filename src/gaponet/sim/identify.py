@@ -287,12 +287,13 @@ class Fit:
 
     def uncertainty(self, values: Values, tell: Callable[[float], None] = lambda error: None) -> Std:
         """Standard errors, joint → field: how far from these values fits end that begin beside them and give every
-        window a random weight (a Bayesian bootstrap, Rubin 1981). Slopes would say less: the surface is rough."""
+        window a random weight (a Bayesian bootstrap, Rubin 1981), without PRICES. Slopes would say less: the surface is
+        rough."""
         names = [f for f in self.fields_of(values) if f != "encoder_step"]
         axes, windows = Axes(self, names, values), self.runs.counted.shape[1]
         rng = np.random.default_rng(1)
         weight = np.sqrt(rng.dirichlet(np.ones(windows), AGAIN) * windows).astype(np.float32)
-        weight = np.append(np.repeat(weight, len(self.runs.ctrl), axis=1), np.ones((AGAIN, 2), np.float32), axis=1)
+        weight = np.append(np.repeat(weight, len(self.runs.ctrl), axis=1), np.zeros((AGAIN, 2), np.float32), axis=1)
 
         def errors(xs: Array) -> Array:
             found = self.errors(axes.values(xs), self.runs)
