@@ -71,7 +71,8 @@ class Simulators:
         """Shares of each simulator's own error, what transfer adds to its reference's, contact, cost."""
         runs = Runs(study, found, self.seconds)
         free, touching = runs.free(), runs.touching()
-        figure = bars(list(free), _bars(free), "share of the simulator's own error", f"Transfer\n{study.who}")
+        axis, heading = "share of the simulator's own error", f"Transfer\n{study.who}"
+        figure = bars([_label(name) for name in free], _bars(free), axis, heading)
         return found.result(
             study, "simulators", "Simulators that no model was trained in",
             [_shares(free), _added(free), _touching(touching), runs.cost()], {"simulators": figure},
@@ -238,6 +239,10 @@ def _bars(free: Found) -> dict[str, tuple[str, list[Spread]]]:
     ways = {"as it is": (f"nominal + {title(NOMINAL)} as it is", shade(colour(NOMINAL), 0.55))}
     ways |= {f"closed {w}": (f"transfer of {_name(w)}", colour(w)) for w in (NOMINAL, ALONE, BOTH)}
     return {label: (c, [share(e[w], e["uncorrected"]) for e in free.values()]) for w, (label, c) in ways.items()}
+
+
+def _label(name: str) -> str:
+    return name.replace(" ×", "\n×").replace(", ", ",\n").replace("payload ", "payload\n")
 
 
 def _sentences(free: Found, touching: Found) -> list[str]:
