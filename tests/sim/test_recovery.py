@@ -45,8 +45,7 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
             assert std[joint][field] < value
 
 
-def test_a_table_comes_back(tmp_path, monkeypatch):
-    monkeypatch.setattr(touching, "SEARCH", (2, 4))
+def test_a_table_comes_back(tmp_path):
     tip = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
     robot = write_arm(tmp_path / "arm", toml=TOML + tip)
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)

@@ -26,7 +26,7 @@ from gaponet.sim.multistart import better_half, descend
 from gaponet.sim.refit import cut
 from gaponet.sim.shared import ITERATIONS as SHARED_ITERATIONS
 from gaponet.sim.shared import far_from_published, same_servos, share
-from gaponet.sim.touching import SEARCH as TABLE_SEARCH
+from gaponet.sim.touching import GENERATIONS as TABLE_GENERATIONS
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 
 Array = np.ndarray
@@ -131,7 +131,7 @@ def identify(
     each, same = sum(SEARCH), same_servos(robot) if shared else {}
     before_shared = each * (1 + len(terms)) + AGAIN_STEPS
     before_table = before_shared + SHARED_ITERATIONS * len(same)
-    total = before_table + sum(TABLE_SEARCH) * bool(table and robot.tips)
+    total = before_table + TABLE_GENERATIONS * bool(table and robot.tips)
 
     def tell(what: str, done: int) -> Callable[[float], None]:
         step = itertools.count(done + 1)

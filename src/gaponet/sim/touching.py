@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
+from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
 from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
@@ -19,7 +20,7 @@ from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
-from gaponet.sim.multistart import better_half, descend, soft
+from gaponet.sim.multistart import soft
 from gaponet.sim.replay import idle_limbs
 from gaponet.sim.table import write_table
 
@@ -28,10 +29,9 @@ Array = np.ndarray
 CLEARANCE = 0.045  # m above the lowest tip, or the table, in which a joint's zero may hide a contact
 WINDOW = 5.0  # s
 WINDOWS, PER_MOTION = 14, 2
-HEIGHTS, STARTS = 10, 4  # tried first, from the lowest tip upwards, and from how many of them fits start
-SEARCH = (4, 6)  # iterations: of all starts, of the better half
-STEP = 0.005  # m between them
-ZERO, PRICE = 0.02, 2e-4  # rad: an ordinary zero, and what it costs (soft square of one for a window)
+HEIGHTS, STEP = 10, 0.005  # tried first, from the lowest tip upwards, and m between them
+CANDIDATES, GENERATIONS, AROUND = 16, 15, 1.5  # of the search, and how wide it begins, in large changes
+ZERO, PRICE = 0.02, 2e-3  # rad: an ordinary zero, and what it costs (soft square of one for a row)
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
@@ -124,25 +124,29 @@ def fit_table(
     before = scene.errors(away)
     guesses = np.repeat(away, HEIGHTS, axis=0)
     guesses[:, 0] = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else measured.height
-    starts = guesses[np.argsort(soft(scene.soft_errors(guesses)))[:STARTS]]
+    start = guesses[np.argmin(soft(scene.soft_errors(guesses)))]
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
-    low = np.array([starts[0, 0] - 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
-    high = np.array([starts[0, 0] + 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
+    low = np.array([start[0] - 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
+    high = np.array([start[0] + 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
     if measured is not None:
         low[0] = high[0] = measured.height
-    price = np.sqrt(2 * PRICE * scene.counted.sum() * n)
+    rows = scene.counted.sum() * n
 
-    def errors(xs: Array) -> Array:
-        x = xs[:, 0] * unit
-        return np.append(scene.soft_errors(x), price * x[:, 3:] / ZERO, axis=1)[:, None].astype(np.float32)
+    def cost(xs: Array) -> Array:
+        """Of tables and zeros, one to a column."""
+        return soft(scene.soft_errors(xs.T)) + PRICE * rows * np.square(xs[3:] / ZERO).sum(axis=0)
 
-    def tell(cost: Array) -> None:
-        progress(SOFT * float(np.sqrt(2 * cost.mean() / (scene.counted.sum() * n))))
+    def tell(intermediate_result: OptimizeResult) -> None:
+        progress(SOFT * float(np.sqrt(2 * intermediate_result.fun / rows)))
 
-    x = starts[:, None] / unit
-    for iterations in SEARCH:
-        x = better_half(*descend(x, low[None] / unit, high[None] / unit, errors, iterations, tell))
-    best = x[0, 0] * unit
+    # Contacts come and go: the surface has no slopes to follow, and its valley of heights and zeros has walls.
+    rng = np.random.default_rng(0)
+    population = start + AROUND * unit * rng.standard_normal((CANDIDATES, len(unit)))
+    population[0] = start
+    best = differential_evolution(
+        cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
+        vectorized=True, updating="deferred", callback=tell, rng=rng,
+    ).x  # fmt: skip
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
     kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
     found = robot
