@@ -232,8 +232,7 @@ def identify(
         twins = replay(val, simulator, nthread=threads, lock_idle=True)
         return np.array([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)])
 
-    both = {"nominal": errors(spec.nominal or spec), "identified": errors(found.robot)}
-    return Identification(found, both, seconds)
+    return Identification(found, {"nominal": errors(spec.nominal or spec), "identified": errors(found.robot)}, seconds)
 
 
 def train(
@@ -255,7 +254,7 @@ def train(
         dataset: Recordings.
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
-        config: Everything else (train.config); default TrainConfig().
+        config: Everything else (training.config); default TrainConfig().
         model: gaponet, or a baseline: shared_mlp, mlp, transformer, fno, inverse; default that of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that identify wrote.
         holdout_units: Units never trained on; their test motions stay in the test part.
@@ -270,7 +269,7 @@ def train(
         DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
     from gaponet.files import writing
-    from gaponet.training.budget import Budget, Status
+    from gaponet.training.budget import Budget
     from gaponet.training.config import TrainConfig
     from gaponet.training.run import Trainer
 
@@ -278,10 +277,7 @@ def train(
     config = config or TrainConfig()
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
     with bar(f"training {config.model.kind}") as update, writing(Path(out), "run"):
-
-        def show(status: Status) -> None:
-            update(status.fraction, 1.0, status.note)
-
+        show = lambda status: update(status.fraction, 1.0, status.note)  # noqa: E731
         return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
 
 
@@ -306,8 +302,7 @@ def evaluate(
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
             transfer was never measured so far from the simulator of the run.
     """
-    from gaponet.eval.evaluate import evaluate as step
-    from gaponet.eval.evaluate import save
+    from gaponet.eval import evaluate as measuring
     from gaponet.robot_folder import keeps_robot, kept_robot
     from gaponet.sim.model import model_hash
 
@@ -317,8 +312,8 @@ def evaluate(
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
     with bar("evaluating") as update:
-        found = step([folder, *map(Path, also)], data, spec, motions, update, target)
-    save(found, folder)
+        found = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, update, target)
+    measuring.save(found, folder)
     return found
 
 

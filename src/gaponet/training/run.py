@@ -111,8 +111,7 @@ class Trainer:
         self.net = build_network(config.model, self.n)
         self.untrained = copy.deepcopy(self.net.state_dict())
         self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
-        self.nominal = float("nan")
-        self.found = Update()
+        self.nominal, self.found = float("nan"), Update()
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
@@ -296,8 +295,7 @@ class Trainer:
             "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1),
             "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
-        if self.stage == "ppo":
-            line |= vars(self.found)
+        line |= vars(self.found) if self.stage == "ppo" else {}
         self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
         self.kept.seconds, self.began = self.seconds(), time.monotonic()
