@@ -155,6 +155,8 @@ class RobotSpec:
 
         The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp.
         """
+        if kp is None and kd is None:
+            return self
         nominal = self.nominal or self
         known = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
         if np.allclose(known, (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):

@@ -16,6 +16,7 @@ from gaponet.eval.gap import causes, floor, gap_by_step, removed
 from gaponet.eval.gap_figure import waterfall
 from gaponet.eval.run_files import read_gap
 from gaponet.metrics import Run
+from gaponet.plot.methods import title
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
 
@@ -46,10 +47,9 @@ def test_every_kind_of_model_has_its_bar(kind):
     found = {"left": steps, "floor": floor, "by_joint": {"elbow_joint": {"left": steps, "floor": floor}},
              "virtual": True, "robot": "arm", "sequences": 3, "unseen": True}  # fmt: skip
     ax = waterfall(found).axes[0]
-    ticks = [t.get_text() for t in waterfall(found).axes[1].get_xticklabels()]
-    assert ticks[0] == "nominal"
-    assert ticks[-1] == "left"
-    assert ax.patches[4].get_height() == pytest.approx(2.0)  # what the model removes, mrad
+    ticks = [t.get_text() for t in ax.get_yticklabels()]
+    assert ticks == [*map(title, steps), "left"]
+    assert ax.patches[4].get_width() == pytest.approx(2.0)  # what the model removes, mrad
 
 
 @pytest.mark.parametrize("kind", LEARNED)

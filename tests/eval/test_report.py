@@ -41,7 +41,7 @@ def test_a_model_that_corrects_an_identified_simulator_is_called_so_in_every_tab
     assert page.count("identification + GAPONet") > 10
     assert not re.findall(r"(?<!identification \+ )GAPONet", page)
     assert list(gp.gap(data, arm, run=run)["left"]) == ["nominal", "delay", "offset", "gain", "identified+gaponet"]
-    assert "cation\n+\nGAPONet" in waterfall(read_gap(run)).axes[1].get_xticklabels()[4].get_text()
+    assert waterfall(read_gap(run)).axes[0].get_yticklabels()[4].get_text() == "identification + GAPONet"
     assert "Where the gap comes from" in write_report(run).read_text()
     for words in (["runs", str(tmp_path)], ["eval", str(run), str(data.path)]):
         assert main(words) == 0

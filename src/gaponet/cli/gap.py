@@ -11,8 +11,10 @@ from gaponet.cli.out import Out
 from gaponet.data.store import open_dataset
 from gaponet.eval.tables import by_group, mrad, totals
 from gaponet.plot.methods import title
+from gaponet.plot.table import Table
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
+SHOWN = 8  # columns of the totals that a screen has room for
 
 
 @like(api.gap)
@@ -39,32 +41,40 @@ def show_methods(out: Out, result: dict[str, Any]) -> None:
         f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
         result["robot"],
     )
-    out.show("Totals", totals(methods, simulators=result.get("simulators")))
+    whole = totals(methods)
+    out.show("Totals", Table(whole.name, whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
+    ran = result.get("simulators", {})
+    if len(set(ran.values())) > 1:
+        out.say("; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items()), "ran in: ")
     for group in ("joint", "payload", "unit", "horizon", "motion"):
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
             out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))
 
 
 def _show_steps(out: Out, found: dict[str, Any]) -> None:
-    """What is left after each step, and in brackets what the step removes."""
-    steps = list(found["left"])
+    """What is left after each step, in all and by joint and payload, and what the step removes in all."""
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
-    panels = {"all joints": found} | found["by_joint"]
-    out.table(f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
-              ["", *map(title, steps), "floor", "unexplained"], [
-        *([j, *(_left(v, s) for s in steps), mrad(v["floor"]["both"]), mrad(v["unexplained"])]
-          for j, v in panels.items()),
-        *([f"{p} kg", *(mrad(v[s]) for s in steps), "", ""] for p, v in found["by_payload"].items()),
-    ])  # fmt: skip
-    out.say("in brackets: what the step removes ± its standard error over motions")
+    joints, loads = found["by_joint"], found["by_payload"]
+    rows = [
+        [title(s), mrad(left), *map(mrad, found["removed"].get(s, ())), *[""] * (0 if s in found["removed"] else 2),
+         *(mrad(j["left"][s]) for j in joints.values()), *(mrad(p[s]) for p in loads.values())]
+        for s, left in found["left"].items()
+    ]  # fmt: skip
+    for end, of in (("floor", lambda x: x["floor"]["both"]), ("unexplained", lambda x: x["unexplained"])):
+        rows.append([end, mrad(of(found)), "", "", *(mrad(of(j)) for j in joints.values()), *[""] * len(loads)])
+    out.table(
+        f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
+        [
+            "step",
+            "left",
+            "removed",
+            "± over motions",
+            *(j.replace("_", " ") for j in joints),
+            *(f"{p} kg" for p in loads),
+        ],
+        rows,
+    )
     if found["floor"]["repeatability"] is None:
         rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
         out.say(f"floor: {rest}; no motion was recorded twice or repeats itself: repeatability is unknown")
-
-
-def _left(panel: dict[str, Any], step: str) -> str:
-    if step not in panel["removed"]:
-        return mrad(panel["left"][step])
-    less, error = panel["removed"][step]
-    return f"{mrad(panel['left'][step])} ({mrad(less)} ± {mrad(error)})"

@@ -56,7 +56,7 @@ class Out:
             if i == 0:
                 table.add_column(Text(plain(column)), overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL)
             else:
-                words = [len(word) for cell in cells for word in cell.split()]
+                words = [len(word) for cell in (plain(column), *cells) for word in cell.split()]
                 table.add_column(
                     Text(plain(column)), overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER)
                 )

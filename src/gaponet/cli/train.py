@@ -71,8 +71,7 @@ def evaluate(
 ) -> None:
     """Step the simulator with the shipped artifact against logs it never saw, baselines beside it."""
     out = Out(json)
-    data, spec = api.open_dataset(dataset, robot, run)
-    evaluation = api.evaluate(run, data, also, motions, spec)
+    evaluation = api.evaluate(run, dataset, also, motions, robot)
     if not evaluation.result["unseen"]:
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"

@@ -26,7 +26,7 @@ METHODS = {  # name, colour
     "gaponet": ("GAPONet", "#c8102e"),
     "calibrated": ("calibrated to the unit", "#6a1b9a"),
     "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),
-    "transfer": ("transfer into it", "#e07a1f"),
+    "transfer": ("transferred into the other simulator", "#e07a1f"),
     "delay": ("delay", "#d99000"),
     "offset": ("offset", "#b36b00"),
     "gain": ("gains, inertia, delay", "#2a9d6f"),

@@ -59,7 +59,8 @@ class BatchSim:
         robots = {c: robot.with_gains(c.kp, c.kd) for c in dict.fromkeys(conditions)}
         self.models = {c: build_model(r, *c[:3], locked, bare=True) for c, r in robots.items()}
         first = self.models[conditions[0]]
-        self._stiffer = np.array([robots[c].kp / np.where(robot.kp > 0, robot.kp, 1.0) for c in conditions])
+        stiffer = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
+        self._stiffer = np.array([stiffer[c] for c in conditions])
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
