@@ -164,7 +164,7 @@ class Ladder:
             "playing training motions."
         )
         tables = (table("ladder", steps, self.hard.test, told), lines(steps, self.hard.test),
-                  table("easy", easy, self.easy.test, f"The fleet `easy`, its {UNIT}."))  # fmt: skip
+                  table("easy", easy, self.easy.test, f"The fleet easy, its {UNIT}."))  # fmt: skip
         said = [
             *differences(steps, self.hard.test),
             f"Of the servo's law, validation kept {', '.join(law) or 'nothing'}.",
