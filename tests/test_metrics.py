@@ -26,7 +26,10 @@ def test_metrics_by_hand(robot):
     assert m["q_dis"] == pytest.approx(0.5 * ((0.1 + 0.1) + (0.2 + 0.6)) / 2)
     assert m["rmse"] == pytest.approx((0.1 + np.sqrt((0.04 + 0.36) / 2)) / 2)
     assert m["large_0.05"] == 1.0
+    assert m["large_0.5"] == 0.25
     assert m["large_0.1"] == 0.75  # 0.9 − 1 is a little less
+    assert m["range"] == pytest.approx((0.0 + 0.4) / 2)
+    assert m["iqr"] == pytest.approx((0.0 + 0.2) / 2)
     assert m["static"] == pytest.approx((0.0 + 0.2) / 2)  # medians of (0.1, −0.1) and (0.2, −0.6)
 
 

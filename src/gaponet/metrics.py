@@ -16,7 +16,7 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 
-THRESHOLDS = (0.05, 0.1)  # rad, of the large-gap ratio
+THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
 
 
@@ -51,7 +51,9 @@ def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
     """All metrics of a method: totals, and by joint, motion, payload, unit and horizon."""
     columns = {j: [i] for i, j in enumerate(robot.operated)}
     by = lambda key: {str(k): metrics([r for r in part if key(r) == k]) for k in sorted({key(r) for r in part})}  # noqa: E731
-    return metrics(part) | {
+    no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
+    total = metrics(part) | {"mpjae_no_wrist": metrics(part, no_wrist)["mpjae"] if no_wrist else float("nan")}
+    return total | {
         "by_joint": {j: metrics(part, c) for j, c in columns.items()},
         "by_motion": by(lambda r: r.real.meta.motion),
         "by_payload": by(lambda r: f"{r.real.meta.payload_mass:g}"),
@@ -65,7 +67,8 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
 
     Returns:
         mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (the median error; the rest),
-        large_0.05 and large_0.1, shares of |e| beyond a threshold, and correlation.
+        iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
+        SAGE and the paper report, tables show the first few).
     """
     rows = [_sequence_metrics(r, columns) for r in part]
     return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
@@ -76,6 +79,7 @@ def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
     error = run.error[:, c].astype(float)
     size = np.abs(error)
     real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
+    low, high = np.percentile(size, [25, 75], axis=0)
     bias = np.median(error, axis=0)
     out = {
         "mpjae": size.mean(),
@@ -83,7 +87,13 @@ def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
         "q_dis": (size.sum(axis=0) * run.real.dt).mean(),
         "static": np.abs(bias).mean(),
         "dynamic": np.abs(error - bias).mean(),
+        "iqr": (high - low).mean(),
+        "range": np.ptp(size, axis=0).mean(),
         "correlation": _mean_correlation(real, sim),
+        "cosine": (
+            (real * sim).sum(0) / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
+        ).mean(),
+        "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
     }
     return out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}
 
