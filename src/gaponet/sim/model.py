@@ -18,7 +18,8 @@ from gaponet.sim.table import add_table, soften_table
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
 # is the stiffest that the solver still meets at this tolerance, whatever the armature; it costs 7 % of an environment
-# step of the SO-101 and 12 % of the H1-2, and makes joint stops as much harder. noslip_iterations halve the speed of a humanoid and converge slowly in a light limb.
+# step of the SO-101 and 12 % of the H1-2, and makes joint stops as much harder. noslip_iterations halve the speed of a
+# humanoid and converge slowly in a light limb.
 STIFF_SOLREF = (0.004, 1.0)
 STIFF_SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 STIFF_MOBILITY = 0.1
