@@ -31,7 +31,7 @@ def main(
     Args:
         run: Folder of gaponet train.
         motions: Names; variants 0 and 1 are in the packaged recipes, so others were not trained on.
-        unit: Of the default fleet.
+        unit: Of the fleet `hard`.
         payload_mass: kg in each hand.
         state_rate: States per second.
         domain: DDS domain.

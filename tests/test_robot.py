@@ -7,7 +7,7 @@ import pytest
 from arm import TOML, XML, write_arm
 
 from gaponet.errors import JointMismatchError, RobotError
-from gaponet.robot import available, load_robot
+from gaponet.robot import as_option, available, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model, model_hash
 
@@ -128,6 +128,13 @@ def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
     save_robot(load_robot(name), tmp_path / "here")
     (tmp_path / "here").rename(tmp_path / "there")
     assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"
+
+
+def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(Path("mine"))
+    for folder in (Path("mine"), tmp_path / "mine", Path("..") / tmp_path.name / "mine"):
+        assert load_robot(as_option(folder)).name == "arm"
 
 
 def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):

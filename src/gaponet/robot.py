@@ -250,6 +250,11 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
         raise RobotError(f"{toml}: {error}") from None
 
 
+def as_option(folder: Path) -> str:
+    """What to write after --robot for a robot folder: with a slash, as a text without one is a name."""
+    return f"./{folder}" if folder.name == str(folder) else str(folder)
+
+
 def _folder(name_or_path: str | Path) -> Path:
     """Where a robot is; refuses a name that could mean two."""
     text, folder = str(name_or_path), Path(name_or_path)

@@ -12,6 +12,7 @@ from gaponet.cli.options import Data, Flag, Json, Robot, like
 from gaponet.cli.out import Out, writes
 from gaponet.eval.tables import mrad
 from gaponet.metrics import standard_error
+from gaponet.robot import as_option
 
 if TYPE_CHECKING:
     from gaponet.sim.identify import Identified
@@ -55,7 +56,7 @@ def identify(
 ) -> None:
     """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
 
-    The result is a robot folder: use it with --robot, e.g. gaponet train DATASET --robot OUT --out RUN.
+    The result is a robot folder: use it with --robot, with a slash: gaponet train DATASET --robot ./OUT --out RUN.
 
     Args:
         terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
@@ -64,7 +65,7 @@ def identify(
     made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, shared, threads)
     found = made.found
     _tell(screen, found, made.val)
-    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {out} --out RUN")
+    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {as_option(out)} --out RUN")
     screen.result({
         "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
@@ -107,12 +108,12 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
         fell, error = (mrad(x) for x in term.gain)
         kept = "kept" if term.kept else "not kept"
         screen.say(
-            f"{term.name}: validation error falls by {fell} ± {error} mrad over {len(term.before)} motions; {kept}"
+            f"{term.name}: validation error falls by {fell} ± {error} mrad over {len(term.before)} recordings; {kept}"
         )
     for law in found.shared:
         own, one = (mrad(e.mean()) for e in (law.before, law.after))
         costs = f"{mrad(-law.gain[0])} ± {mrad(law.gain[1])}"
-        screen.say(f"one law for every {law.name}: {own} → {one} mrad over {len(law.before)} motions, costs {costs}")
+        screen.say(f"one law for every {law.name}: {own} → {one} mrad over {len(law.before)} recordings, costs {costs}")
     if found.touch is not None and found.touch.motions:
         touch, table = found.touch, found.robot.table
         what = "none that explains them"
@@ -127,7 +128,7 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
     nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
     screen.say(
         f"windows {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions (± over "
-        f"{len(errors['nominal'])} motions): nominal {nominal}, identified {left} mrad "
+        f"{len(errors['nominal'])} recordings): nominal {nominal}, identified {left} mrad "
         f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
     )
 
