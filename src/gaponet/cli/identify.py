@@ -65,7 +65,9 @@ def identify(
     made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, shared, threads)
     found = made.found
     _tell(screen, found, made.val)
-    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {as_option(out)} --out RUN")
+    screen.say(
+        f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {as_option(out)} --out RUN"
+    )
     screen.result({
         "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
