@@ -12,6 +12,7 @@ from typing import Any
 from gaponet.plot.charts import dots
 from gaponet.plot.table import Spread, Table, compared_by_seed
 from gaponet.study.found import Found, spread
+from gaponet.study.paper import OURS, PAYLOADS, TABLE_2, Printed
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study, rates_of
@@ -20,13 +21,10 @@ from gaponet.training.config import TrainConfig
 
 DEFAULT = "gaponet"
 COLD = "warm_start.rounds=0"
+LARGE = "large_0.05"  # the newer version of the paper reports such a share; its threshold is not known here
 
 WIDE = "branch_hidden=128,128:trunk_hidden=64,64:sensor_hidden=256,256"
 PAPER_SIZE = "coupling=full:branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"
-
-# Table 2(a) of the paper, smallest and largest error over its rows, unit not known here, nor any other of its numbers.
-# The paper's own model ("Ours") is the row without payload and with H = 4.
-PAPER = {"payload_input=on": (0.016, 0.019), "payload_input=off": (0.012, 0.015)}
 
 FACTORS: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("payload input", (("in", "payload_input=on"), ("out", "payload_input=off"))),
@@ -55,7 +53,7 @@ class Setting:
     setting: str
     word: str
     """The word that study.variant reads; DEFAULT where the setting is the default's."""
-    paper: tuple[float, float] | None = None
+    paper: Printed | None = None
 
 
 def rows(study: Study) -> tuple[list[Setting], list[str]]:
@@ -77,7 +75,8 @@ def rows(study: Study) -> tuple[list[Setting], list[str]]:
     found = []
     for factor, settings in factors:
         for setting, change in settings:
-            found.append(Setting(factor, setting, _word(change, config), PAPER.get(change)))
+            printed = TABLE_2.get(change.replace("sensor_hold", "delta_hold"))  # "action duration" is either
+            found.append(Setting(factor, setting, _word(change, config), printed))
     return found, missing
 
 
@@ -125,9 +124,9 @@ class Ablation:
              if r.word in worth and DEFAULT in seeds],
             "MPJAE of the default's with the same seed", f"What each choice is worth\n{study.who}",
         )  # fmt: skip
-        table = _table(lines, found, seeds, worth)
+        tables = [_table(lines, found, seeds, worth), _beside_paper(lines, found, study)]
         said = [*_sentences(lines, seeds, worth), *missing]
-        return found.result(study, "ablation", "Ablation of the operator", [table], {"ablation": figure}, said)
+        return found.result(study, "ablation", "Ablation of the operator", tables, {"ablation": figure}, said)
 
 
 def _table(lines: list[Setting], found: Found, seeds: Seeds, worth: Mapping[str, Spread]) -> Table:
@@ -141,18 +140,40 @@ def _table(lines: list[Setting], found: Found, seeds: Seeds, worth: Mapping[str,
             worth[row.word] if cells and row.word != DEFAULT else None, spread(cells, "known", "q_dis"),
             *([spread(cells, "new", "mpjae")] * new), cells[0]["parameters"] if cells else None,
             spread(cells, "seconds", scale=1 / 60).mean if cells else None,
-            f"{row.paper[0]:g} to {row.paper[1]:g}" if row.paper else None,
         ))  # fmt: skip
     columns = ("choice", "MPJAE, mrad", "of nominal", "of default, by seed", "Q_dis, mrad·s",
-               *(["new unit, mrad"] * new), "weights", "minutes", "paper")  # fmt: skip
+               *(["new unit, mrad"] * new), "weights", "minutes")  # fmt: skip
     caption = (
         "MPJAE: mean over joints and held-out motions of the whole-motion free run, mean ± std over seeds; of nominal: "
         "on the same motions at the same rate; of default: the ratio of both with the same seed, which does not "
-        "contain what a seed does to both. All with the same training budget. paper: range of its Table 2(a), unit "
-        "not known here; blank where no number of it is. Oracle and learned sensors ask the simulator itself, which "
-        "no robot can."
+        "contain what a seed does to both. All with the same training budget. Oracle and learned sensors ask the "
+        "simulator itself, which no robot can."
     )
-    return Table("table2", columns, tuple(table), caption)
+    return Table("choices", columns, tuple(table), caption)
+
+
+def _beside_paper(lines: list[Setting], found: Found, study: Study) -> Table:
+    """The paper's Table 2: its rows, its four payloads and ours, Obs Dim of both."""
+    masses = sorted({e.meta.payload_mass for e in study.data.entries})
+    n = len(study.robot.operated)
+    rows: list[tuple[Any, ...]] = []
+    for row in lines:
+        cells = found.of_word(row.word)
+        if row.paper is not None:
+            ours = [spread(cells, "known", "by_payload", f"{m:g}", "mpjae") if cells else None for m in masses]
+            rows.append((
+                f"{row.factor}: {row.setting}", study.variant(row.word).config.model.observation_dim(n), *ours,
+                spread(cells, "known", LARGE, scale=1e2) if cells else None, row.paper.obs_dim,
+                *(f"{v * 1e3:.0f}" for v in row.paper.mpjae),
+            ))  # fmt: skip
+    columns = ("choice", "Obs Dim", *(f"{m:g} kg, mrad" for m in masses), "large gaps, %", "paper: Obs Dim",
+               *(f"{m:g} kg, mrad, paper" for m in PAYLOADS))  # fmt: skip
+    caption = (
+        "MPJAE by payload, ± std over seeds, beside Table 2 of the paper: real robots, a model without payload input "
+        "in all comparisons but the first, where ours has it in all but that one. Large gaps: |e| of 50 mrad and "
+        "more. The paper's 'action duration' stands twice: correction held, and sensors held."
+    )
+    return Table("table2", columns, tuple(rows), caption)
 
 
 def _paired(seeds: Seeds, word: str, other: str) -> Spread:
@@ -175,24 +196,26 @@ def _sentences(lines: list[Setting], seeds: Seeds, worth: Mapping[str, Spread]) 
 
 
 def _against_paper(lines: list[Setting], seeds: Seeds) -> list[str]:
-    """Pairs of settings that the paper orders, beside our order."""
-    known = [(r, r.paper) for r in lines if r.paper and r.word in seeds]
+    """What the paper orders, beside our order: each setting against the paper's own."""
     out = []
-    for i, (a, first) in enumerate(known):
-        for b, second in known[i + 1 :]:
-            if a.factor != b.factor:
-                continue
-            (low, less), (high, more) = sorted([(a, first), (b, second)], key=lambda pair: pair[1])
-            change = _paired(seeds, high.word, low.word)
-            if abs(change.mean - 1) <= 2 * change.error:
-                verdict = "finds no difference beyond the seeds'"
-            else:
-                verdict = "agrees" if change.mean > 1 else "disagrees"
-            out.append(
-                f"{a.factor}: the paper has less error with '{low.setting}' ({less[0]:g} to {less[1]:g}) than with "
-                f"'{high.setting}' ({more[0]:g} to {more[1]:g}); this run {verdict} "
-                f"({_left(seeds, low):.2f} against {_left(seeds, high):.2f} of nominal)."
-            )
+    for other in lines:
+        if other.paper in (None, OURS) or other.word not in seeds:
+            continue
+        own = next(r for r in lines if r.factor == other.factor and r.paper == OURS)
+        assert other.paper is not None
+        if own.word not in seeds:
+            continue
+        change = _paired(seeds, other.word, own.word)
+        more = [a / b - 1 for a, b in zip(other.paper.mpjae, OURS.mpjae, strict=True)]
+        if abs(change.mean - 1) <= 2 * change.error:
+            verdict = "finds no difference beyond the seeds'"
+        else:
+            verdict = "agrees" if change.mean > 1 else "disagrees"
+        out.append(
+            f"{other.factor}: the paper has {100 * min(more):.0f} to {100 * max(more):.0f} % more error with "
+            f"'{other.setting}' than with '{own.setting}'; this run {verdict} "
+            f"({_left(seeds, other):.2f} against {_left(seeds, own):.2f} of nominal)."
+        )
     return out
 
 

@@ -21,6 +21,7 @@ from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import identify
 from gaponet.study.found import Found, spread
+from gaponet.study.options import MODELS
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
@@ -36,7 +37,7 @@ class Compare:
     The same command again goes on where it was; more seeds or models may be added to it.
     """
 
-    models: tuple[str, ...] = ("gaponet", "mlp")
+    models: tuple[str, ...] = MODELS
     """Kinds, each with changed fields where wanted: mlp:mlp_hidden=256,128 or gaponet:sensors=off:history=8.
     identified+KIND trains in the identified simulator (with --identify)."""
     holdout_units: tuple[str, ...] = ()

@@ -20,6 +20,7 @@ from gaponet.plot.charts import draw_bars
 from gaponet.plot.methods import colour, title
 from gaponet.plot.style import DASHED, figure, legend, styled
 from gaponet.plot.table import Spread, Table
+from gaponet.study.paper import TABLE_1, TABLE_1_METHODS
 from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Placed, ShownHand, deliver
 from gaponet.study.played.goals import STOPS, Planner
 from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, over_seeds, payloads, percent, series
@@ -74,7 +75,7 @@ class Delivery(Playing):
 def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: ShownHand, **told: Any) -> Result:
     heading = "Goal-directed delivery: hands at goals under load (VIRTUAL robot)"
     figures = {"offsets": draw_offsets(found), "example": draw_example(example)}
-    tables = [offsets(found), moving(found), spent(costs)]
+    tables = [offsets(found), beside_paper(found), moving(found), spent(costs)]
     return session.result("delivery", heading, tables, figures, sentences(found), **told)
 
 
@@ -102,6 +103,23 @@ def offsets(found: ListOf[Placed]) -> Table:
         "the end."
     )
     return by_method("offsets", found, columns, caption)
+
+
+def beside_paper(found: ListOf[Placed]) -> Table:
+    """Table 1 as the paper has it, its numbers below ours."""
+    shown = [m for m in TABLE_1_METHODS if m in methods(found)]
+    columns = ["payload per hand", *(f"{title(m)}: {a}, cm" for m in shown for a in AXES)]
+    rows: list[tuple[Any, ...]] = []
+    for p in payloads(found):
+        rows.append((f"{p:g} kg", *(_along("offset", a)(of(found, m, p)) for m in shown for a in range(3))))
+        if p in TABLE_1:
+            printed = dict(zip(TABLE_1_METHODS, TABLE_1[p], strict=True))
+            rows.append((f"{p:g} kg, the paper", *(printed[m][a] for m in shown for a in range(3))))
+    caption = (
+        "Mean |hand − goal| by axis, as Table 1 of the paper, and its numbers: a real H1-2, goals and heights that are "
+        "not known here. Its third column is the simulator's output, sent as it is: raw targets here."
+    )
+    return Table("table1", tuple(columns), tuple(rows), caption)
 
 
 def moving(found: ListOf[Placed]) -> Table:
