@@ -51,7 +51,8 @@ def write_files_arm(folder: Path, contacts: bool = False, scale: float = 1.0, **
     xml = parts.get("xml", XML).replace("CONTACT", "enable" if contacts else "disable")
     (folder / "robot.xml").write_text(xml)
     (folder / "common.xml").write_text(parts.get("common", COMMON))
-    (folder / "robot.toml").write_text(parts.get("toml", TOML))
+    toml = parts.get("toml", TOML)
+    (folder / "robot.toml").write_text("contacts = true\n" + toml if contacts else toml)
     lines = [f"v {scale * x!r} {scale * y!r} {scale * z!r}" for x, y, z in CORNERS]
     lines += [f"f {a} {b} {c}" for a, b, c in FACES]
     (folder / "meshes" / "link.obj").write_text("\n".join(lines) + "\n")

@@ -64,7 +64,9 @@ class RobotSpec:
         min_torque: Least torque of a motor that turns at all, (n), N·m.
         encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
         servos: Type of each joint's servo, (n); None where robot.toml does not say.
-        tips, table: What may touch, and the table, without which nothing does.
+        tips, table: What may touch a table, and the table; with one nothing else touches.
+        contacts: Whether links touch as the MJCF says. Off, nothing touches but tips a table: links welded to the world
+            collide for ever with their neighbours, which shows as a gap.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
     """
 
@@ -100,6 +102,7 @@ class RobotSpec:
     servos: tuple[ServoType | None, ...] = ()
     tips: tuple[Tip, ...] = ()
     table: Table | None = None
+    contacts: bool = False
     nominal: RobotSpec | None = None
 
     def __post_init__(self) -> None:
@@ -300,6 +303,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         servos=_servo_types(table),
         tips=table.tip,
         table=table.table,
+        contacts=table.contacts,
     )
     found = table.identified_table
     if (robot.table or found) and not robot.tips:

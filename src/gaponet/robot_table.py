@@ -103,6 +103,7 @@ class RobotTable:
     payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None
+    contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
     identified: dict[str, Servo] = field(default_factory=dict)
     identified_table: Table | None = None
     description: str = ""

@@ -10,7 +10,7 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.options import Data, Folder, Json, like
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, show_findings
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec, load_robot
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from gaponet.data.offsets import JointOffset
     from gaponet.data.store import Entry
 
-COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 MAX_ROWS = 60
 
 
@@ -173,8 +172,7 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
          signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
         for r in diagnosis.joints
     ])  # fmt: skip
-    for finding in diagnosis.findings:
-        out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
+    show_findings(out, diagnosis.findings)
     out.say("", diagnosis.verdict)
 
 

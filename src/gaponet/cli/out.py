@@ -21,10 +21,12 @@ from gaponet.plot.table import Table as ResultTable
 from gaponet.text import plain
 
 if TYPE_CHECKING:
+    from gaponet.data.checks.finding import Finding
     from gaponet.study.result import Result
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
+COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
 WIDTH = 120  # letters of a line in a file or a pipe
 LABEL, NUMBER = 30, 10  # letters: labels longer than that are wrapped; room that a number keeps where it is narrow
 
@@ -73,6 +75,12 @@ class Out:
         if self.as_json:
             json.dump(finite(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
+
+
+def show_findings(out: Out, findings: Iterable[Finding]) -> None:
+    """A line each."""
+    for finding in findings:
+        out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
 
 
 def show_result(result: Result, out: Path, screen: Out) -> None:

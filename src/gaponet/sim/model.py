@@ -99,6 +99,8 @@ def build_spec(
     for joint in spec.joints:
         joint.solref_friction = STIFF_SOLREF
         joint.solimp_friction = STIFF_SOLIMP
+    if not robot.contacts:
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     _set_joints(spec, robot)
     add_table(spec, robot)
     _lock(spec, robot, locked)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tyro
 
 from gaponet.cli.options import Json
-from gaponet.cli.out import Out
+from gaponet.cli.out import Out, show_findings
+from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec, available, load_robot
+
+POSTURES = 300  # of the logs
 
 
 def robot(
@@ -21,9 +25,11 @@ def robot(
     interface: str = "lo",
     port: str = "/dev/ttyACM0",
     seconds: float = 5.0,
+    data: Path | None = None,
+    payloads: tuple[float, ...] = (),
     json: Json = False,
 ) -> None:
-    """List the package's robots, say what is wrong with a robot folder, or listen to a robot without moving it.
+    """List the package's robots, step one to say what is wrong with it, or listen to a robot without moving it.
 
     Args:
         action: check, list or link.
@@ -33,6 +39,8 @@ def robot(
         interface: link, unitree: network interface to the robot.
         port: link, so101: serial port.
         seconds: link: how long to listen.
+        data: check: dataset of this robot, whose postures and payloads are looked at.
+        payloads: check: kg in every mount, each held for a minute; default those of the data, or 0.
     """
     out = Out(json)
     if action == "list":
@@ -43,7 +51,7 @@ def robot(
     elif not path:
         raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
     else:
-        check_robot(out, load_robot(path))
+        check_robot(out, load_robot(path), data, payloads)
 
 
 def list_robots(out: Out) -> None:
@@ -80,16 +88,18 @@ def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: flo
     out.result(found | {"publishers": publishers, "virtual": driver.virtual} | driver.facts)
 
 
-def check_robot(out: Out, spec: RobotSpec) -> None:
-    """Compile the robot with and without a payload; a broken one raises RobotError, a doubtful one gets warnings."""
-    from gaponet.sim.dynamics import static_torque
-    from gaponet.sim.model import build_model, model_hash
+def check_robot(out: Out, spec: RobotSpec, dataset: Path | None = None, payloads: tuple[float, ...] = ()) -> None:
+    """Step the robot; a broken one raises RobotError, a doubtful one gets warnings."""
+    from gaponet.sim.model import model_hash
+    from gaponet.sim.setup.check import check_robot
 
-    model = build_model(spec)
-    if spec.payload_mounts:
-        build_model(spec, 1.0)
-    load = static_torque(model, spec.qpos_home[None])[0]
-    warnings = doubts(spec, load)
+    postures = None
+    if dataset is not None:
+        data, _ = open_dataset(dataset, spec)
+        payloads = payloads or tuple(sorted({e.meta.payload_mass for e in data.entries}))
+        rows = np.concatenate([data.read(e).qpos for e in data.entries])
+        postures = rows[:: max(1, len(rows) // POSTURES)].astype(float)
+    findings = check_robot(spec, payloads or (0.0,), postures)
     out.table(f"{spec.name}: {spec.description}; N·m/rad, N·m·s/rad, N·m, rad",
               ["joint", "operated", "kp", "kd", "limit", "range"], [
         [name, "yes" if name in spec.operated else "no", f"{spec.kp[i]:g}", f"{spec.kd[i]:g}",
@@ -102,37 +112,19 @@ def check_robot(out: Out, spec: RobotSpec) -> None:
     mounts = ", ".join(f"{m.side} on {m.body}" for m in spec.payload_mounts) or "none"
     out.say(
         f"control period {spec.dt * 1e3:g} ms, physics step {spec.timestep * 1e3:g} ms ({spec.decimation} a period); "
-        f"payload mounts: {mounts}; simulator {model_hash(spec)}"
+        f"payload mounts: {mounts}; contacts {'on' if spec.contacts else 'off'}; simulator {model_hash(spec)}"
     )
-    for warning in warnings:
-        out.say(f"  {warning}", "warning", "yellow")
-    if warnings:
-        out.say(f"{spec.name} compiles; see the warnings")
+    show_findings(out, findings)
+    bad = {level: sum(f.level == level for f in findings) for level in ("error", "warning")}
+    if bad["error"]:
+        out.say(f": {spec.name} is no simulator of it yet; mend the {bad['error']} error(s)", "not ok", "bold red")
+    elif bad["warning"]:
+        out.say(f"{spec.name} compiles and holds; see the {bad['warning']} warning(s)")
     else:
-        out.say(f": {spec.name} compiles", "ok", "bold green")
-    out.result(as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings})
-
-
-def doubts(spec: RobotSpec, load: np.ndarray) -> list[str]:
-    """What compiles and is still likely a mistake. load: holding torque at home, (n), N·m."""
-    found = []
-    for i, name in enumerate(spec.joint_names):
-        low, high = spec.qpos_range[i]
-        if spec.kp[i] <= 0:
-            found.append(f"{name}: kp is {spec.kp[i]:g}; a position-controlled joint needs kp > 0")
-        if not low <= spec.qpos_home[i] <= high:
-            found.append(f"{name}: home {spec.qpos_home[i]:g} lies outside its range [{low:.2f}, {high:.2f}]")
-        if not np.isfinite(low):
-            found.append(
-                f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions"
-            )
-        if abs(load[i]) > spec.effort_limit[i]:
-            found.append(
-                f"{name}: needs {abs(load[i]):.3g} N·m to hold its home, its limit is {spec.effort_limit[i]:g}"
-            )
-    if not spec.payload_mounts:
-        found.append("no [[payload_mount]]: payloads other than 0 will be refused")
-    return found
+        out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
+    warnings = [f.message for f in findings if f.level in bad]
+    out.result(as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
+                                "findings": [vars(f) for f in findings]})  # fmt: skip
 
 
 def as_dict(spec: RobotSpec) -> dict[str, Any]:
