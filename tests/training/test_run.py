@@ -135,6 +135,13 @@ def test_the_kept_model_is_the_best_on_validation(trained):
     assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
 
 
+def test_progress_says_how_far_labels_are_fitted(trained):
+    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
+    fitted = [line for line in lines if line["stage"] == "warm start"]
+    assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
+    assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
+
+
 def test_parts_of_the_split_share_no_content(trained):
     parts = split_entries(trained[0])
     hashes = [{e.hash for e in entries} for entries in parts.values()]

@@ -177,12 +177,12 @@ class Trainer:
             warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
         ):
             before = round_state(warm)
-            warm.round(self._tick)
+            fit = warm.round(self._tick)
             self.kept.sensor_r2 = warm.report
             rounds.append(before)
             self.kept.rounds_done, self.kept.warm = warm.done, warm_state(warm, rounds)
             self.kept.steps += config.num_envs * config.steps
-            self._consider()
+            self._consider(None, **fit)
 
     def _cold_start(self) -> None:
         """PPO alone also needs the statistics of its inputs, and sensors that answer."""
@@ -283,7 +283,7 @@ class Trainer:
         network = FunctionNetwork(torch_infer(net), config.input_dim(self.n), self.n)
         return DeltaCorrector(network, config, self.robot, points_of(net))
 
-    def _consider(self, shrunk: DeltaNet | None = None) -> None:
+    def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
         net = shrunk or self.net
         self.kept.val = self.validate(net)
@@ -295,7 +295,7 @@ class Trainer:
             "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1),
             "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
-        line |= vars(self.found) if self.stage == "ppo" else {}
+        line |= vars(self.found) if self.stage == "ppo" else told
         self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
         self.kept.seconds, self.began = self.seconds(), time.monotonic()

@@ -101,15 +101,20 @@ class WarmStart:
         noise[: len(noise) // 4] = 0.0
         return noise
 
-    def round(self, tick: Callable[[], float]) -> float:
-        """Collect with the present policy, fit on the pool; returns the fit's RMSE, rad.
+    def round(self, tick: Callable[[], float]) -> dict[str, float]:
+        """Collect with the present policy, fit on the pool.
+
+        Returns:
+            RMSE of the labels, rad, over the last quarter of the gradient steps and over the quarter before it: a fit
+            that is done has both alike.
 
         tick is called after every gradient step and returns the share of the budget spent: whichever is further, rounds
         or budget, lowers the step size.
         """
         self.collect(follow_labels=self.done == 0)
         x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
-        config, net, total = self.config, self.net, 0.0
+        config, net = self.config, self.net
+        losses = np.zeros(config.gradient_steps)
         net.train()
         net.sample_sensors = True
         spent = 0.0
@@ -122,12 +127,18 @@ class WarmStart:
             self.optimiser.zero_grad()
             loss.backward()
             self.optimiser.step()
-            total += loss.item()
+            losses[step] = loss.item()
             spent = tick()
         net.sample_sensors = False
         net.eval()
         self.done += 1
-        return float(np.sqrt(total / config.gradient_steps))
+        quarter = max(len(losses) // 4, 1)
+        last, before = losses[-quarter:], losses[-2 * quarter : -quarter]
+        return {"label_rmse": _rms(last), "label_rmse_before": _rms(before)}
+
+
+def _rms(losses: Array) -> float:
+    return float(np.sqrt(losses.mean())) if len(losses) else float("nan")
 
 
 def held_labels(labels: Array, hold: int) -> Array:
