@@ -11,8 +11,8 @@ SOURCE = Path(gaponet.__file__).parent
 # A module may import from its own rank or a lower one, also inside functions. The ground floor: plot and all modules of
 # the top folder that are not named here.
 RANKS = [
-    {"data"}, {"metrics"}, {"sim"}, {"motion"}, {"virtual", "collect"}, {"model"}, {"training", "deploy"}, {"eval"},
-    {"study", "view", "bench"}, {"api"}, {"cli"},
+    {"data"}, {"metrics"}, {"sim"}, {"family"}, {"motion"}, {"virtual", "collect"}, {"model"},
+    {"training", "deploy"}, {"eval"}, {"study", "view", "bench"}, {"api"}, {"cli"},
 ]  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {

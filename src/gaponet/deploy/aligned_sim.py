@@ -77,8 +77,8 @@ class AlignedSim:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
-        if isinstance(model, GapModel) and not told and model.corrects(robot) and periods_of(model, self.dt) == 1:
-            self.loop = model.loop(self.num_envs)
+        if isinstance(model, GapModel) and self._knows(model, own if told else None):
+            self.loop = model.loop(self.num_envs, model.context(own, robot))
         elif model is not None:
             inverted = of_simulator(self.sim, robot, own, locked, inverse, nthread)
             self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
@@ -141,6 +141,14 @@ class AlignedSim:
         if self.transfer is not None:
             target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
         sim.step(target)
+
+    def _knows(self, model: GapModel, carried: list[Condition] | None) -> bool:
+        """Whether the model was trained in this simulator, at this rate; carried: what it has in its hands instead."""
+        if not model.corrects(self.robot) or periods_of(model, self.dt) > 1:
+            return False
+        family = model.family
+        empty = carried is not None and not any(c.payload_mass for c in carried)
+        return carried is None or (family is not None and family.unladen > 0 and empty)
 
     def _past(self, target: Array) -> Array:
         return np.repeat(target[:, None], self._depth, axis=1)

@@ -70,7 +70,8 @@ class MujocoAligner:
             self._invert(model, mj_model, Condition(payload_mass, "both", dt), prefix, extrapolate, inverse)
         if self.transfer is None:
             model.require_rate(dt)
-            self.loop = model.loop()
+            told = model.context([Condition(payload_mass, "both", dt)])  # it moves as the simulator of the run
+            self.loop = model.loop(context=told)
         joints = model.card["joint_names"] if self.transfer is None else self.transfer.joint_names
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])

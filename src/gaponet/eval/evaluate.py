@@ -45,6 +45,7 @@ ORDER = (
     *LEARNED,
     "calibrated",
     "uncorrected",
+    "member",
     "transfer",
 )  # of tables and figures
 
@@ -265,6 +266,8 @@ def _transferred(
     simulator = replace(target, nominal=target.nominal or nominal)
     if model_hash(target) != model_hash(nominal):
         yield "uncorrected", simulator, None
+    if model.family is not None:
+        yield "member", simulator, model.corrector(simulator)
     yield "transfer", simulator, TransferCorrector(model, simulator)
 
 

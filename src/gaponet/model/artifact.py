@@ -9,7 +9,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NotRequired
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -18,6 +18,7 @@ from typing_extensions import TypedDict
 from gaponet.arrays import Array
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError, UsageError
+from gaponet.family.draw import Family
 from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
 from gaponet.model.config import ModelConfig
@@ -26,6 +27,9 @@ from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import keeps_robot, kept_robot
 from gaponet.structure import Json, Name, Number, read_format, read_json, validated
+
+if TYPE_CHECKING:
+    from gaponet.sim.batch import Condition
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
 RECORDED_TOLERANCE = 0.02  # relative, of gains
@@ -124,6 +128,7 @@ class Card(TypedDict):
     interrupted: NotRequired[bool]
     stages: NotRequired[Stages]
     dataset_hash: NotRequired[str]
+    family: NotRequired[Family | None]
     seed: NotRequired[int]
     hours: NotRequired[float]
     steps: NotRequired[int]
@@ -219,18 +224,48 @@ class GapModel:
         limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
         return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
 
-    def loop(self, num_envs: int = 1) -> DeltaLoop:
+    def loop(self, num_envs: int = 1, context: Array | None = None) -> DeltaLoop:
         """The corrections of num_envs robots, with a past of their own: loop.delta(qpos, qvel, ctrl, payload_mass).
 
         Joints are those of the card (joint_names), in that order.
 
+        Args:
+            num_envs: How many.
+            context: Which simulators they are, as `context` says, for a model that is told.
+
         Raises:
-            ModelError: The model asks the simulator, which a control loop does not have.
+            ModelError: The model asks the simulator, or is told which it is; a control loop has none.
         """
-        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
+        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer, context=context)
+
+    @property
+    def family(self) -> Family | None:
+        """The family of simulators that it was trained in, if any."""
+        told = self.card.get("family")
+        return validated(Family, told, self.path / CARD, ModelError) if told else None
+
+    def context(self, conditions: list[Condition], robot: RobotSpec | None = None) -> Array | None:
+        """What the model is told of simulators, (num, n · context_dim); None where it is told nothing.
+
+        Args:
+            conditions: What they carry, and the control period.
+            robot: The simulator; default the nominal one of its run.
+        """
+        from gaponet.family.context import context
+
+        if self.config.context == "none":
+            return None
+        reference = self.simulator()
+        nominal = reference.nominal or reference
+        return context(self.config.context, nominal, reference if robot is None else robot, conditions)
 
     def corrects(self, robot: RobotSpec) -> bool:
-        """Whether this is the simulator that it was trained in; refuses another robot."""
+        """Whether this is the simulator that it was trained in, or one of its family; refuses another robot."""
+        return not self._stranger(robot)
+
+    def _stranger(self, robot: RobotSpec) -> str:
+        """Why a simulator is none that the model was trained in; "" where it is."""
+        from gaponet.family.context import outside
         from gaponet.sim.model import model_hash
 
         card = self.card
@@ -239,18 +274,22 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        return bool(card["simulator"] == model_hash(robot))
+        if card["simulator"] == model_hash(robot):
+            return ""
+        family = self.family
+        if family is None or not keeps_robot(self.path.parent):
+            return "MJCF, gains or limits differ, or it is of before friction held"
+        return outside(family, self.simulator(), robot)
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""
         from gaponet.sim.model import model_hash
 
-        if not self.corrects(robot):
+        if why := self._stranger(robot):
             trained, asked = self.card["simulator"], model_hash(robot)
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
-                "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
-                "keeps, or train again"
+                f"({why}); use the robot folder that the run keeps, or train again"
             )
         if dt is not None:
             self.require_rate(dt)
@@ -319,7 +358,8 @@ class GapModel:
             points, n = OnnxNetwork(self.path / WEIGHTS, output="offsets"), len(self.card["joint_names"])
             shape = (self.config.num_probes, n)
             require_answer(points, self.config.input_dim(n), shape, self.config.probe_large, self.path / WEIGHTS)
-        return DeltaCorrector(self.infer, self.config, robot, points)
+        told = lambda conditions: self.context(conditions, robot)  # noqa: E731
+        return DeltaCorrector(self.infer, self.config, robot, points, told)
 
     def weights_hash(self) -> str:
         """First 12 hex digits of the SHA-256 of model.onnx."""

@@ -11,6 +11,7 @@ from gaponet.errors import UsageError
 
 Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "fno", "inverse"]
 OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
+CONTEXT = {"none": 0, "parameters": 7, "fingerprint": 36}  # numbers per joint (family/context.py)
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
@@ -60,6 +61,9 @@ class ModelConfig:
     sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh. With
     delta_hold they are refreshed at the next decision."""
+    context: Literal["none", "parameters", "fingerprint"] = "none"
+    """What the branch is told of the simulator it is in, where --family draws many. parameters: its numbers.
+    fingerprint: its answers to a few steps, asked once. With either, a model is for simulators, not for a robot."""
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""
@@ -103,6 +107,10 @@ class ModelConfig:
             )
         if self.kind == "shared_mlp" and self.coupling == "full":
             raise UsageError("shared_mlp takes one joint at a time; with full coupling the plain network is mlp")
+        if self.context != "none" and not self.joint_wise:
+            raise UsageError(
+                f"context {self.context} is told one joint at a time: to gaponet or shared_mlp, not {self.kind}"
+            )
         if self.transformer_width % self.transformer_heads:
             raise UsageError(
                 f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
@@ -123,6 +131,11 @@ class ModelConfig:
         return self.num_probes * 2 * n
 
     @property
+    def context_dim(self) -> int:
+        """Numbers per joint that say which simulator it is."""
+        return CONTEXT[self.context]
+
+    @property
     def asks_simulator(self) -> bool:
         """Whether the sensors are the simulator's own answers, a part of x."""
         return self.kind in OPERATORS and self.sensors in ("oracle", "learned")
@@ -138,6 +151,6 @@ class ModelConfig:
         return self.kind in OPERATORS and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
 
     def input_dim(self, n: int) -> int:
-        """Numbers in x = [o_t | a_t | o_refresh or S_t, where there is one]."""
+        """Numbers in x = [o_t | a_t | o_refresh or S_t | context, where there is one]."""
         more = self.observation_dim(n) * self.keeps_observation + self.sensor_dim(n) * self.asks_simulator
-        return self.observation_dim(n) + n + more
+        return self.observation_dim(n) + n + more + self.context_dim * n

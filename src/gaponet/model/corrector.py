@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,12 +15,23 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.loop import Ask, DeltaLoop, Infer
 from gaponet.robot import RobotSpec
 
+if TYPE_CHECKING:
+    from gaponet.sim.batch import Condition
+
 
 class DeltaCorrector:
     """Target → target + Δa for the operated joints, clipped to the joint range. Implements sim.replay.Corrector."""
 
-    def __init__(self, network: Network, config: ModelConfig, robot: RobotSpec, points: Infer | None = None) -> None:
-        """points: x → offsets of the probes, where config.sensors is learned."""
+    def __init__(
+        self,
+        network: Network,
+        config: ModelConfig,
+        robot: RobotSpec,
+        points: Infer | None = None,
+        context: Callable[[list[Condition]], Array | None] = lambda conditions: None,
+    ) -> None:
+        """points: x → offsets of the probes, where config.sensors is learned. context: Which simulator that is."""
+        self.context = context
         self.network, self.config, self.robot, self.points = network, config, robot, points
         self.op = robot.operated_index
 
@@ -26,7 +39,10 @@ class DeltaCorrector:
         """Begin one simulation per sequence at its first row; that frame, with its command, repeated is the history."""
         ask = self._simulator(start) if self.config.asks_simulator else None
         limits = self.robot.qpos_range[self.op]
-        self.loop = DeltaLoop(self.config, limits, len(start), self.network, ask, self.points)
+        from gaponet.sim.batch import Condition
+
+        told = self.context([Condition.of(s, self.robot) for s in start])
+        self.loop = DeltaLoop(self.config, limits, len(start), self.network, ask, self.points, told)
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
         self.last = np.array([len(s) - 1 for s in start])
 

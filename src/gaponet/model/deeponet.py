@@ -69,6 +69,8 @@ class OperatorNet(DeltaNet):
             self.predictor, self.points = Surrogate(config, n), ProbePoints(config, n)
         elif config.sensors == "oracle":
             self.answers = Standardise(config.sensor_dim(n))
+        if config.context_dim:
+            self.context = Standardise(config.context_dim * n)
         self.sees_observation = config.branch_history or config.sensors == "off"
         self.asks_payload = config.payload_input and config.payload_trunk
         self.per_joint = config.joint_wise
@@ -76,6 +78,7 @@ class OperatorNet(DeltaNet):
         sensed, seen, asked = self.input_dims(config, n)
         outputs = config.num_basis * (1 if self.per_joint else n)
         inputs = sensed * (config.sensors != "off") + seen * self.sees_observation + n * self.per_joint
+        inputs += config.context_dim
         self.branch_inputs = inputs
         if config.branch == "stacked":
             nets = [dense(inputs, config.branch_hidden, outputs // config.num_basis) for _ in range(config.num_basis)]
@@ -97,16 +100,21 @@ class OperatorNet(DeltaNet):
         return config.sensor_dim(n), config.observation_dim(n), 2 * n + asked
 
     def fit_inputs(self, x: Tensor) -> None:
-        """Statistics of the features, and of the answers where the simulator is asked at fixed targets."""
+        """Statistics of the features, of answers where the simulator is asked at fixed targets, and of which it is."""
         super().fit_inputs(x)
         if self.config.sensors == "oracle":
             self.answers.fit(x[:, self.features.layout.answers], floor=1e-6)
+        if self.config.context_dim:
+            self.context.fit(x[:, self.features.layout.context], floor=1e-5)
 
     def prepare(self, x: Tensor) -> Tensor:
         """x = [o_t | a_t | more], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
         z = self.features(x)
         sensors = self.sensors(x, z) if self.config.sensors != "off" else None
         see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
+        if self.config.context_dim:
+            told = self.context(x[:, self.features.layout.context]).clamp(-5.0, 5.0)
+            see = torch.cat([see, told.reshape(-1, self.n, self.config.context_dim)], dim=-1)
         return torch.cat([see, ask], dim=-1)
 
     def correct(self, prepared: Tensor) -> Tensor:

@@ -38,6 +38,7 @@ class DeltaLoop:
         network: Network | None = None,
         ask: Ask | None = None,
         points: Infer | None = None,
+        context: Array | None = None,
     ) -> None:
         """
         Args:
@@ -45,14 +46,20 @@ class DeltaLoop:
             network: The model; None where the correction is found elsewhere, as in training: observe and push.
             ask: The simulator, where config.asks_simulator.
             points: x → offsets, where these are learned; without it the fixed probes are asked.
+            context: Which simulators they are, (num_envs, n · config.context_dim), where the model is told.
 
         Raises:
-            ModelError: The model asks the simulator, and there is none.
+            ModelError: The model asks the simulator, or is told which it is, and there is none.
         """
         if config.asks_simulator and ask is None:
             raise ModelError(
                 f"this model's sensors are the simulator's own answers (sensors = {config.sensors}): to compare with, "
                 "of no use outside a simulator; train with --model.sensors predicted"
+            )
+        if config.context_dim and context is None:
+            raise ModelError(
+                f"this model is told which simulator it is in ({config.context}), and here is none; use it with "
+                "AlignedSim, gaponet eval or transfer, or train without --model.context"
             )
         n = len(qpos_range)
         self.config, self.n, self.num_envs, self.ask, self.points = config, n, num_envs, ask, points
@@ -60,8 +67,12 @@ class DeltaLoop:
         nothing = Bound(np.zeros((num_envs, at.dim), np.float32), np.zeros((num_envs, n), np.float32), lambda: None)
         self.bound = network.bind(num_envs) if network else nothing
         self.x, self.history = self.bound.x, History(config, n, self.bound.x)
-        self.more = self.x[:, at.query.stop :]  # [o_r | S_t]: what belongs to the last refresh of the sensors
+        self.more = self.x[
+            :, at.query.stop : at.answers.stop
+        ]  # [o_r | S_t]: what belongs to the last refresh of the sensors
         self._host = isinstance(self.x, np.ndarray)
+        if context is not None:
+            self.x[:, at.context] = context if self._host else self.x.new_tensor(context)
         self._xp = import_module(type(self.x).__module__.partition(".")[0])  # numpy or torch
         self._counts = config.delta_hold > 1 or self.more.shape[1] > 0
         self.low, self.high = (

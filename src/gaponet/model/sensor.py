@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gaponet.arrays import Array
+from gaponet.family.draw import Members
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
@@ -38,14 +39,18 @@ class ProbeOracle:
         nthread: int = 0,
         locked: tuple[str, ...] = (),
         whole: bool = False,
+        members: Members | None = None,
     ) -> None:
-        """One state slot per entry of `conditions`; states are of the joints that are not locked, or, where whole, of
-        all."""
+        """One state slot per entry of `conditions`, and of `members`, if any; states are of the joints that are not
+        locked, or, where whole, of all."""
         self.offsets = probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
-        self.sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
+        own = conditions if members is None else members.conditions(conditions)
+        self.sim = BatchSim(prompt, [c for c in own for _ in range(m)], nthread, locked)
+        if members is not None:
+            members[np.repeat(np.arange(len(own)), m)].put(self.sim, prompt)
         self.free = robot.index(self.sim.joint_names) if whole else slice(None)
         self.target = np.zeros((self.sim.num_envs, self.sim.n))
         self.absolute = config.sensor_target == "absolute"

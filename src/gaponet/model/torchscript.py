@@ -107,10 +107,10 @@ def export_torchscript(model: GapModel, run: Path, path: Path) -> float:
         ModelError: It is above 1e-5 rad; nothing is written.
     """
     n, config = len(model.card["joint_names"]), model.config
-    if config.asks_simulator or config.keeps_observation or config.delta_hold > 1:
+    if config.asks_simulator or config.keeps_observation or config.delta_hold > 1 or config.context_dim:
         raise ModelError(
-            f"{model.path}: holds sensors or corrections, or asks the simulator, which TorchScript does not; train "
-            "with sensors predicted or off, sensor_hold 1 and delta_hold 1"
+            f"{model.path}: holds sensors or corrections, or asks the simulator, or is told which it is, which "
+            "TorchScript does not; train with sensors predicted or off, sensor_hold 1, delta_hold 1 and context none"
         )
     net = traced(torch_network(model, run), model.config.observation_dim(n) + n)
     content = io.BytesIO()  # torch ends the process when it meets a full disk itself
@@ -158,7 +158,7 @@ def network_calls(model: GapModel, run: Path) -> dict[str, Callable[[], object]]
     """One step of the network as trained (or as fused, without a checkpoint) and as TorchScript, to be timed."""
     torch.set_num_threads(1)
     n = len(model.card["joint_names"])
-    dim = model.config.observation_dim(n) + n
+    dim = model.config.input_dim(n)
     as_trained = (run / "checkpoint.pt").is_file()
     net = trained_network(run, model.config, n) if as_trained else torch_network(model, run)
     script = torch.jit.freeze(traced(torch_network(model, run), dim))

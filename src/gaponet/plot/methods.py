@@ -26,6 +26,7 @@ METHODS = {  # name, colour
     "gaponet": ("GAPONet", "#c8102e"),
     "calibrated": ("calibrated to the unit", "#6a1b9a"),
     "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),
+    "member": ("in the other simulator, as one of its family", "#9c3d54"),
     "transfer": ("transferred into the other simulator", "#e07a1f"),
     "delay": ("delay", "#d99000"),
     "offset": ("offset", "#b36b00"),

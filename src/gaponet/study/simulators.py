@@ -22,6 +22,7 @@ from gaponet.plot.charts import bars
 from gaponet.plot.methods import colour, shade, title
 from gaponet.plot.table import Spread, Table
 from gaponet.sim.model import model_hash
+from gaponet.study import family
 from gaponet.study.found import Found as Cells
 from gaponet.study.played.kept import KeptParts
 from gaponet.study.played.simulators import (
@@ -32,6 +33,7 @@ from gaponet.study.played.simulators import (
     free_run,
     microseconds,
     recorded,
+    share,
     simulator_of,
     simulators_of,
 )
@@ -57,6 +59,8 @@ class Simulators:
     """Units never trained on."""
     seconds: float = 0.0
     """Of each motion, from its start; 0 for whole motions."""
+    family: str = ""
+    """Also train models in this family of simulators, 768 members each: a .toml file, or wide."""
     identify: ClassVar[bool] = True
 
     def cells(self, study: Study) -> list[Cell]:
@@ -65,7 +69,7 @@ class Simulators:
             raise UsageError(
                 "gaponet experiment simulators identifies by itself; leave out --robot, or give a nominal one"
             )
-        return study.cells([NOMINAL, BOTH])
+        return study.cells([NOMINAL, BOTH]) + (family.cells(study, self.family) if self.family else [])
 
     def result(self, study: Study, found: Cells) -> Result:
         """Shares of each simulator's own error, what transfer adds to its reference's, contact, cost."""
@@ -73,10 +77,15 @@ class Simulators:
         free, touching = runs.free(), runs.touching()
         axis, heading = "share of the simulator's own error", f"Transfer\n{study.who}"
         figure = bars([_label(name) for name in free], _bars(free), axis, heading)
+        tables = [_shares(free), _added(free), _touching(touching), runs.cost()]
+        said = _sentences(free, touching)
+        if self.family:
+            own = family.errors_of(study, found, self.family, runs.sequences, runs.simulators)
+            table, more = family.told(own, _rivals(free), self.family)
+            tables, said = [tables[0], table, *tables[1:]], said + more
         return found.result(
             study, "simulators", "Simulators that no model was trained in",
-            [_shares(free), _added(free), _touching(touching), runs.cost()], {"simulators": figure},
-            _sentences(free, touching), motions=sorted({s.meta.motion for s in runs.sequences}),
+            tables, {"simulators": figure}, said, motions=sorted({s.meta.motion for s in runs.sequences}),
             simulators={s.name: model_hash(s.robot) for s in runs.simulators},
         )  # fmt: skip
 
@@ -180,14 +189,6 @@ def _way(way: str) -> str:
     return f"{_name(reference)}, {WAYS['closed' if how == 'closed' else 'probes']}"
 
 
-def share(error: ListOf[float], base: ListOf[float]) -> Spread:
-    """One error as a share of another, paired over motions, ± its standard error."""
-    e, b = np.array(error), np.array(base)
-    ratio = e.mean() / b.mean()
-    spread = (e - ratio * b).std(ddof=1) / b.mean() / np.sqrt(len(e)) if len(e) > 1 else np.nan
-    return Spread(float(ratio), float(spread), len(e))
-
-
 def _shares(free: Found) -> Table:
     """A row per simulator: its own error, and what each way leaves of it."""
     references = [way.removeprefix("own ") for way in next(iter(free.values())) if way.startswith("own ")]
@@ -229,6 +230,12 @@ def _touching(touching: Found) -> Table:
     )
     columns = ("simulator", "uncorrected, mrad", *WAYS.values(), "worse motions")
     return Table("contact", columns, tuple(rows), note)
+
+
+def _rivals(free: Found) -> family.Rivals:
+    """What stands beside models of a family: the nominal simulator's model, as it is and transferred, and the best."""
+    ways = {"as is": "as it is", "transferred": f"closed {NOMINAL}", "identification, transferred": f"closed {ALONE}"}
+    return {at: {"uncorrected": e["uncorrected"]} | {k: e[w] for k, w in ways.items()} for at, e in free.items()}
 
 
 def _mean(error: ListOf[float]) -> Spread:

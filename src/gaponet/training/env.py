@@ -9,6 +9,8 @@ import torch
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
+from gaponet.family.context import context
+from gaponet.family.draw import Members
 from gaponet.model.config import ModelConfig
 from gaponet.model.loop import Ask, DeltaLoop
 from gaponet.model.observation import frames_before
@@ -44,8 +46,12 @@ class DeltaEnv:
         reward: RewardConfig,
         seed: int = 0,
         nthread: int = 0,
+        members: Members | None = None,
     ) -> None:
-        """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods."""
+        """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
+
+        With members each environment is one simulator of a family.
+        """
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
         self.robot, self.config, self.reward_config = robot, config, reward
@@ -55,11 +61,20 @@ class DeltaEnv:
         self.rng = np.random.default_rng(seed)
         self._load(sequences)
         conditions = [self.conditions[g] for g in self.group]
-        self.sim = BatchSim(robot, conditions, nthread, self.locked)
+        self.drawn, told = members, None
+        if members is None:
+            self.sim = BatchSim(robot, conditions, nthread, self.locked)
+        else:
+            self.sim = BatchSim(members.robot(robot), members.conditions(conditions), nthread, self.locked)
+            members.put(self.sim, robot)
+        if config.context != "none":
+            told = context(config.context, robot.nominal or robot, robot, conditions, members, nthread)
         ask = self._simulator(conditions, nthread) if config.asks_simulator else None
-        self.loop = DeltaLoop(config, self.sim.range[self.op], num_envs, ask=ask)
+        self.loop = DeltaLoop(config, self.sim.range[self.op], num_envs, ask=ask, context=told)
         shortest = min(c[2] for c in self.conditions)
-        under_way = 1 + int(np.ceil(robot.delay.max() / shortest))  # periods whose command a late servo has not met yet
+        under_way = 1 + int(
+            np.ceil(self.sim.robot.delay.max() / shortest)
+        )  # periods whose command a late servo has not met yet
         self.depth = max(self.loop.history.depth, under_way)
         self.elapsed = np.zeros(num_envs, np.int64)  # control periods since the reset
         self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at

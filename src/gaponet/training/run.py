@@ -30,11 +30,10 @@ from gaponet.data.sequence import require_same_gains
 from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
+from gaponet.family.draw import Members
 from gaponet.files import write_text, writing
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
-from gaponet.model.backends import FunctionNetwork
 from gaponet.model.baselines import delay_offset
-from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
 from gaponet.model.layers import DeltaNet
@@ -42,7 +41,6 @@ from gaponet.robot import RobotSpec
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import replay
 from gaponet.structure import validated
 from gaponet.training.budget import Budget, Status
 from gaponet.training.checkpoint import (
@@ -56,11 +54,12 @@ from gaponet.training.checkpoint import (
 from gaponet.training.config import TrainConfig, options
 from gaponet.training.env import DeltaEnv
 from gaponet.training.gain import choose_gain
-from gaponet.training.inverse import inverse_labels
+from gaponet.training.inverse import labels_of
 from gaponet.training.kept import Kept
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import Learner, Update
-from gaponet.training.sensor_fit import points_of, torch_infer
+from gaponet.training.sensor_fit import points_of
+from gaponet.training.validation import PAIRS, in_members, mean_error
 from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
 VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
@@ -105,7 +104,7 @@ class Trainer:
                 "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
             )
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
-        self.n = len(robot.operated)
+        self.n, self.family = len(robot.operated), config.drawn
         torch.manual_seed(config.seed)
         torch.set_num_threads(config.learner_threads)
         self.net = build_network(config.model, self.n)
@@ -160,7 +159,7 @@ class Trainer:
         config = recipe(self.config)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         limit = 0.99 * self.config.model.delta_max
-        labels = np.concatenate([inverse_labels(s, self.robot, limit) for s in self.train_set])
+        labels = labels_of(self.train_set, self.robot, limit, env.drawn)
         warm = WarmStart(self.net, env, labels, config, self.config.seed, self.config.threads)
         warm.report = self.kept.sensor_r2
         rounds: list[StateDict] = []
@@ -261,27 +260,26 @@ class Trainer:
 
     def _env(self, num_envs: int, episode_steps: int, seed: int) -> DeltaEnv:
         c = self.config
-        return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, c.reward, seed, c.threads)
+        members = self._members(num_envs, c.seed)
+        return DeltaEnv(
+            self.train_set, self.robot, c.model, num_envs, episode_steps, c.reward, seed, c.threads, members
+        )
+
+    def _members(self, num: int, seed: int) -> Members | None:
+        return None if self.family is None else Members.draw(self.family, num, self.n, seed)
 
     # ---- validation, checkpoints, card
 
     def validate(self, net: DeltaNet | None) -> float:
         """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
 
-        Nominal is the simulator before identification, also where training starts from an identified one.
+        Nominal is the simulator before identification, also where training starts from an identified one. With a
+        family both are means over members that no environment is.
         """
-        corrector = self._corrector(net) if net is not None else None
-        simulator = self.robot if net is not None else self.robot.nominal or self.robot
-        twins = replay(self.val_set, simulator, corrector, self.config.threads, lock_idle=True)
-        op = self.robot.operated_index
-        return float(
-            np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(self.val_set, twins, strict=True)])
-        )
-
-    def _corrector(self, net: DeltaNet) -> DeltaCorrector:
-        config = self.config.model
-        network = FunctionNetwork(torch_infer(net), config.input_dim(self.n), self.n)
-        return DeltaCorrector(network, config, self.robot, points_of(net))
+        what = self.config.model, net, self.config.threads
+        if (members := self._members(PAIRS, self.config.seed + 1)) is not None:
+            return in_members(self.val_set, self.robot, *what, members)
+        return mean_error(self.val_set, self.robot if net is not None else self.robot.nominal or self.robot, *what)
 
     def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
@@ -358,6 +356,7 @@ class Trainer:
             val_mpjae={"model": self.kept.best, "nominal": self.nominal},
             sensor_r2=self.kept.sensor_r2,
             seed=self.config.seed,
+            family=self.family and asdict(self.family),
             gain=self.kept.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
             steps=self.kept.steps,

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaponet.arrays import Array
+from gaponet.family.draw import Members
 from gaponet.model.layers import DeltaNet
 from gaponet.model.loop import Infer
 from gaponet.model.observation import Layout
@@ -59,6 +60,7 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
+    members: Members | None = None,
 ) -> Answers:
     """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
@@ -69,10 +71,15 @@ def sensor_labels(
         net: Its config says the probes.
         x: What the network was given at those states, (k, dim).
         qpos, qvel: All joints that are not locked, (k, n_free).
+        members: Of a family, whose simulator is asked, one for each state.
     """
     rng = np.random.default_rng(seed)
     third = rng.integers(0, 3, len(qpos))
-    oracle, n, at = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n, net.features.layout
+    oracle, n, at = (
+        ProbeOracle(robot, net.config, conditions, nthread, locked, members=members),
+        net.n,
+        net.features.layout,
+    )
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)

@@ -19,6 +19,7 @@ from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
+from gaponet.training.inverse import MemberLabels
 from gaponet.training.sensor_fit import Report, fit_predictor, points_of, sensor_labels
 
 
@@ -41,10 +42,17 @@ class WarmStart:
     """How well the sensor predictor explains the simulator, where there is one."""
 
     def __init__(
-        self, net: DeltaNet, env: DeltaEnv, labels: Array, config: WarmStartConfig, seed: int, nthread: int = 0
+        self,
+        net: DeltaNet,
+        env: DeltaEnv,
+        labels: Array | MemberLabels,
+        config: WarmStartConfig,
+        seed: int,
+        nthread: int = 0,
     ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
-        self.net, self.env, self.labels, self.config = net, env, held_labels(labels, env.config.delta_hold), config
+        self.net, self.env, self.config = net, env, config
+        self.labels = held_labels(labels, env.config.delta_hold) if isinstance(labels, np.ndarray) else labels
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -171,14 +179,13 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: i
     xs: list[Array] = []
     qs: list[Array] = []
     vs: list[Array] = []
-    groups: list[Array] = []
     while sum(map(len, xs)) < states:
         env.reset()
         xs.append(env.get_observations()["actor"].numpy())
         qs.append(env.sim.qpos.copy())
         vs.append(env.sim.qvel.copy())
-        groups.append(env.group)
-    x, q, v, group = (np.concatenate(part) for part in (xs, qs, vs, groups))
+    x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
+    of = np.tile(np.arange(env.num_envs), len(xs))  # environment of each state
     pick = np.sort(rng.permutation(len(x))[:states])
     shuffled = rng.permutation(pick)
     asked = sensor_labels(
@@ -187,9 +194,10 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: i
         x[shuffled],
         q[shuffled],
         v[shuffled],
-        [env.conditions[g] for g in group[shuffled]],
+        [env.conditions[g] for g in env.group[of[shuffled]]],
         env.locked,
         seed,
         nthread,
+        None if env.drawn is None else env.drawn[of[shuffled]],
     )
     return fit_predictor(net, asked, env.robot.operated, seed)

@@ -19,9 +19,11 @@ from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.transfer import Inverse, Reference
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
+from gaponet.plot.table import Spread
 from gaponet.robot import RobotSpec, Tip, load_robot
 from gaponet.robot import Table as Plane
 from gaponet.robot_folder import save_robot
+from gaponet.sim.batch import Condition
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
 from gaponet.sim.table import TABLE
@@ -103,7 +105,10 @@ def free_run(
         robot, given, payload, first.meta.payload_side, first.dt / at.times, len(sequences), 0,
         idle_limbs(sequences, robot), simulator_payload=at.payload, inverse="probes" if how == "probes" else "closed",
     )  # fmt: skip
-    loop = reference.loop(len(sequences)) if how == "as it is" and isinstance(reference, GapModel) else None
+    loop = None
+    if how == "as it is" and isinstance(reference, GapModel):
+        known = [Condition(p if at.payload is None else at.payload, first.meta.payload_side, first.dt) for p in payload]
+        loop = reference.loop(len(sequences), reference.context(known, at.robot))
     free = robot.index(sim.joint_names)
     ctrl = np.stack([s.ctrl[np.minimum(np.arange(len(first)), len(s) - 1)][:, free] for s in sequences], axis=1)
     qpos, qvel = (np.stack([getattr(s, name)[0, free] for s in sequences]) for name in ("qpos", "qvel"))
@@ -132,6 +137,14 @@ def errors(sequences: ListOf[Sequence], run: Array, truth: Array) -> list[float]
     """Mean |difference| of two runs in each motion, mrad."""
     apart = np.abs(run - truth)
     return [1e3 * float(apart[1 : len(s), i].mean()) for i, s in enumerate(sequences)]
+
+
+def share(error: ListOf[float], base: ListOf[float]) -> Spread:
+    """One error as a share of another, paired over motions, ± its standard error."""
+    e, b = np.array(error), np.array(base)
+    ratio = e.mean() / b.mean()
+    spread = (e - ratio * b).std(ddof=1) / b.mean() / np.sqrt(len(e)) if len(e) > 1 else np.nan
+    return Spread(float(ratio), float(spread), len(e))
 
 
 def on_plane(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:

@@ -1,0 +1,1 @@
+"""Families of simulators: drawn around a nominal one, and how a model knows which of them it is in."""
