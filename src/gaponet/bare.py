@@ -33,7 +33,11 @@ def bare_mjcf(path: Path) -> str:
     Raises:
         RobotError: It does not compile, or has what such a text cannot hold (tendons with odd figures, plugins).
     """
-    spec = read_mjcf(path)
+    return bare_text(read_mjcf(path), path)
+
+
+def bare_text(spec: mujoco.MjSpec, path: Path) -> str:
+    """The same of a specification that was read from `path`."""
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
     model = compiled(spec, path)
     root = ET.fromstring(spec.to_xml())

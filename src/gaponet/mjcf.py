@@ -25,7 +25,7 @@ def read_mjcf(path: Path) -> mujoco.MjSpec:
     """
     import mujoco
 
-    _require_size(path, path.parent, {path.resolve()})
+    require_size(path)
     try:
         return mujoco.MjSpec.from_file(str(path))
     except (ValueError, mujoco.FatalError) as error:
@@ -46,7 +46,12 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
         raise RobotError(f"{path}: does not compile: {' '.join(str(error).split())}") from None
 
 
-def _require_size(path: Path, folder: Path, seen: set[Path]) -> int:
+def require_size(path: Path) -> None:
+    """Refuse a file that is no XML, or makes or names more than a robot has."""
+    _count(path, path.parent, {path.resolve()})
+
+
+def _count(path: Path, folder: Path, seen: set[Path]) -> int:
     """Elements that a file makes, those of its <include>s counted; refuses too many."""
     if not path.is_file() or path.stat().st_size > BYTES:
         raise RobotError(f"{path}: is missing, not a file, or has more than {BYTES >> 20} MiB")
@@ -68,7 +73,7 @@ def _require_size(path: Path, folder: Path, seen: set[Path]) -> int:
             other = folder / tag.get("file", "")
             if other.resolve() in seen:
                 raise RobotError(f"{path}: includes {other.name} twice")
-            count += times * _require_size(other, folder, seen | {other.resolve()})
+            count += times * _count(other, folder, seen | {other.resolve()})
         open_tags += [(child, times) for child in tag]
     _require_files(root, path, folder)
     return math.ceil(count)

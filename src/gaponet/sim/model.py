@@ -186,15 +186,27 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
 
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for name in locked:
-        joint = spec.joint(name)
-        angle = robot.qpos_home[robot.joint_names.index(name)] - joint.ref
-        turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
-        mujoco.mju_axisAngle2Quat(turn, np.array(joint.axis), angle)
-        mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
-        mujoco.mju_rotVecQuat(offset, np.array(joint.pos) - offset, np.array(joint.parent.quat))
-        mujoco.mju_mulQuat(quat, np.array(joint.parent.quat), turn)
-        joint.parent.pos, joint.parent.quat = np.array(joint.parent.pos) + offset, quat
-        spec.delete(joint)
+        freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
+
+
+def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
+    """Clamp a hinge or slide joint of a body with a quaternion at a value, rad or m.
+
+    Raises:
+        RobotError: Another joint of its body comes before it, and it is not clamped at its reference.
+    """
+    body, move = joint.parent, value - joint.ref
+    if move and body.joints[0].name != joint.name:
+        raise RobotError(f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both")
+    turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
+    slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
+    mujoco.mju_axisAngle2Quat(turn, axis, 0.0 if slides else move)
+    mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
+    mujoco.mju_rotVecQuat(offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat))
+    mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
+    body.pos, body.quat = np.array(body.pos) + offset, quat
+    spec.delete(joint)
 
 
 def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -70,8 +70,8 @@ class Camera:
         self.layout = Tiles.of(scene, width - width % 2, course)
         self.span = (span[0], min(span[1], (len(scene.shown.real) - 1) * scene.shown.real.dt))
         self.lens = self._lens()
-        self.renderer = _renderer(scene.model, self.layout.robots, self.layout.width)
-        self.fonts = {size: _font(size * max(width / 960, 0.5)) for size in (13, 15, 17)}
+        self.renderer = renderer(scene.model, self.layout.robots, self.layout.width)
+        self.fonts = {size: font(size * max(width / 960, 0.5)) for size in (13, 15, 17)}
 
     def __enter__(self) -> Camera:
         return self
@@ -179,13 +179,19 @@ def _payload(mass: float, side: str) -> str:
     return "empty-handed" if mass == 0 else f"{mass:g} kg " + ("in each hand" if side == "both" else f"in {side} hand")
 
 
-def _font(size: float) -> Any:
+def font(size: float) -> Any:
+    """Pillow's own, of a size in pixels."""
     from PIL import ImageFont
 
     return ImageFont.load_default(max(size, 9))
 
 
-def _renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """MuJoCo's, off screen.
+
+    Raises:
+        UsageError: With what is missing here.
+    """
     try:
         return mujoco.Renderer(model, height, width)
     except Exception as error:  # GL libraries raise whatever they like; all of it means: no picture here

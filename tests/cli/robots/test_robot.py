@@ -4,6 +4,7 @@ import json
 
 import pytest
 from arm import TOML, XML, write_arm
+from setup_vendors import write_mjcf
 
 from gaponet.cli.main import main
 
@@ -68,3 +69,18 @@ def test_a_broken_folder_is_one_line_and_exit_code_2(tmp_path, capsys, toml, mes
 def test_check_without_a_name_says_which_there_are(capsys):
     assert main(["robot", "check"]) == 2
     assert "needs a robot name (h1_2, so101, xl330_bench) or a folder" in capsys.readouterr().err
+
+
+def test_new_makes_checks_and_shows_a_robot_from_a_vendor_s_model(tmp_path, capsys):
+    model = write_mjcf(tmp_path / "repo")
+    told = ["robot", "new", str(model), "--out", str(tmp_path / "mine"), "--joints", "shoulder", "elbow"]
+    assert main([*told, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert [joint["kp"] for joint in result["joints"]] == [60.0, 40.0]
+    assert result["warnings"] == []
+    if result["picture"]:  # where something can be rendered
+        assert (tmp_path / "mine" / "picture.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["robot", "check", str(tmp_path / "mine"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["simulator_hash"] == result["simulator_hash"]
+    assert main(told) == 2
+    assert "holds a robot; choose another --out" in capsys.readouterr().err

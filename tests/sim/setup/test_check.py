@@ -83,6 +83,7 @@ def test_postures_of_the_logs_in_which_links_meet_are_counted(tmp_path):
         (LIGHT, "inertia", "no armature at shoulder, elbow"),
         (XML.replace('axis="0 1 0"', 'axis="0 1 0" stiffness="3"', 1), "couplings", "springs at shoulder"),
         (XML.replace('body name="fore"', 'body name="fore" gravcomp="1"'), "couplings", "gravcomp in robot.xml"),
+        (XML.replace('integrator="implicitfast"', 'gravity="0 0 0"'), "couplings", "gravity in robot.xml is [0.0,"),
         (XML.replace("</mujoco>", '<equality><joint joint1="shoulder" joint2="elbow"/></equality></mujoco>'),
          "couplings", "robot.xml has 1 <equality>"),
     ],

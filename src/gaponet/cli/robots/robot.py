@@ -1,61 +1,29 @@
-"""gaponet robot check, gaponet robot list, gaponet robot link."""
+"""gaponet robot new, check, list, link."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from gaponet.cli.options import Json
+from gaponet.cli.options import Flag, Folder, Json
 from gaponet.cli.out import Out, show_findings
 from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
+from gaponet.files import whole
 from gaponet.robot import RobotSpec, available, load_robot
+
+if TYPE_CHECKING:
+    from gaponet.sim.setup.new import Made
 
 POSTURES = 300  # of the logs
 
 
-def robot(
-    action: tyro.conf.Positional[Literal["check", "list", "link"]],
-    path: tyro.conf.Positional[str] = "",
-    driver: Literal["unitree", "so101"] = "unitree",
-    domain: int = 0,
-    interface: str = "lo",
-    port: str = "/dev/ttyACM0",
-    seconds: float = 5.0,
-    data: Path | None = None,
-    payloads: tuple[float, ...] = (),
-    json: Json = False,
-) -> None:
-    """List the package's robots, step one to say what is wrong with it, or listen to a robot without moving it.
-
-    Args:
-        action: check, list or link.
-        path: For check and link: robot name, or a folder with robot.toml and robot.xml.
-        driver: link: unitree (DDS) or so101 (serial).
-        domain: link, unitree: DDS domain.
-        interface: link, unitree: network interface to the robot.
-        port: link, so101: serial port.
-        seconds: link: how long to listen.
-        data: check: dataset of this robot, whose postures and payloads are looked at.
-        payloads: check: kg in every mount, each held for a minute; default those of the data, or 0.
-    """
-    out = Out(json)
-    if action == "list":
-        list_robots(out)
-    elif action == "link":
-        options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
-        listen(out, driver, path or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
-    elif not path:
-        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
-    else:
-        check_robot(out, load_robot(path), data, payloads)
-
-
-def list_robots(out: Out) -> None:
+def list_robots(json: Json = False) -> None:
     """Robots in the package."""
+    out = Out(json)
     specs = [load_robot(name) for name in available()]
     out.table("Robots", ["name", "joints", "operated", "Hz", "payload", "what it is"], [
         [s.name, str(len(s.joint_names)), str(len(s.operated)), f"{1 / s.dt:g}",
@@ -63,6 +31,29 @@ def list_robots(out: Out) -> None:
     ])  # fmt: skip
     out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
     out.result({"robots": [{"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs]})
+
+
+def link(
+    robot: tyro.conf.Positional[str] = "",
+    driver: Literal["unitree", "so101"] = "unitree",
+    domain: int = 0,
+    interface: str = "lo",
+    port: str = "/dev/ttyACM0",
+    seconds: float = 5.0,
+    json: Json = False,
+) -> None:
+    """Listen to a robot without moving it: how its states arrive, and who publishes what.
+
+    Args:
+        robot: Name, or a folder with robot.toml and robot.xml.
+        driver: unitree (DDS) or so101 (serial).
+        domain: unitree: DDS domain.
+        interface: unitree: network interface to the robot.
+        port: so101: serial port.
+        seconds: How long to listen.
+    """
+    options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
+    listen(Out(json), driver, robot or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
 
 
 def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: float) -> None:
@@ -88,10 +79,103 @@ def listen(out: Out, kind: str, name: str, options: dict[str, Any], seconds: flo
     out.result(found | {"publishers": publishers, "virtual": driver.virtual} | driver.facts)
 
 
-def check_robot(out: Out, spec: RobotSpec, dataset: Path | None = None, payloads: tuple[float, ...] = ()) -> None:
+def check(
+    robot: tyro.conf.Positional[str] = "",
+    data: Path | None = None,
+    payloads: tuple[float, ...] = (),
+    json: Json = False,
+) -> None:
+    """Step a robot's simulator and say what is wrong with its folder.
+
+    Args:
+        robot: Name, or a folder with robot.toml and robot.xml.
+        data: Dataset of this robot, whose postures and payloads are looked at.
+        payloads: kg in every mount, each held for a minute; default those of the data, or 0.
+    """
+    if not robot:
+        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
+    out = Out(json)
+    out.result(check_robot(out, load_robot(robot), data, payloads))
+
+
+def new(
+    model: Folder,
+    out: Path,
+    joints: tuple[str, ...] = (),
+    operated: tuple[str, ...] = (),
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
+    effort_limit: tuple[str, ...] = (),
+    mounts: tuple[str, ...] = (),
+    packages: tuple[str, ...] = (),
+    rate: float = 50.0,
+    keyframe: str = "",
+    contacts: Flag = False,
+    name: str = "",
+    json: Json = False,
+) -> None:
+    """Make a robot folder from a vendor's MJCF or URDF, with the source of every number, and check it.
+
+    Args:
+        model: MJCF or URDF file, as it lies in its repository.
+        out: New robot folder.
+        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with an
+            actuator, or all hinges.
+        operated: Of these, the ones to be corrected; default all.
+        kp: Of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later wins.
+            Default: the model's actuators.
+        kd: Likewise, N·m·s/rad.
+        effort_limit: Likewise, N·m.
+        mounts: Where payloads go: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: found by name.
+        packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
+        rate: Of the commands, Hz.
+        keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
+        contacts: Let links touch as the model says.
+        name: Of the robot. Default: the file's.
+    """
+    from gaponet.view.portrait import prepare
+
+    prepare()
+    from gaponet.sim.setup.new import Wanted, new_robot
+
+    screen = Out(json)
+    made = new_robot(model, out, Wanted(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
+                                        contacts, name))  # fmt: skip
+    for note in made.notes:
+        screen.say(f"  {note}", "   note", "cyan")
+    for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source")):
+        screen.say(f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}", "   from", "cyan")
+    picture = None
+    try:
+        picture = _picture(made, model.name)
+    except (UsageError, ModuleNotFoundError) as error:
+        screen.say(f"  no picture: {error}", "   note", "cyan")
+    result = check_robot(screen, made.robot, None, ())
+    screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
+    screen.say(f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {_as_folder(out)} --out data")
+    screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
+
+
+def _picture(made: Made, label: str) -> Path:
+    """picture.png in the folder: the vendor's model beside ours, both at home."""
+    from gaponet.sim.model import build_model
+    from gaponet.view.still import still
+
+    path = made.robot.folder / "picture.png"
+    png = still([(label, made.vendor, made.pose), ("robot.xml", build_model(made.robot), made.robot.qpos_home)])
+    with whole(path) as temporary:
+        temporary.write_bytes(png)
+    return path
+
+
+def _as_folder(path: Path) -> str:
+    return str(path) if path.name != str(path) else f"./{path}"
+
+
+def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]) -> dict[str, Any]:
     """Step the robot; a broken one raises RobotError, a doubtful one gets warnings."""
     from gaponet.sim.model import model_hash
-    from gaponet.sim.setup.check import check_robot
+    from gaponet.sim.setup import check
 
     postures = None
     if dataset is not None:
@@ -99,7 +183,7 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None = None, payloads
         payloads = payloads or tuple(sorted({e.meta.payload_mass for e in data.entries}))
         rows = np.concatenate([data.read(e).qpos for e in data.entries])
         postures = rows[:: max(1, len(rows) // POSTURES)].astype(float)
-    findings = check_robot(spec, payloads or (0.0,), postures)
+    findings = check.check_robot(spec, payloads or (0.0,), postures)
     out.table(f"{spec.name}: {spec.description}; N·m/rad, N·m·s/rad, N·m, rad",
               ["joint", "operated", "kp", "kd", "limit", "range"], [
         [name, "yes" if name in spec.operated else "no", f"{spec.kp[i]:g}", f"{spec.kd[i]:g}",
@@ -123,8 +207,8 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None = None, payloads
     else:
         out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
     warnings = [f.message for f in findings if f.level in bad]
-    out.result(as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
-                                "findings": [vars(f) for f in findings]})  # fmt: skip
+    return as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
+                                "findings": [vars(f) for f in findings]}  # fmt: skip
 
 
 def as_dict(spec: RobotSpec) -> dict[str, Any]:
@@ -139,3 +223,16 @@ def as_dict(spec: RobotSpec) -> dict[str, Any]:
         ],
         "payload_mounts": [{"side": m.side, "body": m.body, "pos": m.pos} for m in spec.payload_mounts],
     }  # fmt: skip
+
+
+# Each is run while the command line is parsed; what is left to call is nothing.
+Action = (
+    Annotated[None, tyro.conf.subcommand("new", constructor=new)]
+    | Annotated[None, tyro.conf.subcommand("check", constructor=check)]
+    | Annotated[None, tyro.conf.subcommand("list", constructor=list_robots)]
+    | Annotated[None, tyro.conf.subcommand("link", constructor=link)]
+)
+
+
+def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+    """Make a robot folder from a vendor's model, check one, list the package's, or listen to one."""

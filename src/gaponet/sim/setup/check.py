@@ -24,6 +24,7 @@ RESTS = 0.05  # rad/s: faster in the last ten seconds, it does not rest
 CREEP = 1e-3  # rad in its second half
 SAG = 0.1  # rad
 GROWTH = 1e-3  # of a small motion in one physics step, beyond which it grows
+TURNS = 0.1  # rad a step: an unstable step turns a motion round, one that falls goes on
 POSTURES = 8  # at random, in which small motions are looked at
 ARMATURE = 1e-5  # kg·m²; less is none
 BURIED = 1e-4  # m inside each other: they collide
@@ -118,6 +119,9 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
         yield Finding(
             "note", "couplings", f"springs at {some(springs.tolist())}: stiffness in robot.xml", tuple(springs)
         )
+    if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
+        text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
+        yield Finding("warning", "couplings", text)
     if (model.body_gravcomp != 0).any():
         text = "gravcomp in robot.xml takes weight off bodies: right where the controller compensates gravity; else "
         yield Finding("note", "couplings", f"{text}delete it")
@@ -222,7 +226,7 @@ def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, arma
     values, vectors = np.linalg.eig(slopes)
     k = int(np.abs(values).argmax())
     joint = int(np.abs(vectors[: model.nv, k]).argmax())
-    return Growth(float(np.abs(values[k])), joint, bool(values[k].real < 0 or abs(values[k].imag) > 1e-9))
+    return Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > TURNS))
 
 
 def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
@@ -232,24 +236,30 @@ def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
     low, high = robot.qpos_range.T
     sim.reset(slice(None), np.clip(home + NUDGE, low, high), np.zeros_like(home), past=home[:, None])
     rows = round(SECONDS / robot.dt)
-    speed, fastest, middle = np.zeros_like(home), np.zeros_like(home), home
+    speed, full, middle = np.zeros_like(home), np.zeros(home.shape, bool), home
     for t in range(rows):
         sim.step(home)
-        with np.errstate(invalid="ignore"):
-            fastest = np.fmax(fastest, np.abs(sim.qvel))
-            if t >= rows * 5 // 6:
-                speed = np.fmax(speed, np.abs(sim.qvel))
+        if t >= rows * 5 // 6:
+            speed = np.fmax(speed, np.abs(sim.qvel))
+            full |= np.abs(sim.torque) > 0.999 * robot.effort_limit
         if t == rows // 2:
             middle = sim.qpos.copy()
     creep, sag = np.abs(sim.qpos - middle), np.abs(sim.qpos - home)
+    light = " where its armature is small: write armature = 0.003 or more in robot.xml"
+    swings = "check kp and kd; write more damping in robot.xml"
+    if (full & (speed > RESTS)).any():
+        swings = (
+            "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more then: write kd as "
+            "damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, or armature"
+        )
     quiet = True
     for what, amount, most, level, mend in (
-        ("does not come to rest: {:.2g} rad/s after a minute", speed, RESTS, "error", "see gains and timestep"),
-        ("creeps {:.2g} rad in half a minute of a hold", creep, CREEP, "warning", "write more damping or less kp"),
+        ("does not come to rest: {:.2g} rad/s after a minute", speed, RESTS, "error", swings),
+        ("creeps {:.2g} rad in half a minute of a hold", creep, CREEP, "warning", f"friction gives way{light}"),
         ("hangs {:.2g} rad from its target", sag, SAG, "note", "check kp and effort_limit against masses"),
     ):
         wrong = np.argwhere(~(amount <= most))
-        if not len(wrong) or (what.startswith("creeps") and not quiet):
+        if not len(wrong) or (level != "error" and not quiet):
             continue
         quiet = False
         p, j = max(wrong, key=lambda k: float(np.nan_to_num(amount[*k], nan=np.inf)))
