@@ -65,6 +65,7 @@ class RobotSpec:
         encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
         servos: Type of each joint's servo, (n); None where robot.toml does not say.
         tips, table: What may touch a table, and the table; with one nothing else touches.
+        carries_payload: Whether the simulator has the payload that the robot has.
         contacts: Whether links touch as the MJCF says. Off, nothing touches but tips a table: links welded to the world
             collide for ever with their neighbours, which shows as a gap.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
@@ -103,6 +104,7 @@ class RobotSpec:
     tips: tuple[Tip, ...] = ()
     table: Table | None = None
     contacts: bool = False
+    carries_payload: bool = True
     nominal: RobotSpec | None = None
 
     def __post_init__(self) -> None:
@@ -304,6 +306,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         tips=table.tip,
         table=table.table,
         contacts=table.contacts,
+        carries_payload=table.carries_payload,
     )
     found = table.identified_table
     if (robot.table or found) and not robot.tips:

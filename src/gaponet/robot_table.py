@@ -104,6 +104,7 @@ class RobotTable:
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None
     contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
+    carries_payload: bool = True  # false: the robot's payload is not in the simulator
     identified: dict[str, Servo] = field(default_factory=dict)
     identified_table: Table | None = None
     description: str = ""

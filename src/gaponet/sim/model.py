@@ -149,6 +149,7 @@ def model_hash(robot: RobotSpec) -> str:
     if "_model_hash" not in vars(robot):
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
+            *([] if robot.carries_payload else ["carries no payload"]),
             *lines(build_model(robot)),
         ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
@@ -252,7 +253,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         raise RobotError(f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg")
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch steps them together.
-        carried = mass if side in ("both", mount.side) else 0.0
+        carried = mass if robot.carries_payload and side in ("both", mount.side) else 0.0
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:

@@ -95,6 +95,6 @@ def told(own: Own, rivals: Rivals, family: str) -> tuple[Table, list[str]]:
     ahead = sum(min(x.mean for x in r[1 + len(beside) :]) < min(x.mean for x in r[1 : 1 + len(beside)]) for r in each)
     verdict = (
         f"Trained in the family {family}, {theirs}: {text(shares[theirs])} of the simulators' own error is left; "
-        f"without one, {best}: {text(shares[best])}. The best of the family is ahead in {ahead} of {len(own)} simulators."
+        f"without one, {best}: {text(shares[best])}. The best of the family is ahead in {ahead} of {len(own)}."
     )
     return Table("family", ("simulator", *beside, *models.values()), tuple(rows), note), [verdict]

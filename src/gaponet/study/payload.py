@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
@@ -42,6 +43,9 @@ class Payload:
     """kg left out on the outside; default the heaviest."""
     holdout_units: tuple[str, ...] = ()
     """Units never trained on."""
+    simulator_payload: Literal["told", "none"] = "told"
+    """told: the simulator has the robot's payload. none: it does not, as where nobody wrote it into the MJCF; only the
+    payload between the others is then left out, and more stands beside."""
 
     def left_out(self, data: Dataset) -> tuple[LeftOut, LeftOut]:
         """The payload between others and the one beyond all others.
@@ -63,13 +67,22 @@ class Payload:
             raise UsageError(f"--beyond {outer:g}: is not the lightest or heaviest of {data.path}, {known} kg")
         return LeftOut("between", inner), LeftOut("beyond", outer)
 
+    def prepared(self, study: Study) -> Study:
+        """The study in the simulator that is asked about."""
+        if self.simulator_payload == "told":
+            return study
+        return replace(study, robot=replace(study.robot, carries_payload=False))
+
     def cells(self, study: Study) -> list[Cell]:
         """Trained on all payloads, and without each one asked about; each also without payload input."""
-        return study.cells([ALL, ALL + BLIND, *(w for q in self.left_out(study.data) for w in q.words)])
+        return study.cells([ALL, ALL + BLIND, *(w for q in self._asked(study.data) for w in q.words)])
+
+    def _asked(self, data: Dataset) -> tuple[LeftOut, ...]:
+        return self.left_out(data)[: 2 if self.simulator_payload == "told" else 1]
 
     def result(self, study: Study, found: Found) -> Result:
         """Error by payload, a row per model."""
-        asked = self.left_out(study.data)
+        asked = self._asked(study.data)
         masses = sorted({e.meta.payload_mass for e in study.data.entries})
         error = {name: [_at(found, name, m) for m in masses] for name in BASELINES}
         error |= {word: [_at(found, word, m) for m in masses] for word, _ in found.runs}

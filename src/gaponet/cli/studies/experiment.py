@@ -66,6 +66,8 @@ def _ask(kind: type[Any], dataset: Path, out: Path, question: Any, options: Opti
         _play(question, data, robot, out, options)
         return
     study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
+    if isinstance(question, Payload):
+        study = question.prepared(study)
     if kind in (Compare, Simulators):
         study = _prepared(question, study)
     _carry_out(question, study, options.json)
