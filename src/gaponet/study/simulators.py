@@ -22,8 +22,8 @@ from gaponet.plot.charts import bars
 from gaponet.plot.methods import colour, shade, title
 from gaponet.plot.table import Spread, Table
 from gaponet.sim.model import model_hash
-from gaponet.study import family
 from gaponet.study.found import Found as Cells
+from gaponet.study.played import family
 from gaponet.study.played.kept import KeptParts
 from gaponet.study.played.simulators import (
     CHANGES,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gaponet.study.family import told, words
+from gaponet.study.played.family import told, words
 from gaponet.study.played.simulators import CHANGES
 
 
