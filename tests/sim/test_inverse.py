@@ -5,7 +5,7 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Inertia, Period, mean_before
+from gaponet.sim.inverse import ClosedForm, Inertia, Period, within
 from gaponet.sim.model import build_model
 from gaponet.training.inverse import inverse_targets
 
@@ -47,13 +47,14 @@ def test_it_is_the_label_of_the_warm_start(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 10])
-def test_the_mean_of_positions_before_steps_of_parabolic_speeds(count):
+def test_positions_and_speeds_within_a_period_of_parabolic_speeds(count):
     h, i = 0.005, np.arange(count + 1)
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
-    first, last, whole = mean_before(count)
-    mean = h * (first * speed[0] + last * speed[-1]) + whole * position[-1]
-    assert mean == pytest.approx(position[:-1].mean(), abs=1e-12)
+    known = np.array([h * speed[0], h * speed[-1], position[-1]])
+    before, speeds = (weights @ known for weights in within(count, 12))
+    np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
+    np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
 
 
 def test_inertia_is_mujocos(tmp_path):

@@ -136,13 +136,14 @@ class SceneCopies:
         """The scene is here now."""
         self.seen = data
 
-    def __call__(self, targets: Array) -> tuple[Array, Array]:
-        """Targets (k, 1, n) rad → next qpos and qvel, each (k, 1, n)."""
+    def __call__(self, targets: Array, speeds: Array) -> tuple[Array, Array]:
+        """Targets (k, 1, n) rad, from speeds (1, n) rad/s → next qpos and qvel, each (k, 1, n)."""
         qpos, qvel = np.empty_like(targets), np.empty_like(targets)
         state = np.empty(mujoco.mj_stateSize(self.scene, STATE))
         mujoco.mj_getState(self.scene, self.seen, state, STATE)
         for k, target in enumerate(targets[:, 0]):
             mujoco.mj_setState(self.scene, self.copy, state, STATE)
+            self.copy.qvel[self.qvel] = speeds[0]
             self.copy.ctrl[self.actuator] = target
             mujoco.mj_step(self.scene, self.copy, self.steps)
             qpos[k, 0], qvel[k, 0] = self.copy.qpos[self.qpos], self.copy.qvel[self.qvel]

@@ -171,9 +171,10 @@ def of_simulator(
     copies = BatchSim(replace(robot, table=None), [c for _ in PROBES for c in conditions], nthread, locked)
     ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
 
-    def answer(targets: Array) -> tuple[Array, Array]:
+    def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
         asked = np.arange(len(targets) * sim.num_envs)
         copies.set_state({name: np.concatenate([x] * len(PROBES)) for name, x in sim.state().items()})
+        copies.qvel[:] = np.concatenate([qvel] * len(PROBES))
         told = np.zeros((copies.num_envs, copies.n))
         told[asked] = targets.reshape(len(asked), -1)
         for _ in range(1 + ahead):

@@ -1,13 +1,12 @@
 """The inverse of a simulator: the position targets, held for a control period, that lead it along a given motion.
 
 In closed form where the simulator's numbers are known: the mean torque that the period asks for is inverse dynamics at
-its mean acceleration and the mean of the states at which physics steps begin, q̄ among them; the position actuator's is
-kp·(u + offset − q̄) − kd·v̄, v̄ the mean speed. What is left is how torques vary within a period.
+its mean acceleration and the mean of the states at which physics steps begin; the position actuator's is the mean of
+kp·(u + offset − q) − kd·v over the physics steps, each as much as the motor can give. What is left is how torques vary
+within a period.
 
-By answers where it is a black box: it is asked where seven targets would lead it, what lies between two of them is
-interpolated, asked again and mended. All joints are asked at once, in proportions in which they do not pull at each
-other: where a forearm swings, moving the shoulder alone moves the elbow the other way, and the interpolation diverges
-(docs/log.md). How they pull is asked too, of one joint in each period.
+By answers where it is a black box: it is asked where seven targets would lead it, all joints at once; what lies between
+two of them is interpolated, asked again and mended.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from gaponet.sim.servo import friction_limit
 
 PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before
 ALIKE, TRIED = 1e-4, 32  # rad: two simulators are one where targets of so many motions differ by less
-MENDED, FINE = 2, 0.02  # times what was interpolated is mended, by so many rad at most
-ALONE = 0.1  # rad: by which one joint is asked alone
-FLAT, STANDS = 1e-3, 0.3  # of an answer over a target; the same as a share of what it was: below it a joint stands
+MENDED, FINE = 2, 0.1  # times what was interpolated is mended, by so many rad at most
+ALONE, SLIDING = 1e-3, 0.5  # rad by which one joint is asked alone, rad/s at which all of them slide then
+FLAT, STANDS, LEAST = 0.05, 0.1, 1e-4  # of an answer over a target; a share of what it was, and at first
 SAME = 1e-6  # rad: answers that differ by less are the same, as within a friction band
 
-Answer = Callable[[Array], tuple[Array, Array]]  # targets (7, num, n) rad → next qpos, qvel, each (7, num, n)
+Answer = Callable[[Array, Array], tuple[Array, Array]]  # targets (≤ 7, num, n) rad, qvel (num, n) → next qpos, qvel, each (7, num, n)
 
 
 @dataclass(frozen=True)
@@ -102,14 +101,15 @@ class ClosedForm:
         bias = _own(batch, model, "actuator_biasprm")[:, act]
         self.kp, self.kd = _own(batch, model, "actuator_gainprm")[:, act, 0], -bias[..., 2]
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
-        limited = model.actuator_forcelimited[act].astype(bool)[:, None]
-        self.low, self.high = np.where(limited, model.actuator_forcerange[act], [-np.inf, np.inf]).T
+        self.low, self.high = most_torque(model, joints, act)
         self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
         self.law = dict(zip(LAW, model.actuator_user[act].T, strict=True)) if model.nuser_actuator == len(LAW) else None
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        self.weights = np.array([mean_before(int(n)) for n in nstep]).T[:, :, None]
+        before, speeds = zip(*(within(int(n), int(nstep.max())) for n in nstep), strict=True)
+        self.before, self.speeds = (np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds))
+        self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep  # of each physics step, (steps, num)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
         self.bias, self.passive = batch.bind("qfrc_bias"), batch.bind("qfrc_passive")
         self.inertia = Inertia(batch, model, self.dof)
@@ -140,13 +140,26 @@ class ClosedForm:
 
     def _held(self, period: Period) -> Array:
         way, gain = period.next_qpos - period.qpos, period.next_qvel - period.qvel
-        first, last, whole = self.weights
-        qpos = period.qpos + self.h * (first * period.qvel + last * period.next_qvel) + whole * way
-        after = way / self.dt  # the mean of the speeds after each physics step, and before
-        before = after - gain * self.h / self.dt
-        torque = self._torque(qpos, before, gain / self.dt, period.friction) + self.damping * (after - before)
-        force = np.clip(torque + self.kd * (before if self.explicit else after), self.low, self.high)
-        return qpos + force / self.kp - self.offset
+        known = np.stack([self.h * period.qvel, self.h * period.next_qvel, way])
+        qpos = period.qpos + np.einsum("ibkx,bkj->ikj", self.before, known)  # at which physics steps begin
+        before = np.einsum("ibkx,bkj->ikj", self.speeds, known) / self.h
+        after, mean = before[1:], lambda x: np.einsum("ik,ikj->kj", self.share, x)
+        torque = self._torque(mean(qpos), mean(before[:-1]), gain / self.dt, period.friction)
+        torque += self.damping * (mean(after) - mean(before[:-1]))
+        back = self.kp * (qpos - self.offset) + self.kd * (before[:-1] if self.explicit else after)
+        return self._told(np.clip(torque, self.low, self.high), back, mean)
+
+    def _told(self, torque: Array, back: Array, mean: Callable[[Array], Array]) -> Array:
+        """Targets (num, n) whose kp·u − back, (steps, num, n), is torque (num, n) in the mean, limited step by step."""
+        out = (torque + mean(back)) / self.kp
+        for _ in range(len(back)):
+            asked = self.kp * out - back
+            given = np.clip(asked, self.low, self.high)
+            if (given == asked).all():
+                break
+            free = np.maximum(mean((given == asked).astype(float)), 1 / len(back))
+            out = out + (torque - mean(given)) / (self.kp * free)
+        return out
 
     def _torque(self, qpos: Array, qvel: Array, qacc: Array, friction: Array) -> Array:
         self.qpos[:, self.at], self.qvel[:, self.dof] = qpos, qvel
@@ -177,13 +190,17 @@ def alike(one: ClosedForm, other: ClosedForm, limits: Array) -> bool:
 
 
 class Probed:
-    """Targets by the simulator's own answers."""
+    """Targets by the simulator's own answers.
+
+    Joints pull at each other, and each has a friction band and a most torque of its own. So how answers rise over
+    targets where all joints move and no motor is at its limit is asked of one joint in each period, and with it what an
+    answer misses is told in rad of each joint's own target: there, a joint at its limit is nobody else's concern.
+    """
 
     def __init__(self, answer: Answer, dt: Array | float, ahead: int = 0) -> None:
         """
         Args:
-            answer: Where targets, held, would lead each robot, in free space: a target is not pushed through what it
-                touches.
+            answer: Where targets, held, would lead each robot, from where it is, at speeds that are given; in free space: a target is not pushed through what it touches.
             dt: Control period, s, one or (num, 1).
             ahead: Control periods after the coming one at whose end is answered, because servos are late.
         """
@@ -198,44 +215,42 @@ class Probed:
         """
         period, n = periods[-1], near.shape[1]
         if self._slope is None:
-            self._slope = np.tile(np.eye(n), (len(near), 1, 1)) * FLAT
-            self._ask_alone(near, self._missed(near[None], period)[0], period, range(n))
-        pull = np.linalg.inv(self._slope)
-        pull /= np.abs(pull).max(axis=1, keepdims=True)  # on a joint for another
-        missed = self._missed(near + PROBES[:, None, None] * pull.sum(axis=2), period)
-        found, slope = _crossing(_rising(missed))
-        out = near + np.einsum("kij,kj->ki", pull, found)
-        left, more, moves = missed[0], np.zeros_like(found), slope > FLAT
-        told, lefts = [near], [missed[len(PROBES) // 2]]
+            self._slope = np.tile(np.eye(n), (len(near), 1, 1)) * LEAST
+            self._ask_alone(periods[0], range(n))
+        self._ask_alone(periods[0], [self._turn])
+        self._turn = (self._turn + 1) % n
+        own = np.linalg.inv(self._slope)
+
+        def missed(targets: Array) -> Array:
+            qpos, qvel = self.answer(targets, periods[0].qvel)
+            return np.einsum("kij,pkj->pki", own, qpos - period.next_qpos + self.dt * (qvel - period.next_qvel))
+
+        probed = missed(near + PROBES[:, None, None])
+        found, slope = _crossing(_rising(probed))
+        out, left, more, moves = near + found, probed[len(PROBES) // 2], found, slope > FLAT
+        told, lefts = [near], [left]
         for _ in range(1 + MENDED):
-            before, left = left, self._missed(out[None], period)[0]
+            before, left = left, missed(out[None])[0]
             told.append(out)
             lefts.append(left)
             steps = np.abs(more) > SAME
             slope = np.maximum(slope, np.divide(left - before, more, out=slope.copy(), where=steps))
             more = np.where(moves, np.clip(-left / np.maximum(slope, FLAT), -FINE, FINE), 0.0)
-            out = out + np.einsum("kij,kj->ki", pull, more)
-        self._ask_alone(near, lefts[0], period, [self._turn])
-        self._turn = (self._turn + 1) % n
-        best = np.abs(lefts).max(axis=2).argmin(axis=0)  # where motors give all they can, mending may make it worse
+            out = out + more
+        best = np.abs(lefts).sum(axis=2).argmin(axis=0)
         return np.array(told)[best, np.arange(len(near))]
 
-    def _ask_alone(self, near: Array, missed: Array, period: Period, joints: Iterable[int]) -> None:
-        """How all joints answer to one; where it stands, by friction or at a limit, what was known stays.
-
-        It is asked towards where it is, away from what its motor can give at most.
-        """
+    def _ask_alone(self, period: Period, joints: Iterable[int]) -> None:
+        """How all joints answer to one, while all slide, the way they go, under little torque."""
         assert self._slope is not None
+        sliding = np.where(period.next_qpos < period.qpos, -SLIDING, SLIDING)
         for j in joints:
-            told, step = near.copy(), np.where(near[:, j] > period.qpos[:, j], -ALONE, ALONE)
-            told[:, j] += step
-            slope = (self._missed(told[None], period)[0] - missed) / step[:, None]
-            moves = slope[:, j] > np.maximum(FLAT, STANDS * self._slope[:, j, j])
+            both = np.stack([period.qpos, period.qpos])
+            both[1, :, j] += ALONE
+            qpos, qvel = self.answer(both, sliding)
+            slope = np.subtract(*(qpos + self.dt * qvel)[::-1]) / ALONE
+            moves = slope[:, j] > STANDS * self._slope[:, j, j]
             self._slope[moves, :, j] = slope[moves]
-
-    def _missed(self, targets: Array, period: Period) -> Array:
-        qpos, qvel = self.answer(targets)
-        return qpos - period.next_qpos + self.dt * (qvel - period.next_qvel)
 
 
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:
@@ -264,25 +279,35 @@ def _crossing(missed: Array) -> tuple[Array, Array]:
     low, high = (np.take_along_axis(missed, i[None], axis=0)[0] for i in (above - 1, above))
     rise, wide = np.maximum(high - low, 1e-15), PROBES[above] - PROBES[above - 1]
     passed = (low < -SAME) & (high > SAME)
-    best = np.abs(missed) <= np.abs(missed).min(axis=0) + SAME
-    least = np.where(best, np.abs(PROBES)[:, None, None], np.inf).argmin(axis=0)
+    least = (np.abs(missed) + FLAT * np.abs(PROBES)[:, None, None]).argmin(axis=0)
     return np.where(passed, PROBES[above - 1] - low / rise * wide, PROBES[least]), rise / wide
 
 
-def mean_before(count: int) -> tuple[float, float, float]:
-    """The mean of the positions before each of `count` physics steps of h, from what is known at a period's ends.
+def within(count: int, rows: int) -> tuple[Array, Array]:
+    """Positions before each of `count` physics steps of h, and speeds, from what is known at a period's ends.
 
     Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
 
     Returns:
-        Weights of h·q̇ at the start, of h·q̇ at the end, and of the way; they add up to what is between that mean and the
-        position at the start.
+        Weights of h·q̇ at the start, of h·q̇ at the end, and of the way: of positions beyond the first, (rows, 3), and of
+        h·speeds from the first to that after the last step, (rows + 1, 3). Rows beyond the period are zero.
     """
-    i = np.arange(1.0, count + 1)
+    i = np.arange(count + 1.0)
     shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])  # α, β of v = v_0 + α i + β i²
-    reached = np.cumsum([i**0, i, i**2], axis=1)[:, :-1].sum(axis=1) / count
-    last, whole = reached[1:] @ shape
-    return float(reached[0] - last - count * whole), float(last), float(whole)
+    known = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
+    speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
+    speeds[: count + 1] = np.stack([i, i**2], axis=1) @ known + [1.0, 0.0, 0.0]
+    before[1:count] = speeds[1:count].cumsum(axis=0)
+    return before, speeds
+
+
+def most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
+    """The least and the most that motors give, (2, n) N·m; ±inf where there is no limit."""
+    at = np.array([model.joint(name).id for name in joints])
+    limits = [(model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
+              (model.jnt_actfrclimited[at], model.jnt_actfrcrange[at])]  # fmt: skip
+    low, high = zip(*(np.where(limited[:, None], both, [-np.inf, np.inf]).T for limited, both in limits), strict=True)
+    return np.array([np.max(low, axis=0), np.min(high, axis=0)])
 
 
 def position_actuator(model: mujoco.MjModel, joint: str) -> int:
