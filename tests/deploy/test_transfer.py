@@ -71,6 +71,18 @@ def test_it_moves_as_the_reference_with_its_operator(robot, model, factors, how)
 
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
+def test_it_follows_where_motors_give_all_they_can(tmp_path, how):
+    weak, strong = (
+        write_arm(tmp_path / limit, TOML.replace("effort_limit = 5.0", f"effort_limit = {limit}"))
+        for limit in ("1.0", "5.0")
+    )
+    there, target = follow(AlignedSim(weak, None, 0.2)), other(weak, kp=3.0)
+    assert np.abs(follow(AlignedSim(strong, None, 0.2)) - there).max() > 0.05
+    alone, given = (np.abs(follow(AlignedSim(target, like, 0.2, inverse=how)) - there).mean() for like in (None, weak))
+    assert given < 0.1 * alone
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
 def test_a_payload_that_the_simulator_does_not_know_of(robot, model, how):
     there = follow(AlignedSim(robot, model, 0.2))
     sim = AlignedSim(robot, model, 0.2, simulator_payload=0.0, inverse=how)

@@ -165,16 +165,17 @@ class TransferCorrector:
 def of_simulator(
     sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
 ) -> ClosedForm | Probed:
-    """The inverse of a batch of robots; by answers, seven copies of each, without the table, step ahead."""
+    """The inverse of a batch of robots; by answers, copies of each, without the table, step ahead."""
     if how == "closed":
         return ClosedForm.of(BatchSim(robot, conditions, nthread, locked))
-    copies = BatchSim(replace(robot, table=None), [c for _ in PROBES for c in conditions], nthread, locked)
+    count = max(len(PROBES), 1 + sim.n)
+    copies = BatchSim(replace(robot, table=None), conditions * count, nthread, locked)
     ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
 
     def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
         asked = np.arange(len(targets) * sim.num_envs)
-        copies.set_state({name: np.concatenate([x] * len(PROBES)) for name, x in sim.state().items()})
-        copies.qvel[:] = np.concatenate([qvel] * len(PROBES))
+        copies.set_state({name: np.concatenate([x] * count) for name, x in sim.state().items()})
+        copies.qvel[:] = np.tile(qvel, (count, 1))
         told = np.zeros((copies.num_envs, copies.n))
         told[asked] = targets.reshape(len(asked), -1)
         for _ in range(1 + ahead):

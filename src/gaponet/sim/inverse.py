@@ -11,7 +11,7 @@ two of them is interpolated, asked again and mended.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 
@@ -27,12 +27,13 @@ from gaponet.sim.servo import friction_limit
 
 PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before
 ALIKE, TRIED = 1e-4, 32  # rad: two simulators are one where targets of so many motions differ by less
+NARROW, WIDE = 0.1, 3.0  # as a share of these at least, and so many times what is missing
 MENDED, FINE = 2, 0.1  # times what was interpolated is mended, by so many rad at most
-ALONE, SLIDING = 1e-3, 0.5  # rad by which one joint is asked alone, rad/s at which all of them slide then
-FLAT, STANDS, LEAST = 0.05, 0.1, 1e-4  # of an answer over a target; a share of what it was, and at first
+ALONE, SLIDING = 1e-3, 0.5  # rad by which a joint is asked alone, and rad/s at which all of them slide then
+FLAT, LEAST, STANDS = 0.05, 1e-4, 0.1  # of an answer over a target: none, least, least of what it was
 SAME = 1e-6  # rad: answers that differ by less are the same, as within a friction band
 
-Answer = Callable[[Array, Array], tuple[Array, Array]]  # targets (≤ 7, num, n) rad, qvel (num, n) → next qpos, qvel, each (7, num, n)
+Answer = Callable[[Array, Array], tuple[Array, Array]]  # targets (k, num, n) rad, qvel (num, n) → next qpos, qvel
 
 
 @dataclass(frozen=True)
@@ -192,65 +193,61 @@ def alike(one: ClosedForm, other: ClosedForm, limits: Array) -> bool:
 class Probed:
     """Targets by the simulator's own answers.
 
-    Joints pull at each other, and each has a friction band and a most torque of its own. So how answers rise over
-    targets where all joints move and no motor is at its limit is asked of one joint in each period, and with it what an
-    answer misses is told in rad of each joint's own target: there, a joint at its limit is nobody else's concern.
+    Joints pull at each other, and each has a friction band and a most torque of its own. So it is asked in each period
+    how all joints answer to each one, while all slide and no motor is near its limit; and what an answer misses is told
+    in rad of each joint's own target: there, a joint at its limit is nobody else's concern.
     """
 
     def __init__(self, answer: Answer, dt: Array | float, ahead: int = 0) -> None:
         """
         Args:
-            answer: Where targets, held, would lead each robot, from where it is, at speeds that are given; in free space: a target is not pushed through what it touches.
+            answer: Where targets, held, would lead each robot, from where it is, with speeds that are given; in free
+                space: a target is not pushed through what it touches.
             dt: Control period, s, one or (num, 1).
             ahead: Control periods after the coming one at whose end is answered, because servos are late.
         """
         self.answer, self.dt, self.ahead = answer, dt, ahead
         self._slope: Array | None = None  # of each joint's answer over each joint's target, (num, n, n)
-        self._turn = 0  # the joint that is asked alone next
 
     def __call__(self, periods: ListOf[Period], near: Array) -> Array:
         """Targets (num, n) rad that lead to where the period ends, the nearest to `near` among those that do so.
 
         Position and speed at the end count together, q + q̇·dt: the speed alone would drift, the position alone ring.
         """
-        period, n = periods[-1], near.shape[1]
-        if self._slope is None:
-            self._slope = np.tile(np.eye(n), (len(near), 1, 1)) * LEAST
-            self._ask_alone(periods[0], range(n))
-        self._ask_alone(periods[0], [self._turn])
-        self._turn = (self._turn + 1) % n
-        own = np.linalg.inv(self._slope)
+        period, own = periods[-1], np.linalg.inv(self._slopes(periods[0]))
 
         def missed(targets: Array) -> Array:
             qpos, qvel = self.answer(targets, periods[0].qvel)
             return np.einsum("kij,pkj->pki", own, qpos - period.next_qpos + self.dt * (qvel - period.next_qvel))
 
-        probed = missed(near + PROBES[:, None, None])
-        found, slope = _crossing(_rising(probed))
-        out, left, more, moves = near + found, probed[len(PROBES) // 2], found, slope > FLAT
+        left = missed(near[None])[0]
+        wide = np.clip(WIDE * np.abs(left) / PROBES[-1], NARROW, 1.0)
+        asked = PROBES[PROBES != 0, None, None] * wide
+        probed = np.insert(missed(near + asked), len(PROBES) // 2, left, axis=0)
+        more, slope = _crossing(_rising(probed / wide))
+        more, moves = more * wide, slope > FLAT
         told, lefts = [near], [left]
         for _ in range(1 + MENDED):
-            before, left = left, missed(out[None])[0]
-            told.append(out)
-            lefts.append(left)
+            told.append(told[-1] + more)
+            lefts.append(missed(told[-1][None])[0])
             steps = np.abs(more) > SAME
-            slope = np.maximum(slope, np.divide(left - before, more, out=slope.copy(), where=steps))
-            more = np.where(moves, np.clip(-left / np.maximum(slope, FLAT), -FINE, FINE), 0.0)
-            out = out + more
+            slope = np.maximum(slope, np.divide(lefts[-1] - lefts[-2], more, out=slope.copy(), where=steps))
+            more = np.where(moves, np.clip(-lefts[-1] / np.maximum(slope, FLAT), -FINE, FINE), 0.0)
         best = np.abs(lefts).sum(axis=2).argmin(axis=0)
         return np.array(told)[best, np.arange(len(near))]
 
-    def _ask_alone(self, period: Period, joints: Iterable[int]) -> None:
-        """How all joints answer to one, while all slide, the way they go, under little torque."""
-        assert self._slope is not None
-        sliding = np.where(period.next_qpos < period.qpos, -SLIDING, SLIDING)
-        for j in joints:
-            both = np.stack([period.qpos, period.qpos])
-            both[1, :, j] += ALONE
-            qpos, qvel = self.answer(both, sliding)
-            slope = np.subtract(*(qpos + self.dt * qvel)[::-1]) / ALONE
-            moves = slope[:, j] > STANDS * self._slope[:, j, j]
-            self._slope[moves, :, j] = slope[moves]
+    def _slopes(self, period: Period) -> Array:
+        """How all joints answer to each, (num, n, n); of one that does not move, what was known stays."""
+        n = period.qpos.shape[1]
+        if self._slope is None:
+            self._slope = np.tile(np.eye(n), (len(period.qpos), 1, 1)) * LEAST
+        told = period.qpos + ALONE * np.concatenate([np.zeros((1, n)), np.eye(n)])[:, None]
+        qpos, qvel = self.answer(told, np.where(period.next_qpos < period.qpos, -SLIDING, SLIDING))
+        reached = qpos + self.dt * qvel
+        slope = ((reached[1:] - reached[0]) / ALONE).transpose(1, 2, 0)
+        moves = np.einsum("kjj->kj", slope) > STANDS * np.einsum("kjj->kj", self._slope)
+        self._slope = np.where(moves[:, None], slope, self._slope)
+        return self._slope
 
 
 def _own(batch: Batch, model: mujoco.MjModel, name: str) -> Array:

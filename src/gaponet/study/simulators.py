@@ -122,7 +122,7 @@ class Runs:
                 own = Simulator("", simulator_of(reference))
                 ways: list[tuple[str, Simulator, How]] = [("own", own, "as it is")]
                 ways += [("as it is", at, "as it is")] if word == NOMINAL else []
-                ways += [(how, at, how) for how in WAYS if how == "closed" or not seed]
+                ways += [(how, at, how) for how in WAYS if how == "closed" or (word == BOTH and not seed)]
                 for way, there, how in ways:
                     name = way if way == "as it is" else f"{way} {word}"
                     seeds.setdefault(name, []).append(self._error(there, laden, word, seed, how))
@@ -192,10 +192,11 @@ def _way(way: str) -> str:
 def _shares(free: Found) -> Table:
     """A row per simulator: its own error, and what each way leaves of it."""
     references = [way.removeprefix("own ") for way in next(iter(free.values())) if way.startswith("own ")]
-    ways = ["as it is", *(f"{how} {word}" for word in references for how in ("own", *WAYS))]
-    heads = [f"nominal + {title(NOMINAL)} as it is"]
+    ways, heads = ["as it is"], [f"nominal + {title(NOMINAL)} as it is"]
     for word in references:
-        heads += [f"{_name(word)}: at home", *WAYS.values()]
+        found = [how for how in WAYS if f"{how} {word}" in next(iter(free.values()))]
+        ways += [f"{how} {word}" for how in ("own", *found)]
+        heads += [f"{_name(word)}: at home", *(WAYS[how] for how in found)]
     rows = [(name, _mean(e["uncorrected"]), *(share(e[w], e["uncorrected"]) for w in ways)) for name, e in free.items()]
     inside = [e for name, e in free.items() if name in CHANGES]
     joined = {w: np.mean([np.array(e[w]) for e in inside], axis=0).tolist() for w in ("uncorrected", *ways)}
