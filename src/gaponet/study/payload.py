@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
@@ -11,6 +11,7 @@ from gaponet.plot.charts import lines
 from gaponet.plot.methods import colour, shade, title
 from gaponet.plot.table import Spread, Table, compared
 from gaponet.study.found import Found
+from gaponet.study.played.unladen import HELD, Beside, beside
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
@@ -108,14 +109,41 @@ class Payload:
             panels.append((f"{q.payload:g} kg left out, {q.name} the others\n{study.who}", drawn))
         figure = lines(panels, ("payload per hand, kg", "MPJAE, mrad"), [(m, f"{m:g}") for m in masses],
                        marked=[q.payload for q in asked])  # fmt: skip
-        said = [s for q in asked if (s := _sentence(q, found))]
-        return found.result(study, "payload", "Payloads never trained on", [table], {"payload": figure}, said)
+        said, tables, name = [s for q in asked if (s := _sentence(q, found))], [table], "Payloads never trained on"
+        if self.simulator_payload == "none":
+            told = {w: titles[w] for w in (ALL, asked[0].words[0]) if w in error}
+            more, moving, best = _unladen(beside(study, found, told, ALL + BLIND), masses)
+            tables = [replace(table, rows=table.rows + more), moving]
+            said, name = [best, *said], "Payloads that the simulator does not have"
+        return found.result(study, "payload", name, tables, {"payload": figure}, said)
 
 
 def _at(found: Found, method: str, mass: float) -> Spread:
     """Error of a model or a baseline at a payload, mrad."""
     path = "known", "by_payload", f"{mass:g}", "mpjae"
     return found.base(method, *path) if method in BASELINES else found.spread(method, *path)
+
+
+def _unladen(found: Beside, masses: list[float]) -> tuple[tuple[tuple[Any, ...], ...], Table, str]:
+    """More rows of the table of payloads, a table of payloads that come and go, and what is best."""
+    rows = tuple((name, *(by[m] for m in masses)) for name, by in found.rows.items() if by)
+    heading = f"{HELD:g} kg picked up and put down: MPJAE, mrad"
+    moving = tuple((name, _over_motions(errors)) for name, errors in found.moving.items())
+    note = (
+        "VIRTUAL units play the test motions; hands are filled after a third and emptied after two, or reversed. Mean "
+        "± standard error over motions and units, first seed. Told is the mass of the moment."
+    )
+    means = {name: sum(s.mean for s in by.values()) / len(by) for name, by in found.rows.items() if by}
+    best = min(means, key=lambda name: means[name])
+    said = (
+        f"Where nobody tells a mass at run time, or no model is trained, {best} leaves least: {means[best]:.2f} mrad."
+    )
+    return rows, Table("moving", ("method", heading), moving, note), said
+
+
+def _over_motions(errors: list[float]) -> Spread:
+    found = Spread.of(errors)
+    return Spread(found.mean, found.error, found.count)
 
 
 def _sentence(asked: LeftOut, found: Found) -> str:
