@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import ClassVar, Literal
 
@@ -59,17 +59,16 @@ class Simulators:
     """Units never trained on."""
     seconds: float = 0.0
     """Of each motion, from its start; 0 for whole motions."""
-    family: str = ""
-    """Also train models in this family of simulators, 768 members each: a .toml file, or wide."""
     identify: ClassVar[bool] = True
 
     def cells(self, study: Study) -> list[Cell]:
-        """The operator on the nominal simulator, and on the identified one."""
+        """The operator on the nominal simulator and on the identified one; with --family, models trained in that."""
         if study.robot.nominal is not None:
             raise UsageError(
                 "gaponet experiment simulators identifies by itself; leave out --robot, or give a nominal one"
             )
-        return study.cells([NOMINAL, BOTH]) + (family.cells(study, self.family) if self.family else [])
+        many, study = study.config.family, replace(study, config=replace(study.config, family=""))
+        return study.cells([NOMINAL, BOTH]) + (family.cells(study, many) if many else [])
 
     def result(self, study: Study, found: Cells) -> Result:
         """Shares of each simulator's own error, what transfer adds to its reference's, contact, cost."""
@@ -79,9 +78,9 @@ class Simulators:
         figure = bars([_label(name) for name in free], _bars(free), axis, heading)
         tables = [_shares(free), _added(free), _touching(touching), runs.cost()]
         said = _sentences(free, touching)
-        if self.family:
-            own = family.errors_of(study, found, self.family, runs.sequences, runs.simulators)
-            table, more = family.told(own, _rivals(free), self.family)
+        if study.config.family:
+            own = family.errors_of(study, found, study.config.family, runs.sequences, runs.simulators)
+            table, more = family.told(own, _rivals(free), study.config.family)
             tables, said = [tables[0], table, *tables[1:]], said + more
         return found.result(
             study, "simulators", "Simulators that no model was trained in",
