@@ -2,9 +2,9 @@
 
     python benchmarks/ppo.py WORK --logs LOGS [--seeds 3] [--steps 2000000] [--arms real-warm real-identified …]
 
-An arm trains three seeds: warm, in the nominal simulator from six rounds of the supervised start on; identified, in the
-identified simulator from the untrained operator on. The virtual arms are those of virtual_h1_2.py, fleet `hard`, tested on a
-unit never seen. Curves are of validation motions at gain 1; test motions are played once, by the best on validation.
+An arm trains three seeds: warm, in the nominal simulator from six rounds of the supervised start on; identified, in
+the identified simulator from the untrained operator on. Virtual: the fleet `hard` of virtual_h1_2.py, tested on a unit
+never seen. Curves are of validation motions at gain 1; test motions are played once, by the best on validation.
 
 Writes docs/results/ppo.{md,json,csv,svg,png}. What is found in WORK is kept.
 """
@@ -153,9 +153,9 @@ class Arm:
 HEAD = ("arm", "validation at the start", "best", "after M steps", "at the end", "explained at first", "at the end ",
         "test without PPO", "test", "less, paired", "motions better")  # fmt: skip
 CAPTION = (
-    "MPJAE in mrad, whole-motion free run; ± std over seeds, of the paired difference standard error over test motions. "
-    "Validation at gain 1; test: the best on validation, beside the supervised start with the gain that validation chose, "
-    "or beside identification. Explained: share of the returns' variance that the critic explains, after "
+    "MPJAE in mrad, whole-motion free run; ± std over seeds, of the paired difference standard error over motions. "
+    "Validation at gain 1; test: the best on validation, beside the supervised start with the gain that validation "
+    "chose, or beside identification. Explained: share of the returns' variance that the critic explains, after "
     f"{VALIDATE} updates and in the end."
 )
 
