@@ -7,7 +7,7 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.errors import UsageError
-from gaponet.sim.identify import identify
+from gaponet.sim.identify import identify, with_stops
 from gaponet.sim.refit import cut
 
 
@@ -49,3 +49,15 @@ def test_windows_cover_all_recordings(tmp_path):
     assert {p.meta.motion for p in parts} == {s.meta.motion for s in sequences}
     with pytest.raises(UsageError, match="longer"):
         identify([s.rows(slice(0, 20)) for s in sequences], robot)
+
+
+def test_a_joint_behind_one_command_is_loaded_and_one_behind_many_is_stopped(tmp_path):
+    robot = write_arm(tmp_path)
+    s = recordings(robot, 1, rows=200)[0]
+    ctrl = np.zeros_like(s.ctrl)
+    ctrl[:, 0] = np.linspace(0.0, 0.8, len(ctrl))
+    ctrl[100:, 1] = 0.5
+    qpos = np.minimum(ctrl, 0.3)
+    found = with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))])
+    assert found.qpos_range[0, 1] == pytest.approx(0.3, abs=1e-3)
+    np.testing.assert_array_equal(found.qpos_range[1], robot.qpos_range[1])

@@ -333,17 +333,21 @@ def motion_errors(runs: JointRuns, values: Values) -> Array:
     return np.asarray(errors.sum(axis=0)[counted > 0] / counted[counted > 0])
 
 
-STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and rows that must show it
+STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and differ there; rows that must show it
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
-    """The robot with joint stops narrower than the MJCF's, where commands go on and the joint stays."""
+    """The robot with joint stops narrower than the MJCF's, where commands go on and the joint stays.
+
+    A joint that hangs far behind one command is loaded or stuck: several commands must have met the stop.
+    """
     servos: dict[str, dict[str, float]] = {}
     for joint, i in zip(robot.operated, robot.operated_index, strict=True):
         qpos, ctrl = (np.concatenate([getattr(s, f)[:, i] for s in sequences]) for f in ("qpos", "ctrl"))
         for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
             end = float((sign * qpos).max())
             pressed = (sign * ctrl > end + STOPPED) & (sign * qpos > end - 0.005)
-            if pressed.sum() >= OFTEN and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
+            met = pressed.sum() >= OFTEN and np.ptp(ctrl[pressed]) > STOPPED
+            if met and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
     return robot.with_servos(servos) if servos else robot
