@@ -1,8 +1,15 @@
-"""Other people's words in what we print: names of motions, units, joints and files, which may hold anything."""
+"""What we print: other people's words (names of motions, joints and files may hold anything), and measured numbers."""
 
 from __future__ import annotations
 
+import math
 import re
+
+
+def measured(value: float, error: float) -> str:
+    """A number with its standard error, as many digits as two of the error's: 0.0 ± 1.3, 320 ± 170."""
+    digits = 1 - math.floor(math.log10(error)) if 0 < error < math.inf else 3
+    return f"{round(value, digits):.{max(digits, 0)}f} ± {round(error, digits):.{max(digits, 0)}f}"
 
 
 def plain(text: str) -> str:

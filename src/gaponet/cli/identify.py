@@ -13,6 +13,7 @@ from gaponet.cli.out import Out, writes
 from gaponet.eval.tables import mrad
 from gaponet.metrics import standard_error
 from gaponet.robot import as_option
+from gaponet.text import measured
 
 if TYPE_CHECKING:
     from gaponet.sim.identify import Identified
@@ -138,4 +139,4 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
 def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
-    return f"{value * factor:.3g}" + ("" if std is None else f" ± {std * factor:.2g}")
+    return measured(value * factor, std * factor) if std else f"{value * factor:.3g}"

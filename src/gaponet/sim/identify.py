@@ -28,6 +28,7 @@ from gaponet.sim.shared import ITERATIONS as SHARED_ITERATIONS
 from gaponet.sim.shared import far_from_published, same_servos, share
 from gaponet.sim.touching import GENERATIONS as TABLE_GENERATIONS
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
+from gaponet.text import measured
 
 Array = np.ndarray
 Values = dict[str, Array]  # field → (n,) of the operated joints
@@ -320,7 +321,7 @@ class Fit:
                 if edge[i, k]:
                     found.append(f"{joint}: {f} ended at its bound ({value:.4g}); the model's form does not fit")
                 elif error > WIDE * max(abs(value), ahead[f][i] - value):
-                    wide.append(f"{f} {value:.3g} ± {error:.2g}")
+                    wide.append(f"{f} {measured(value, error)}")
             if wide:
                 found.append(f"{joint}: not determined by these logs: {', '.join(wide)}")
         return tuple(found)
