@@ -75,6 +75,11 @@ def keeps_robot(holder: Path) -> bool:
     return (holder / KEPT / "robot.toml").is_file()
 
 
+def keeper(artifact: Path) -> Path:
+    """Where the simulator of a model lies: in its folder where that was exported, else in its run."""
+    return artifact if keeps_robot(artifact) else artifact.parent
+
+
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO}

@@ -1,6 +1,8 @@
 """gaponet export and what gaponet bench latency measures, on a small artifact."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +11,13 @@ from arm import write_arm
 
 from gaponet.bench import latency
 from gaponet.cli.main import main
+from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import drawn_states, export
+from gaponet.robot import load_robot
+from gaponet.robot_folder import save_robot
 
 CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
 
@@ -36,6 +41,20 @@ def test_an_artifact_without_numpy_weights_gets_them(run, capsys):
     assert json.loads(capsys.readouterr().out)["parity_rad"] < 1e-5
     again = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
     np.testing.assert_allclose(again, before, atol=1e-7)
+
+
+def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
+    robot = load_robot(tmp_path / "arm")
+    save_robot(robot, run / "robot")
+    assert main(["export", str(run), "--out", str(tmp_path / "shipped")]) == 0
+    stiff = replace(robot, kp=2.0 * robot.kp)
+    there = AlignedSim(stiff, GapModel.load(run), 0.1)
+    shutil.rmtree(run)
+    sim = AlignedSim(stiff, GapModel.load(tmp_path / "shipped"), 0.1)
+    for each in (there, sim):
+        each.step(np.full(2, 0.3))
+    assert sim.transfer is not None
+    np.testing.assert_allclose(sim.target, there.target, atol=1e-7)
 
 
 def test_torchscript_lands_in_the_run(run):

@@ -207,6 +207,7 @@ def test_torchscript_is_self_contained_and_the_same(artifact, tmp_path):
     loaded = torch.jit.load(str(tmp_path / "delta.pt"))
     assert loaded.joint_names == ["shoulder", "elbow"]
     assert loaded.dt == [0.02]
+    assert loaded.simulator == model.card["simulator"]
     assert largest_difference(loaded, model, num_envs=2) <= 1e-5
 
 

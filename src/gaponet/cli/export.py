@@ -27,12 +27,14 @@ def export(
         run: Run folder of gaponet train; for torchscript an artifact folder will do.
         to: onnx: model.onnx, weights.npz and card.json. torchscript: delta.pt, with history and limits inside.
             inverse: a network fitted to the compensator's fixed point, beside the model; a minute or two.
-        out: Folder for onnx, file for torchscript; default the run's model folder. Not for inverse.
+        out: Folder for onnx, which gets the run's simulator too; file for torchscript. Default the run's model folder.
+            Not for inverse.
     """
     from gaponet.model.artifact import CARD, GapModel, read_card
     from gaponet.model.export import drawn_states, trained_network
     from gaponet.model.export import export as write
     from gaponet.model.torchscript import FILE, export_torchscript
+    from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 
     screen = Out(json)
     if to == "inverse":
@@ -49,6 +51,8 @@ def export(
         card, config = read_card(run / "model" / CARD)
         net = trained_network(run, config, len(card["joint_names"]))
         difference = write(net, path, card, drawn_states(net))
+        if path != run / "model" and keeps_robot(run):
+            save_robot(kept_robot(run, card["robot"]), path / KEPT)  # so that commands can be transferred
     screen.say(f"{path}: differs by {difference:.1e} rad from what was trained")
     screen.result({"path": str(path), "to": to, "parity_rad": difference})
 

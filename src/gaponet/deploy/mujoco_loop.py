@@ -13,7 +13,7 @@ from gaponet.arrays import Array
 from gaponet.deploy.transfer import Inverse, Transfer, periods_of
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
-from gaponet.robot_folder import keeps_robot
+from gaponet.robot_folder import keeper, keeps_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Probed, alike
 
@@ -46,7 +46,8 @@ class MujocoAligner:
         """Refuse a scene without the joints trained on, too far from the simulator of training; other rates, payloads.
 
         Args:
-            model: What training made. Without its run folder around it, the scene must have the gains trained with.
+            model: What training made. Where no run or export keeps its simulator, the scene must have the gains trained
+                with.
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand of the robot that the scene is to move like.
@@ -64,7 +65,7 @@ class MujocoAligner:
                 )
         self.transfer: Transfer | None = None
         self._stand: Callable[[mujoco.MjData], None] = lambda data: None
-        if not keeps_robot(model.path.parent):
+        if not keeps_robot(keeper(model.path)):
             _require_gains(model, mj_model, prefix)
         else:
             self._invert(model, mj_model, Condition(payload_mass, "both", dt), prefix, extrapolate, inverse)

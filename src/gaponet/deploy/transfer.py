@@ -5,9 +5,10 @@ to move so is known in closed form, of any simulator. So in each control period 
 simulator is, takes the period's step, and the target is told the inverse of that step (sim/inverse.py).
 
 Exact, but for what happens within a control period: free motion, whatever differs: gains, damping, friction, inertia,
-payload, offsets, delays, integrator, time step. A push moves the target, and the reference goes on from there. In
-contact the motors give what the reference's would in free space, and the target's contacts answer to that; what the
-reference itself touches (the table of an identified one) the target is stopped at by its motors.
+payload, offsets, delays up to the reference's, torque limits, integrator, time step. A push moves the target, and the
+reference goes on from there. In contact the motors give what the reference's would in free space, and the target's
+contacts answer to that; what the reference itself touches (the table of an identified one) the target is stopped at by
+its motors.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ Reference = GapModel | RobotSpec  # a model with the simulator of its run, or a 
 GAINS = (0.15, 5.0)  # of kp, to the reference's; this and what follows as far as was measured
 BAND = 0.06  # rad, frictionloss / kp
 STEP = 0.0051  # s
+LATER = 0.005  # s, servos than the reference's
 RESTING = 0.02  # rad/s: of a joint that is pressed on something, so that its friction is not seen
 
 
@@ -187,6 +189,14 @@ def of_simulator(
 
 def require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
     """Refuse a target further from the reference than those that docs/results/simulators.md has."""
+    periods = (inverse.ahead - reference.ahead) * reference.dt
+    later = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay
+    if later.max() > LATER:
+        raise ModelError(
+            f"joint '{joints[later.argmax() % len(joints)]}': its servo is {1e3 * later.max():.0f} ms later than the "
+            "reference's, and cannot follow it: it hears of a target when the reference has moved. Make the reference "
+            "as late (delay in robot.toml; gaponet identify), or extrapolate (extrapolate=True, --extrapolate)"
+        )
     if isinstance(inverse, Probed):
         return  # what is in a black box is not known
     for what, value, (least, most) in (

@@ -25,7 +25,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
-from gaponet.robot_folder import keeps_robot, kept_robot
+from gaponet.robot_folder import keeper, keeps_robot, kept_robot
 from gaponet.structure import Json, Name, Number, read_format, read_json, validated
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ class GapModel:
         if card["simulator"] == model_hash(robot):
             return ""
         family = self.family
-        if family is None or not keeps_robot(self.path.parent):
+        if family is None or not keeps_robot(keeper(self.path)):
             return "MJCF, gains or limits differ, or it is of before friction held"
         return outside(family, self.simulator(), robot)
 
@@ -295,17 +295,17 @@ class GapModel:
             self.require_rate(dt)
 
     def simulator(self) -> RobotSpec:
-        """The simulator that it corrects, as its run keeps it beside the model.
+        """The simulator that it corrects, as its run or its export keeps it.
 
         Raises:
             ModelError: The model lies in no run, or in one that keeps another simulator.
         """
-        if not keeps_robot(self.path.parent):
+        if not keeps_robot(keeper(self.path)):
             raise ModelError(
                 f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie beside it; "
-                "commands cannot be transferred to another simulator or rate; give the whole run folder"
+                "commands cannot be transferred to another simulator or rate; give the run folder, or an export (--out)"
             )
-        kept = kept_robot(self.path.parent, self.card["robot"])
+        kept = kept_robot(keeper(self.path), self.card["robot"])
         self.require(kept)
         return kept
 

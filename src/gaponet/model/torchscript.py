@@ -3,7 +3,7 @@
 m = torch.jit.load("delta.pt").to("cuda")     # needs torch, not gaponet
 m.reset(ids)                                  # int64 ids of environments that begin anew; None for all
 target = action + m(qpos, qvel, action, payload_mass)   # (num_envs, n) each, payload (num_envs,); once per period
-m.joint_names, m.dt                           # order of the columns, trained control periods [s]
+m.joint_names, m.dt, m.simulator              # order of the columns, control periods [s] and simulator trained in
 """
 
 # No postponed annotations here: TorchScript reads those of DeltaModule.
@@ -48,6 +48,7 @@ class DeltaModule(nn.Module):
         self.payload_input: bool = config.payload_input
         self.payload_max: float = config.payload_max
         self.joint_names = torch.jit.Attribute(list(model.card["joint_names"]), list[str])
+        self.simulator = torch.jit.Attribute(str(model.card["simulator"]), str)
         self.dt = torch.jit.Attribute([float(dt) for dt in model.card.get("dt", [])], list[float])
         low, high = torch.from_numpy(model.qpos_range.T.copy()).float()
         self.register_buffer("low", low)

@@ -56,7 +56,7 @@ class Simulators:
     """Simulators that no model was trained in: the model as it is, transferred in closed form, and by answers."""
 
     holdout_units: tuple[str, ...] = ()
-    """Units never trained on."""
+    """Units never trained on; where there are any, they alone are played."""
     seconds: float = 0.0
     """Of each motion, from its start; 0 for whole motions."""
     identify: ClassVar[bool] = True
@@ -85,6 +85,7 @@ class Simulators:
         return found.result(
             study, "simulators", "Simulators that no model was trained in",
             tables, {"simulators": figure}, said, motions=sorted({s.meta.motion for s in runs.sequences}),
+            recordings=len(runs.sequences),
             simulators={s.name: model_hash(s.robot) for s in runs.simulators},
         )  # fmt: skip
 
@@ -97,7 +98,9 @@ class Runs:
         trained = {word: found.cells.get((word, ""), []) for word in (NOMINAL, BOTH)}
         first = next(cells[0] for cells in trained.values() if cells)
         sequences = study.data.sequences(choose([first.folder], study.data)[0])
-        whole = sorted((s for s in sequences if s.dt == sequences[0].dt), key=lambda s: -len(s))
+        units = study.holdout_units or {s.meta.unit_id for s in sequences}
+        played = (s for s in sequences if s.dt == sequences[0].dt and s.meta.unit_id in units)
+        whole = sorted(played, key=lambda s: -len(s))
         self.sequences = _started(whole, seconds) if seconds else whole
         laden = any(s.meta.payload_mass for s in self.sequences)
         self.simulators = list(simulators_of(nominal, laden, study.out / "euler"))
