@@ -43,12 +43,12 @@ def import_logs(
     The same call again adds what is missing.
 
     Args:
-        src: SAGE folder, LeRobot set (v3.0), BAM logs (JSON), or a table (CSV, Parquet) or a folder of tables.
+        src: File or folder of logs; `gaponet formats` lists what is read.
         robot: The robot that was recorded.
         out: Dataset folder; appended to where it exists.
         unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
         payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
-        options: payload_side, level, fmt, kp, kd, joint_map, columns, position_unit, time_unit, as
+        options: payload_side, level, fmt, kp, kd, skip_bad, joint_map, logs, position_unit, time_unit, allow_pickle, as
             data.importer.import_logs takes them.
 
     Raises:

@@ -48,7 +48,7 @@ EXTRAS = {
     "torch": "train", "onnx": "train", "onnxruntime": "deploy",
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
-    "tensorboard": "tensorboard", "wandb": "wandb",
+    "rosbags": "ros", "h5py": "hdf5", "tensorboard": "tensorboard", "wandb": "wandb",
 }  # fmt: skip
 
 

@@ -32,7 +32,7 @@ def test_even_rows_are_kept_as_recorded_at_their_own_rate(arm):
 def test_a_missing_sample_puts_the_log_on_a_grid(arm):
     time = np.delete(0.02 * np.arange(ROWS), 20)
     sequence = to_sequence(arm_log(time), arm, META)
-    assert sequence.meta.notes["rows"] == "resampled to 50.00 Hz"
+    assert sequence.meta.notes["rows"] == "resampled to 50.00 Hz: commands held, states interpolated"
     assert sequence.meta.notes["longest_gap_ms"] == pytest.approx(40)
     assert len(sequence) == ROWS
     assert sequence.qpos[20, 0] == pytest.approx(0.4)  # on the line between its neighbours
@@ -164,3 +164,16 @@ def test_recordings_with_different_gains_are_not_taken_together_unless_they_do_n
     require_same_gains([soft, stiff], joints, ("shoulder",))
     with pytest.raises(UsageError, match=r"kp of elbow was 5 in 'wave' of a and 10 in 'stiff' of b.*--mixed-gains"):
         require_same_gains([soft, stiff], joints, joints)
+
+
+@pytest.mark.parametrize("short", [0.0, 0.0008, 0.0019])
+def test_time_is_never_stretched(arm, short):
+    """Two in three periods are 20 ms, one is a little shorter: the median is no clock."""
+    time = np.concatenate([[0.0], np.cumsum(np.where(np.arange(1499) % 3, 0.02, 0.02 - short))])
+    truth = lambda t: np.stack([np.sin(t), np.cos(2 * t)], axis=1)  # noqa: E731
+    log = Log("arm", ("shoulder", "elbow"), {n: Channel(time, truth(time)) for n in ("ctrl", "qpos")}, "x")
+    sequence = to_sequence(log, arm, SequenceMeta("arm", "a", "m", 0.0))
+    rows = sequence.dt * np.arange(len(sequence))
+    assert rows[-1] == pytest.approx(time[-1], abs=sequence.dt)
+    assert np.abs(sequence.qpos - truth(rows)).max() < 0.5 * sequence.dt * 2 + 1e-3  # half a period at 2 rad/s
+    assert sequence.dt == pytest.approx(0.02 - short / 3 if short else 0.02, abs=2e-5)

@@ -13,12 +13,13 @@ import pyarrow.parquet as pq
 from arm import write_arm
 from logs import arm_columns, arm_sequence, late, stock, table_text, wave, write_bam, write_so101
 from motion_files import write_motion
+from strange_logs import write_aloha, write_asap, write_bag, write_gaponet, write_mat, write_npz, write_pace
 
 from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
-from gaponet.data.formats.lerobot_export import export_lerobot
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
+from gaponet.data.writers.lerobot import export_lerobot
 from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
 from gaponet.motion.recipe import load_recipe, takes
@@ -80,11 +81,11 @@ def require_sane(dataset: Dataset, robot: RobotSpec, inside: Path) -> None:
                 raise AbsurdError(f"{entry.id}: {name} up to {np.abs(values).max()}")
 
 
-def importing(robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **options: str) -> Callable[..., None]:
+def importing(robot: Callable[[], RobotSpec], at: str = "", stated: str = "", **options: object) -> Callable[..., None]:
     """Import `at` below the folder and look at what was stored."""
 
     def use(source: Path, out: Path) -> None:
-        given = options | ({"columns": str(source / options["columns"])} if "columns" in options else {})
+        given = options | ({"logs": str(source / str(options["logs"]))} if "logs" in options else {})
         unit, payload = None if stated == "all" else "lab", None if stated else 0.0
         report = import_logs(source / at, robot(), unit, payload, out, **given)  # type: ignore[arg-type]
         require_sane(Dataset(out), robot(), source)
@@ -112,6 +113,19 @@ def _mapped(folder: Path) -> None:
     (folder / "map.toml").write_text(
         'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
         '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "rad"\n'
+    )
+
+
+def _described(folder: Path) -> None:
+    """Strange names, a sheet, a sign, and commands in a file of their own."""
+    columns = dict(zip(["t", "a_des", "b_des", "a", "b"], arm_columns(ROWS).values(), strict=True))
+    (folder / "x.csv").write_text(table_text({k: v for k, v in columns.items() if "des" not in k}))
+    (folder / "x_cmd.csv").write_text(table_text({k: v for k, v in columns.items() if len(k) != 1 or k == "t"}))
+    (folder / "sheet.csv").write_text("file,motion,payload,rep,kp.b\nx,wave,0.1,0,20\n")
+    (folder / "logs.toml").write_text(
+        'time = "t"\ntime_unit = "s"\nposition_unit = "rad"\nctrl = "{joint}_des"\nqpos = "{joint}"\n'
+        'ignore = ["t"]\ncommand_file = "{name}_cmd.csv"\nmanifest = "sheet.csv"\n[names]\na = "shoulder"\n'
+        'b = "elbow"\n[signs]\nshoulder = -1\n'
     )
 
 
@@ -168,7 +182,16 @@ TARGETS = (
     Target("sage", written(lambda f: write_so101(f / "real" / "so101" / "wave", ROWS)), importing(so101), 2.0),
     Target("table", written(_tables), importing(arm, position_unit="rad", time_unit="s"), 2.0),
     Target("parquet", written(_parquet), importing(arm, position_unit="rad", time_unit="s"), 1.5),
-    Target("columns", written(_mapped), importing(arm, "logs", columns="map.toml"), 1.0, (".toml", "a.csv")),
+    Target("logs.toml", written(_mapped), importing(arm, "logs", logs="map.toml"), 1.0, (".toml", "a.csv")),
+    Target("described", written(_described), importing(arm, stated="payload"), 1.0),
+    Target("rosbag", written(lambda f: write_bag(f / "bag", "mcap", rows=20)), importing(arm), 1.5),
+    Target("db3", written(lambda f: write_bag(f / "bag", "db3", rows=20)), importing(arm), 1.0, (".db3", ".yaml")),
+    Target("hdf5", written(write_aloha), importing(arm), 1.0, (".hdf5",)),
+    Target("npz", written(write_npz), importing(arm), 1.0, (".npz",)),
+    Target("gaponet npz", written(write_gaponet), importing(arm, stated="payload"), 1.0, (".npz",)),
+    Target("mat", written(write_mat), importing(arm), 0.05, (".mat",)),
+    Target("pt", written(write_pace), importing(arm), 0.7, (".pt",)),
+    Target("asap", written(write_asap), importing(arm, allow_pickle=True), 1.0, (".pkl",)),
     Target("lerobot", written(lambda f: stock(f / "set", rows=(25, 15))), importing(so101, position_unit="deg"), 2.5),
     Target("bam", written(lambda f: write_bam(f / "a.json", ROWS, 30)), importing(bench, stated="payload"), 1.0),
     Target("export", written(_export), importing(arm, stated="all", fmt="lerobot"), 2.0),

@@ -109,7 +109,7 @@ def export(
     Args:
         out: New folder.
     """
-    from gaponet.data.formats.lerobot_export import export_lerobot
+    from gaponet.data.writers.lerobot import export_lerobot
 
     screen, data = Out(json), Dataset(dataset)
     with bar("exporting") as update:

@@ -1,4 +1,4 @@
-"""gaponet import, gaponet doctor."""
+"""gaponet import, formats, doctor."""
 
 from __future__ import annotations
 
@@ -28,40 +28,57 @@ MAX_ROWS = 60
 def import_logs(
     src: Folder,
     robot: str,
-    out: Path,
+    out: Path | None = None,
     unit_id: str | None = None,
     payload_mass: float | None = None,
     payload_side: str | None = None,
     map: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    format: Literal["sage", "table", "lerobot", "bam"] | None = None,
-    columns: Path | None = None,
+    format: Literal["sage", "lerobot", "bam", "table", "rosbag", "hdf5", "npz", "mat", "pace", "asap"] | None = None,
+    logs: Path | None = None,
     position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,
     level: Literal["joint", "upper_body", "whole_body"] | None = None,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
+    skip_bad: bool = False,
+    allow_pickle: bool = False,
+    guess: bool = False,
     json: Json = False,
 ) -> None:
     """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
 
     Args:
         robot: Robot name or folder.
+        out: Dataset folder; appended to where it exists.
         payload_side: Which hand carries it: both (default), or the side of one payload mount.
         map: A joint's name in the log and the robot's, as a=b; may be repeated.
-        format: Format of the logs; default by looking.
-        columns: Tables: TOML file that names columns and units.
-        position_unit: Tables and LeRobot: unit of positions; velocities are that per second. signed_percent: LeRobot's
-            older −100..100.
-        time_unit: Tables: unit of time.
+        format: Format of the logs; default by looking. gaponet formats lists them.
+        logs: A logs.toml: what columns, names, units, signs and clocks mean; default the one in the folder of the logs.
+        position_unit: Unit of positions, where the format leaves it open; velocities are that per second.
+            signed_percent: LeRobot's older −100..100.
+        time_unit: Unit of time, where the format leaves it open.
         level: What the motions move; whole_body by default.
         kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
             states, else the robot's.
         kd: The same of the damping gain, N·m·s/rad.
+        skip_bad: Cut bad rows and leave out logs that cannot be read, and list both, instead of refusing all.
+        allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
+        guess: Print a logs.toml for these logs, filled in as far as they show it, and import nothing.
     """
     spec = load_robot(robot)
+    if guess:
+        from gaponet.data.describe.guess import guess_logs
+        from gaponet.data.formats import look
+
+        kind, told, recordings = look(src, format, logs, allow_pickle)
+        print(guess_logs(recordings, spec, kind, dict(told)), end="")
+        return
+    if out is None:
+        raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
     report = api.import_logs(
         src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=joint_map(map), columns=columns, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
+        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
+        skip_bad=skip_bad, allow_pickle=allow_pickle,
     )  # fmt: skip
     show_import(Out(json), report, spec)
 
@@ -80,6 +97,19 @@ def doctor(dataset: Data, robot: str | None = None, json: Json = False) -> None:
     out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
     out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
+
+
+def formats(json: Json = False) -> None:
+    """List the log formats that are read, and what each needs."""
+    from gaponet.data.formats import FORMATS, about, module
+
+    out = Out(json)
+    rows = {fmt: (about(fmt), module(fmt).EXTRA) for fmt in FORMATS}
+    out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
+        [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
+    ])  # fmt: skip
+    out.say("Strange columns: gaponet import LOGS --robot ROBOT --guess > LOGS/logs.toml, then look it over.")
+    out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
 def cuts(entries: list[Entry]) -> dict[str, list[str]]:
@@ -115,6 +145,10 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     )
     for cut, motions in cuts(entries).items():
         out.say(f"{', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
+    for line in report.cut[:MAX_ROWS]:
+        out.say(line, "cut", "yellow")
+    if len(report.cut) > MAX_ROWS:
+        out.say(f"… and {len(report.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
     lags = {name: fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}
     show_offsets(out, lags, offsets)
@@ -125,7 +159,7 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         "dataset": str(data.path), "imported": [e.id for e in report.entries],
         "present": [e.id for e in report.present], "sequences": len(data), "minutes": minutes,
         "rate_hz": rates, "fast_lag_s": lags, "delay_s": {e.id: e.findings.get("delay_s", {}) for e in entries},
-        "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False,
+        "offsets": {name: vars(joint) for name, joint in offsets.items()}, "offsets_applied": False, "cut": report.cut,
     })  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from gaponet.text import plain
 TASKS = {
     "Logs": {
         "import": "gaponet.cli.logs:import_logs",
+        "formats": "gaponet.cli.logs:formats",
         "doctor": "gaponet.cli.logs:doctor",
         "data": "gaponet.cli.data:data",
         "collect": "gaponet.cli.collect:collect",

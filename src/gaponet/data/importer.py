@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.holds import Holds, find_holds
-from gaponet.data.log import Log
+from gaponet.data.log import Log, skipping
 from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
@@ -36,12 +36,14 @@ class ImportReport:
         entries: Sequences that were added.
         present: Sequences of this source that were there before, by their content.
         offsets: None where no gravity model was given or several units were recorded.
+        cut: Rows that were cut and recordings left out, one line each, where that was asked for.
     """
 
     dataset: Dataset
     entries: list[Entry]
     present: list[Entry]
     offsets: UnitOffsets | None
+    cut: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ def import_logs(
     progress: Progress = silent,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
+    skip_bad: bool = False,
     **options: Any,
 ) -> ImportReport:
     """Import every recording under a path that is not there yet; a bad one refuses them all, and nothing is written.
@@ -87,7 +90,9 @@ def import_logs(
         simulator: Hash of that model, recorded beside the offsets.
         kp, kd: Gains while recording, N·m/rad and N·m·s/rad: one number, or JOINT=NUMBER for some of the joints;
             default what the format states, else the robot's.
-        options: Options of data.formats.read_logs: joint_map, columns, position_unit, time_unit.
+        skip_bad: Cut bad rows and leave out recordings that cannot be read, instead of refusing all; the report lists
+            both.
+        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, allow_pickle.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
@@ -106,12 +111,14 @@ def import_logs(
         if known is not None:
             read_offsets(known)  # a damaged one is said before anything is read
         rests: dict[str, Holds] | None = {} if gravity else None
-        dataset, added, present = _import(src, out, robot, given, fmt, progress, options, rests)
+        with skipping(skip_bad) as bad:
+            dataset, added, present = _import(src, out, robot, given, fmt, progress, options, rests)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
         offsets = {unit: fit_unit(dataset, robot, unit, gravity, rests) for unit in units} if gravity else {}
         for unit, fitted in offsets.items():
             record_offsets(dataset, unit, fitted, simulator)
-    return ImportReport(dataset, added, present, next(iter(offsets.values())) if len(offsets) == 1 else None)
+    only = next(iter(offsets.values())) if len(offsets) == 1 else None
+    return ImportReport(dataset, added, present, only, list(dict.fromkeys(bad or ())))
 
 
 def _import(
@@ -170,7 +177,7 @@ def _sequences(
     """Every recording on its grid, with what the format and the user say of it."""
     digests: dict[tuple[str, ...], str] = {}
     for motion, log in read_logs(src, robot, fmt, **options):
-        files = tuple(sorted(set(log.meta["files"].values())))
+        files = tuple(sorted({*log.meta["files"].values(), *log.meta.get("all_files", ())}))
         if files not in digests:  # many episodes may lie in one file
             digests[files] = _sha256(files)
         meta = _meta(log, motion, src, robot, given, digests[files])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,6 +19,22 @@ CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "tempe
 DERIVED = {"qacc": "rad/s²", "tau_eq": "N·m"}
 UNITS = {"time": "s"} | CHANNELS | DERIVED
 REQUIRED = ("ctrl", "qpos")
+_bad: ContextVar[list[str] | None] = ContextVar("bad", default=None)
+
+
+@contextmanager
+def skipping(wanted: bool = True) -> Iterator[list[str] | None]:
+    """While this is open, a Log cuts its bad rows instead of refusing them; yields the list of what was cut."""
+    token = _bad.set([] if wanted else None)
+    try:
+        yield _bad.get()
+    finally:
+        _bad.reset(token)
+
+
+def skipped() -> list[str] | None:
+    """Where bad rows are listed now; None where they are refused."""
+    return _bad.get()
 
 
 class Channel(NamedTuple):
@@ -51,8 +70,30 @@ class Log:
                     f"{self.source}: no {name} channel (it has {', '.join(self.channels) or 'none'}); "
                     "a log needs commanded and measured joint positions"
                 )
+        bad = _bad.get()
+        if bad is not None:
+            self._cut_bad_rows(bad)
         for name, (time, values) in self.channels.items():
             self._check(name, np.asarray(time), np.asarray(values))
+
+    def _cut_bad_rows(self, bad: list[str]) -> None:
+        """Cut rows that are not finite or go back in time, in all channels of the same clock; they are listed."""
+        kept: dict[str, Channel] = {}
+        for name, (clock, _) in self.channels.items():
+            if name in kept:
+                continue
+            same = [n for n, c in self.channels.items() if np.array_equal(c.time, clock, equal_nan=True)]
+            good = np.isfinite(clock)
+            for other in same:
+                good &= np.isfinite(self.channels[other].values).all(axis=1)
+            latest = np.maximum.accumulate(np.where(good, clock, -np.inf))
+            good[1:] &= clock[1:] > latest[:-1]
+            bad += [f"{self.row(name, int(row))}: cut" for row in np.flatnonzero(~good)]
+            kept |= {n: Channel(clock[good], self.channels[n].values[good]) for n in same}
+        cut = max(len(c.time) - len(kept[n].time) for n, c in self.channels.items())
+        if cut:
+            self.meta["notes"] = self.meta.get("notes", {}) | {"rows_cut": cut}
+            object.__setattr__(self, "channels", kept)
 
     def _check(self, name: str, time: Array, values: Array) -> None:
         if name not in UNITS:

@@ -191,9 +191,11 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
 
     Where all channels share timestamps and every period is within 10 % of the median, rows are kept as they are and dt
     is the median period rounded to 10 µs: the robot's real rate (49.85 Hz stays 49.85 Hz); or the exact period where
-    the format states one. Otherwise measurements are interpolated and commands held on a grid of the state's median
-    period. The manifest says which. Refused are clocks that cannot be right: periods below 0.1 ms or above 1 s, a gap
-    of more than 2 s, three times as many rows as were recorded, a stated period that the timestamps contradict.
+    the format states one; or the mean period. It is the first by which no row is moved by more than half a period:
+    time is never stretched. Where none is, or rows are uneven, measurements are interpolated and commands held on a
+    grid of the state's median period. The manifest says which. Refused are clocks that cannot be right: periods below
+    0.1 ms or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period that the
+    timestamps contradict.
 
     Args:
         log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
@@ -204,9 +206,13 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     period = np.diff(time)
     median = _median_period(log)
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
-    regular = bool(shared and (np.abs(period - median) <= 0.1 * median).all() and dt is None)
-    if regular:
-        dt = float(log.meta.get("dt", round(median, 5)))
+    even = shared and dt is None and bool((np.abs(period - median) <= 0.1 * median).all())
+    kept = _row_period(
+        time, (float(log.meta.get("dt", round(median, 5))), round(float(period.mean()), 7)) if even else ()
+    )
+    regular = kept is not None
+    if kept is not None:
+        dt = kept
         arrays = {name: channel.values for name, channel in log.channels.items()}
     else:
         dt = round(median, 5) if dt is None else dt
@@ -221,7 +227,7 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
         meta.notes
         | log.meta.get("notes", {})
         | {
-            "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz",
+            "rows": "as recorded" if regular else f"resampled to {1 / dt:.2f} Hz: commands held, states interpolated",
             "rate_hz": round(1 / median, 3),
             "jitter_ms": round(float(np.abs(period - median).max()) * 1e3, 3),
             "longest_gap_ms": round(float(period.max()) * 1e3, 3),
@@ -237,6 +243,12 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
+
+
+def _row_period(time: Array, periods: tuple[float, ...]) -> float | None:
+    """The first period, s, by which row t is never further than half a period from where t·period puts it."""
+    rows = np.arange(len(time))
+    return next((p for p in periods if np.abs(time - time[0] - p * rows).max() <= 0.5 * p), None)
 
 
 def _median_period(log: Log) -> float:

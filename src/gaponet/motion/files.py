@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.formats import refuse_degrees
+from gaponet.data.describe.limits import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.errors import LogError
 from gaponet.motion.motion import Motion

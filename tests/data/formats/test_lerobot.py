@@ -9,10 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 from logs import SO101, arm_sequence, late, stock, wave
 
-from gaponet.data.formats import detect, lerobot_export
-from gaponet.data.formats.lerobot_export import export_lerobot
+from gaponet.data.formats import detect
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
+from gaponet.data.writers import lerobot as lerobot_export
+from gaponet.data.writers.lerobot import export_lerobot
 from gaponet.errors import DatasetError, JointMismatchError, LogError, UsageError
 
 
@@ -242,7 +243,9 @@ def test_joints_without_names_are_refused(so101, tmp_path):
     info = json.loads((folder / "meta" / "info.json").read_text())
     info["features"]["action"]["names"] = None
     (folder / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(LogError, match=r"info\.json: action does not name its \[6\] values; write the joints' names"):
+    with pytest.raises(
+        LogError, match=r"info\.json: action does not name its \[6\] values; write joints = \[their names"
+    ):
         read_stock(folder, so101, tmp_path / "data")
 
 

@@ -85,7 +85,7 @@ def test_a_column_map_names_columns_and_units(tmp_path, arm):
         'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\n[columns]\n"ctrl.shoulder" = "cmd_1"\n'
         '"ctrl.elbow" = "cmd_2"\n"qpos.shoulder" = "pos_1"\n"qpos.elbow" = "pos_2"\n[joint_units]\nelbow = "deg"\n'
     )
-    ((_, log),) = read_logs(file, arm, columns=toml)
+    ((_, log),) = read_logs(file, arm, logs=toml)
     assert np.array_equal(log.channels["qpos"].values[:, 0], theirs["pos_1"])
     assert np.allclose(log.channels["qpos"].values[:, 1], theirs["pos_2"] * np.pi / 180)
     assert log.channels["qpos"].time[-1] == pytest.approx(1.18)
@@ -101,11 +101,11 @@ def test_a_joint_at_three_quarters_of_its_range_of_three_radians(tmp_path, arm):
 @pytest.mark.parametrize(
     ("toml", "message"),
     [
-        ('tme = "t"', r"map\.toml: tme: is not a known field; use time, time_unit, position_unit"),
+        ('tme = "t"', r"map\.toml: tme: is not a known field; docs/data-format.md lists the fields"),
         ('[columns]\n"control.elbow" = "x"', "'control.elbow' is neither time nor ctrl.<joint>, qpos.<joint>"),
         (
             '[columns]\n"ctrl.elbow" = "x"',
-            r"column 'x' \(for ctrl.elbow\) is missing; the header has: time, ctrl.shoulder",
+            r"column 'x' \(for ctrl.elbow\) is missing; there are: time, ctrl.shoulder",
         ),
         ('time_unit = "min"', "time unit 'min' is not one of s, ms, us, ns"),
         ('time_unit = "s"\n[joint_units]\nelbow = "grad"', "unit of elbow 'grad' is not one of rad, deg, fraction"),
@@ -117,19 +117,23 @@ def test_a_broken_column_map_says_what_is_wrong(tmp_path, arm, toml, message):
     options = {"position_unit": "rad"} | ({} if "time_unit" in toml else {"time_unit": "s"})
     file = write(tmp_path / "wave.csv", arm_columns())
     with pytest.raises((UsageError, LogError), match=message):
-        list(read_logs(file, arm, columns=tmp_path / "map.toml", **options))
+        list(read_logs(file, arm, logs=tmp_path / "map.toml", **options))
 
 
 def test_a_column_map_that_is_not_there_is_named(tmp_path, arm):
     file = write(tmp_path / "wave.csv", arm_columns())
-    with pytest.raises(UsageError, match=r"no\.toml: is missing, or not a file; use time"):
-        only(file, arm, columns=tmp_path / "no.toml")
+    with pytest.raises(UsageError, match=r"no\.toml: is missing, or not a file; docs/data-format.md"):
+        only(file, arm, logs=tmp_path / "no.toml")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("time", "clock", r":1: column 'time' is missing; the header has: clock, ctrl.shoulder, .*--columns file"),
+        (
+            "time",
+            "clock",
+            r":1: column 'time' \(the clock of ctrl\) is missing; there are: clock, .*logs.toml",
+        ),
         ("qpos.elbow", "elbow", r":1: column 'qpos.elbow' is missing: every channel needs the same joints"),
         ("ctrl.elbow", "note", r":1: column 'ctrl.elbow' is missing: every channel needs the same joints"),
         ("qpos.elbow", "qpos.shoulder", r":1: column 'qpos.shoulder' stands twice; rename one"),
@@ -163,7 +167,9 @@ def test_a_table_cut_short_names_its_last_line(tmp_path, arm):
         only(file, arm)
 
 
-@pytest.mark.parametrize(("text", "message"), [("", "empty; a table needs a header"), ("time\n", "is missing")])
+@pytest.mark.parametrize(
+    ("text", "message"), [("", "empty; a table needs a header"), ("time\n", "no column holds ctrl")]
+)
 def test_an_empty_table_is_refused(tmp_path, arm, text, message):
     (tmp_path / "wave.csv").write_text(text)
     with pytest.raises(LogError, match=message):
@@ -205,18 +211,18 @@ def test_a_strange_joint_says_how_to_map_it(tmp_path, arm):
 
 def test_radians_that_are_degrees_are_refused(tmp_path, arm):
     columns = {k: v * (1 if k == "time" else 57.3) for k, v in arm_columns().items()}
-    with pytest.raises(LogError, match=r"wave\.csv:\d+: .* these look like degrees \(tables: --position-unit deg\)"):
+    with pytest.raises(LogError, match=r"wave\.csv:\d+: .* these look like degrees \(--position-unit deg\)"):
         only(write(tmp_path / "wave.csv", columns), arm)
 
 
 def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
     (tmp_path / "readme.txt").touch()
-    with pytest.raises(LogError, match=r"not a log this version reads\. Known formats: sage: .*; table: CSV"):
+    with pytest.raises(LogError, match=r"not a log this version reads\. Known formats: sage: SAGE .*; table: CSV"):
         list(read_logs(tmp_path, arm))
     with pytest.raises(LogError, match="nowhere: does not exist"):
         list(read_logs(tmp_path / "nowhere", arm))
-    with pytest.raises(LogError, match="unknown format 'rosbag'; use one of sage, table"):
-        list(read_logs(tmp_path, arm, "rosbag"))
+    with pytest.raises(LogError, match="unknown format 'ascii'; use one of sage, lerobot"):
+        list(read_logs(tmp_path, arm, "ascii"))
 
 
 def test_a_cell_longer_than_the_csv_module_takes_is_refused_by_line(tmp_path, arm):
@@ -239,4 +245,4 @@ def test_names_in_a_parquet_file_that_are_no_text_are_refused(tmp_path, arm):
 def test_a_column_map_of_other_types_is_refused(tmp_path, arm, toml):
     (tmp_path / "map.toml").write_text(toml)
     with pytest.raises(UsageError, match=r"map\.toml: "):
-        only(write(tmp_path / "wave.csv", arm_columns()), arm, columns=tmp_path / "map.toml")
+        only(write(tmp_path / "wave.csv", arm_columns()), arm, logs=tmp_path / "map.toml")

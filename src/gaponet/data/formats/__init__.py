@@ -1,153 +1,245 @@
-"""One file per log format. A reader takes a path and yields Logs; it is imported when its format is asked for.
+"""One file per log format, imported when its format is asked for or looked for; heavy libraries only when it reads.
 
-A format is a module with
+A format is a module whose docstring begins with what it is, in one line, and which has
 
-    OPTIONS                 options of `read` beside joint_map that it understands
+    detects(path)           whether a file, or the files directly in a folder, look like it
     find(path)              the recordings under a path: files or folders, sorted
-    read(path, robot, joint_map=None, **options)    yields (motion name, Log), in the order of find
+    EXTRA                   the extra of the package that it needs, or ""
+    OPTIONS                 fields of logs.toml that it acts on beside names, signs, offsets, motion and the like
+
+and either
+
+    read(path, robot, joint_map, **options)    yields (motion name, what reads its Log), in the order of find
+
+where the format itself says what its columns are, or
+
+    recordings(path, told)  yields Recordings, whose signals logs.toml explains (data.describe.recording)
+    DEFAULT                 what of logs.toml holds unless something else is said
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.log import UNITS, Log
+from gaponet.data.describe.limits import refuse_absurd
+from gaponet.data.describe.logs_file import LogsFile, Naming, find_file, read_logs_file
+from gaponet.data.describe.recording import COMMAND, Recording, to_log
+from gaponet.data.log import Channel, Log, skipped
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 
-FORMATS = {
-    "sage": "SAGE folder: control.csv and state_motor.csv beside each other",
-    "table": "CSV or Parquet with named columns, a file or a folder of files",
-    "lerobot": "LeRobotDataset v3.0 folder: meta/info.json",
-    "bam": "JSON of BAM's servo test bench, a file or a folder of files",
-}
-TABLES = (".csv", ".parquet")
-# Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
-MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
+FORMATS = ("sage", "lerobot", "bam", "table", "rosbag", "hdf5", "npz", "mat", "pace", "asap")
+ALWAYS = ("names", "ignore", "signs", "offsets", "motion", "manifest", "unit", "payload", "side", "kp", "kd", "format")
+DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
+
+
+def module(fmt: str) -> ModuleType:
+    """The reader of a format."""
+    if fmt not in FORMATS:
+        raise LogError(f"unknown format '{fmt}'; use one of {', '.join(FORMATS)}")
+    return import_module(f"gaponet.data.formats.{fmt}")
+
+
+def about(fmt: str) -> str:
+    """What a format is, in a line."""
+    return (module(fmt).__doc__ or "").split("\n")[0].rstrip(".")
+
+
+def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
+    """The file, or those with these suffixes in a folder and below it; hidden ones are left alone."""
+    if path.is_file():
+        return [path] if path.suffix.lower() in suffixes else []
+    found = (f for f in path.rglob("*") if f.suffix.lower() in suffixes and f.is_file())
+    return sorted(f for f in found if not any(part.startswith(".") for part in f.relative_to(path).parts))
 
 
 def detect(path: Path) -> str:
-    """The format of a file or folder."""
+    """The format of a file or folder; refuses one that could be several."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    if path.is_dir() and any(next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json")):
-        return "lerobot"
-    if path.is_dir() and any(next(path.rglob(name), None) for name in ("control.csv", "state_motor.csv")):
-        return "sage"
-    files = [path] if path.is_file() else sorted(path.iterdir())
-    if any(f.is_file() and f.suffix.lower() in TABLES for f in files):
-        return "table"
-    if any(f.is_file() and f.suffix.lower() == ".json" and is_bam(f) for f in files):
-        return "bam"
-    known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())
-    raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
-
-
-def is_bam(file: Path) -> bool:
-    """Whether a file begins as BAM's logs do."""
-    with file.open("rb") as stream:
-        start = stream.read(4096)
-    return all(name in start for name in (b'"trajectory"', b'"entries"', b'"goal_position"'))
+    found = [fmt for fmt in FORMATS if module(fmt).detects(path)]
+    if len(found) > 1:
+        ways = " or ".join(f"--format {fmt}" for fmt in found)
+        raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")
+    if not found:
+        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in FORMATS)
+        raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
+    return found[0]
 
 
 def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     """The recordings under a path, without reading them."""
-    return _reader(path, fmt).find(path)
+    return cast("list[Path]", _reader(path, fmt or _described(path, None)[0].get("format")).find(path))
 
 
-def read_logs(path: Path, robot: RobotSpec, fmt: str | None = None, **options: Any) -> Iterator[tuple[str, Log]]:
+def read_logs(
+    path: Path,
+    robot: RobotSpec,
+    fmt: str | None = None,
+    joint_map: dict[str, str] | None = None,
+    logs: str | Path | None = None,
+    position_unit: str | None = None,
+    time_unit: str | None = None,
+    allow_pickle: bool = False,
+) -> Iterator[tuple[str, Log]]:
     """Yield (motion name, Log) for every recording under a path.
+
+    While data.log.skipping is open, rows that are not finite, go back in time or cannot be are cut, recordings that
+    cannot be read are left out, and both are listed there.
 
     Args:
         fmt: One of FORMATS; default by looking.
-        options: joint_map {log name: robot name}. For tables also columns (a TOML file that maps column names),
-            position_unit and time_unit; for LeRobot sets position_unit. None counts as not given; one that the format
-            does not know is refused.
+        joint_map: The log's name of a joint → the robot's; wins over logs.toml.
+        logs: A logs.toml (data.describe.logs_file); default the one in the folder of the logs.
+        position_unit, time_unit: Win over logs.toml; refused where the format itself fixes them.
+        allow_pickle: Open pickled files, with an unpickler that makes arrays, numbers and text and nothing else.
+
+    Raises:
+        LogError, JointMismatchError, UsageError: What, where and what to do.
     """
-    reader = _reader(path, fmt)
-    given = {name: value for name, value in options.items() if value is not None}
-    for name in given:
-        if name != "joint_map" and name not in reader.OPTIONS:
-            flag, kind = name.replace("_", "-"), reader.__name__.rsplit(".", 1)[-1]
-            raise UsageError(f"--{flag} means nothing to the {kind} format, which fixes it itself; leave it out")
-    yield from reader.read(path, robot, **given)
+    told, file = _described(path, logs)
+    reader = _reader(path, fmt or told.get("format"))
+    told = told | {k: v for k, v in (("position_unit", position_unit), ("time_unit", time_unit)) if v is not None}  # type: ignore[assignment]
+    kind = _require_allowed(reader, path, allow_pickle)
+    for name in told:
+        if name not in ALWAYS and name not in reader.OPTIONS:
+            by_hand = {"position_unit": position_unit, "time_unit": time_unit}.get(name) is not None
+            said = f"--{name.replace('_', '-')}" if by_hand else f"{file}: {name}"
+            raise UsageError(f"{said} means nothing to the {kind} format, which fixes it itself; leave it out")
+    names = told.get("names", {}) | (joint_map or {})
+    naming, root = Naming(told, file), path if path.is_dir() else path.parent
+    bad = skipped()
+    for name, load in _loaders(reader, path, robot, told, names):
+        try:
+            log = _corrected(refuse_absurd(load(), robot), robot, told, names)
+        except LogError as error:
+            if bad is None:
+                raise
+            bad.append(f"left out: {error}")
+            continue
+        inside, _, part = log.source.partition("#")
+        place = Path(inside).relative_to(root).as_posix()
+        words = naming.of(name, place + ("#" + part if part else ""))
+        yield str(words.pop("motion", name)), _named(log, words, robot, names)
+    naming.require_all_used()
+
+
+def look(
+    path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
+) -> tuple[str, LogsFile, list[Recording]]:
+    """The format, what is said of it already, and the recordings as they lie there; arguments as of read_logs."""
+    told, _ = _described(path, logs)
+    reader = _reader(path, fmt or told.get("format"))
+    kind = _require_allowed(reader, path, allow_pickle)
+    if not hasattr(reader, "recordings"):
+        raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
+    full = cast("LogsFile", reader.DEFAULT | told)
+    return kind, full, list(reader.recordings(path, full))
+
+
+def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
+    """The name of the format; refuses pickled files unless they were allowed."""
+    kind = reader.__name__.rsplit(".", 1)[-1]
+    if getattr(reader, "PICKLED", False) and not allow_pickle:
+        raise UsageError(
+            f"{path}: {kind} files are Python pickles, which can hold anything; add --allow-pickle to open them with "
+            "an unpickler that makes arrays, numbers and text only"
+        )
+    return kind
+
+
+def _described(path: Path, logs: str | Path | None) -> tuple[LogsFile, Path | None]:
+    file = Path(logs) if logs is not None else find_file(path)
+    return (read_logs_file(file) if file else LogsFile()), file
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:
-    fmt = fmt or detect(path)
-    if fmt not in FORMATS:
-        raise LogError(f"unknown format '{fmt}'; use one of {', '.join(FORMATS)}")
+    reader = module(fmt or detect(path))
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    return import_module(f"gaponet.data.formats.{fmt}")
+    return reader
 
 
-def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec) -> Array:
-    """Positions or velocities in the unit of the log → rad or rad/s.
-
-    Args:
-        name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
-        values: (k, n), columns in the order of joint_names.
-        joint_names: The robot's own names, (n).
-        units: Unit of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
-        robot: Whose joint ranges give a fraction its meaning.
-    """
-    if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
-        return values
-    out = np.array(values, float)
-    for column, (joint, unit) in enumerate(zip(joint_names, units, strict=True)):
-        if unit == "deg":
-            out[:, column] *= np.pi / 180
-        if unit == "fraction":
-            low, high = robot.qpos_range[robot.joint_names.index(joint)]
-            out[:, column] = out[:, column] * (high - low) + (0.0 if name == "qvel" else low)
-    return out
+def _loaders(
+    reader: ModuleType, path: Path, robot: RobotSpec, told: LogsFile, names: dict[str, str]
+) -> Iterator[tuple[str, Callable[[], Log]]]:
+    """(name, what reads it) of every recording."""
+    if not hasattr(reader, "recordings"):
+        yield from reader.read(path, robot, names or None, **{k: v for k, v in told.items() if k in reader.OPTIONS})
+        return
+    full = cast("LogsFile", reader.DEFAULT | told)
+    found: Iterable[Recording] = reader.recordings(path, full)
+    if "command_file" in full:
+        found = _with_commands(list(found), full["command_file"])
+        full = cast("LogsFile", full | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
+    for recording in found:
+        yield recording.name, partial(to_log, recording, robot, full, names or None)
 
 
-def refuse_absurd(log: Log, robot: RobotSpec) -> Log:
-    """Return the log, or refuse positions that can only be degrees (or another joint's), and what no motor does.
-
-    A sensor may read more torque than the motor has, not 20 times as much.
-    """
-    columns = robot.index(log.joint_names)
-    for name in (n for n in UNITS if n in log.channels):
-        values = log.channels[name].values
-        if name in ("ctrl", "qpos"):
-            refuse_degrees(values, log.joint_names, robot, partial(_place, log, name))
+def _with_commands(found: list[Recording], pattern: str) -> Iterator[Recording]:
+    """Each recording together with its command_file, which is then no recording of its own."""
+    by_file = {Path(r.source).name: r for r in found}
+    wanted = {r.source: pattern.replace("{name}", r.name) for r in found}
+    for recording in found:
+        if Path(recording.source).name in wanted.values():
             continue
-        most = np.maximum(20 * robot.effort_limit[columns], 100.0) if name == "tau" else MOST[name]
-        beyond = np.argwhere(np.abs(values) > most)
-        if len(beyond):
-            row, column = beyond[0]
-            raise LogError(
-                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
-                f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
-            )
-    return log
+        if wanted[recording.source] not in by_file:
+            raise LogError(f'{recording.source}: its command_file "{wanted[recording.source]}" is not beside it')
+        yield recording.beside(by_file[wanted[recording.source]])
 
 
-def _place(log: Log, name: str, row: int) -> str:
-    return f"{log.row(name, row)}: {name}"
+def _beside_clock(told: LogsFile) -> dict[str, str]:
+    """Commands in a file of their own have the clock of that file."""
+    clock = told.get("clock", {})
+    mine = clock.get("ctrl") or told.get("time")
+    return clock | ({"ctrl": COMMAND + mine} if mine else {})
 
 
-def refuse_degrees(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
-    """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
+def _corrected(log: Log, robot: RobotSpec, told: LogsFile, names: dict[str, str]) -> Log:
+    """Signs and offsets, where logs.toml says some; both are noted."""
+    signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in told.get(t, {}).items()}  # type: ignore[attr-defined]
+                      for t in ("signs", "offsets"))  # fmt: skip
+    if not signs and not offsets:
+        return log
+    if 0 in signs.values():
+        raise UsageError("[signs] of logs.toml: a sign is 1 or -1")
+    sign = np.array([signs.get(j, 1) for j in log.joint_names], float)
+    offset = np.array([offsets.get(j, 0.0) for j in log.joint_names])
+    turned = {
+        name: Channel(
+            c.time, c.values if name == "temperature" else sign * c.values + offset * (name in ("ctrl", "qpos"))
+        )
+        for name, c in log.channels.items()
+    }
+    notes = log.meta.get("notes", {}) | {k: v for k, v in (("signs", signs), ("offsets", offsets)) if v}
+    return refuse_absurd(replace(log, channels=turned, meta=log.meta | {"notes": notes}), robot)
 
-    A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
-    """
-    for column, joint in enumerate(joint_names):
-        row = int(abs(values[:, column]).argmax())
-        value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
-        if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
-            raise LogError(
-                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
-                "must be in radians: these look like degrees (tables: --position-unit deg)"
-            )
+
+def _named(log: Log, said: dict[str, Any], robot: RobotSpec, names: dict[str, str]) -> Log:
+    """The log with what its name and logs.toml say of it; what the format itself says must not contradict."""
+    meta, stated = dict(log.meta), dict(log.meta.get("stated", {}))
+    for name in ("kp", "kd"):
+        if name in said:
+            meta[name] = _gains(name, said.pop(name), log, robot, names)
+    for name, value in said.items():
+        if stated.get(name) not in (None, value):
+            raise UsageError(f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one")
+        stated[name] = value
+    return replace(log, meta=meta | ({"stated": stated} if stated else {}))
+
+
+def _gains(name: str, said: Any, log: Log, robot: RobotSpec, names: dict[str, str]) -> list[float]:
+    """One number for all joints, or {joint: number} with the robot's own for the others ("": for all others)."""
+    if not isinstance(said, dict):
+        return [said] * len(log.joint_names)
+    given = {robot.resolve(j, f"{name} of logs.toml", names) if j else "": value for j, value in said.items()}
+    own = getattr(robot.nominal or robot, name)[robot.index(log.joint_names)]
+    return [given.get(j, given.get("", float(o))) for j, o in zip(log.joint_names, own, strict=True)]

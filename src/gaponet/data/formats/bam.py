@@ -1,4 +1,6 @@
-"""BAM's JSON (github.com/Rhoban/bam): one servo on a pendulum, {mass, length, kp, vin, motor, trajectory, entries}.
+"""JSON of BAM's servo test bench, a file or a folder of files.
+
+github.com/Rhoban/bam: one servo on a pendulum, {mass, length, kp, vin, motor, trajectory, entries}.
 
 The mass at the arm's end is the payload, and the arm's length says at which mount: `--robot xl330_bench` has one for
 each. kp is the firmware's; MOTORS makes N·m/rad of it. A recording ends where torque is switched off: from there on
@@ -7,7 +9,8 @@ nothing is commanded.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NotRequired
 
@@ -15,13 +18,13 @@ import numpy as np
 from annotated_types import Gt, Interval, Len
 from typing_extensions import TypedDict
 
-from gaponet.data.formats import is_bam, refuse_absurd
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
 from gaponet.structure import read_json
 
 OPTIONS: tuple[str, ...] = ()
+EXTRA = ""
 # Motor → N·m/rad for a firmware kp of 1 and 1 V. xl330: PWM is kp/256 of the error in ticks of 2π/4096, and 885 is all
 # of the voltage (both as the logs' load says); 0.52 N·m at 5 V at stall (ROBOTIS, XL330-M288-T).
 MOTORS = {"xl330": 4096 / (2 * np.pi) / 256 / 885 * 0.52 / 5}
@@ -52,19 +55,32 @@ class BamFile(TypedDict):
     entries: Annotated[list[Sample], Len(2)]
 
 
+def detects(path: Path) -> bool:
+    """A file that begins as BAM's do, or a folder with one."""
+    return any(f.suffix.lower() == ".json" and _is_bam(f) for f in ([path] if path.is_file() else path.glob("*.json")))
+
+
+def _is_bam(file: Path) -> bool:
+    with file.open("rb") as stream:
+        start = stream.read(4096)
+    return all(name in start for name in (b'"trajectory"', b'"entries"', b'"goal_position"'))
+
+
 def find(path: Path) -> list[Path]:
     """The recordings at or below a path."""
-    return [path] if path.is_file() else sorted(f for f in path.rglob("*.json") if is_bam(f))
+    return [path] if path.is_file() else sorted(f for f in path.rglob("*.json") if _is_bam(f))
 
 
-def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) -> Iterator[tuple[str, Log]]:
-    """Yield (trajectory, Log) for every recording; the motor's name stands for the joint."""
+def read(
+    path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None
+) -> Iterator[tuple[str, Callable[[], Log]]]:
+    """Yield (trajectory, what reads its Log) for every recording; the motor's name stands for the joint."""
     files = find(path)
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
     for file in files:
         told = read_json(BamFile, file, LogError, "record it again, or leave the file out", more=True)
-        yield told["trajectory"], refuse_absurd(_log(file, told, robot, joint_map), robot)
+        yield told["trajectory"], partial(_log, file, told, robot, joint_map)
 
 
 def _log(file: Path, told: BamFile, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:

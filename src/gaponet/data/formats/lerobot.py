@@ -1,4 +1,6 @@
-"""LeRobotDataset v3.0: one folder, many episodes; what gaponet exports, and stock sets of position-controlled arms.
+"""LeRobotDataset v3.0 folder: meta/info.json.
+
+One folder, many episodes; what gaponet exports, and stock sets of position-controlled arms.
 
     meta/info.json                          codebase_version "v3.0", fps, features, data_path
     meta/tasks.parquet                      task, task_index
@@ -14,22 +16,30 @@ its units, periods and metadata itself. Images and videos are left alone.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.formats import refuse_absurd, to_radians
+from gaponet.data.describe.joints import resolve_all
+from gaponet.data.describe.limits import to_radians
 from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
 from gaponet.data.log import Channel, Log
 from gaponet.errors import JointMismatchError, LogError, UsageError
 from gaponet.robot import RobotSpec
 
-OPTIONS = ("position_unit",)
+OPTIONS = ("position_unit", "joints")
+EXTRA = ""
 POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
 INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
+
+
+def detects(path: Path) -> bool:
+    """A folder with meta/info.json, or of such folders."""
+    return path.is_dir() and any(next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json"))
 
 
 def find(path: Path) -> list[Path]:
@@ -38,12 +48,17 @@ def find(path: Path) -> list[Path]:
 
 
 def read(
-    path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None, position_unit: str | None = None
-) -> Iterator[tuple[str, Log]]:
-    """Yield (motion name, Log) for every episode.
+    path: Path,
+    robot: RobotSpec,
+    joint_map: dict[str, str] | None = None,
+    position_unit: str | None = None,
+    joints: list[str] | None = None,
+) -> Iterator[tuple[str, Callable[[], Log]]]:
+    """Yield (motion name, what reads its Log) for every episode.
 
     Args:
         joint_map: The set's name of a joint → the robot's.
+        joints: Names of the values, for a set that does not name them.
         position_unit: One of POSITION_UNITS; not for what gaponet exported, which says rad itself.
     """
     for part in sets_under(path):
@@ -53,10 +68,9 @@ def read(
         for episode in part.episodes:
             file = part.data_file(episode)
             if file != open_file:
-                open_file, table = file, _Frames(part, file, robot, joint_map, unit)
+                open_file, table = file, _Frames(part, file, robot, joint_map, unit, joints)
             assert table is not None
-            log = table.episode(episode)
-            yield _motion(episode, tasks), refuse_absurd(log, robot)
+            yield _motion(episode, tasks), partial(table.episode, episode)
 
 
 def _unit(part: Set, given: str | None) -> str:
@@ -79,8 +93,11 @@ def _unit(part: Set, given: str | None) -> str:
 class _Frames:
     """Reads a data file once and cuts it into episodes."""
 
-    def __init__(self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str) -> None:
-        self.part, self.file, self.robot = part, file, robot
+    def __init__(
+        self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
+        joints: list[str] | None,
+    ) -> None:  # fmt: skip
+        self.part, self.file, self.robot, self.given = part, file, robot, joints
         features = part.features
         present = {ours: theirs for ours, theirs in FEATURES.items() if theirs in features}
         for need in ("ctrl", "qpos"):
@@ -110,12 +127,13 @@ class _Frames:
         names, where = spec["names"], f"{self.part.path}/meta/info.json: {feature}"
         if isinstance(names, dict):
             names = next((v for v in names.values() if isinstance(v, list)), None)
+        names = names or self.given
         if not names or len(names) != int(np.prod(spec["shape"])):
-            raise LogError(f"{where} does not name its {spec['shape']} values; write the joints' names there")
-        found = [self.robot.resolve(str(name).removesuffix(".pos"), where, joint_map) for name in names]
-        if len(set(found)) != len(found):
-            raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map")
-        return found
+            raise LogError(
+                f"{where} does not name its {spec['shape']} values; write joints = [their names, in order] into "
+                "logs.toml beside the set"
+            )
+        return resolve_all([str(name).removesuffix(".pos") for name in names], self.robot, where, joint_map)
 
     def _joint_unit(self, joint: str, unit: str) -> str:
         """A gripper is 0..100 of its range wherever the other joints are not SI."""

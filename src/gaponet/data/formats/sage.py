@@ -1,5 +1,6 @@
-"""SAGE folders: {real,sim}/{robot}/{source}/{motion}/{control,state_motor,event}.csv and joint_list.txt.
+"""SAGE folder: control.csv and state_motor.csv beside each other.
 
+{real,sim}/{robot}/{source}/{motion}/{control,state_motor,event}.csv and joint_list.txt.
 Rows are TYPE,timestamp,"[...]"; the case of TYPE differs between recordings. Real timestamps are microseconds,
 simulated ones seconds; the reader decides by the period and refuses one that is neither. Joints stand in the unit that
 the robot's `log_unit` says (SO-101's gripper: 0..1 of its range).
@@ -9,36 +10,47 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.formats import refuse_absurd, to_radians
+from gaponet.data.describe.joints import resolve_all
+from gaponet.data.describe.limits import to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
+FILES = ("control.csv", "state_motor.csv")
 OPTIONS: tuple[str, ...] = ()
+EXTRA = ""
 DIGITS = b"0123456789.+-eE \r"  # what numbers are made of; the rest of a row is its skeleton
 NUMBER = r" *(?:[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?nan|[-+]?inf) *"
 
 
+def detects(path: Path) -> bool:
+    """A folder with motion folders at or below it."""
+    return path.is_dir() and any(next(path.rglob(name), None) for name in FILES)
+
+
 def find(path: Path) -> list[Path]:
     """Real motion folders under path; simulated ones are skipped."""
-    folders = sorted({f.parent for name in ("control.csv", "state_motor.csv") for f in path.rglob(name)})
+    folders = sorted({f.parent for name in FILES for f in path.rglob(name)})
     return [f for f in folders if f.relative_to(path).parts[:1] != ("sim",)]
 
 
-def read(path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None) -> Iterator[tuple[str, Log]]:
-    """Yield (motion, Log) for every real motion folder under path."""
+def read(
+    path: Path, robot: RobotSpec, joint_map: dict[str, str] | None = None
+) -> Iterator[tuple[str, Callable[[], Log]]]:
+    """Yield (motion, what reads its Log) for every real motion folder under path."""
     folders = find(path)
     if not folders:
         raise LogError(f"{path}: no folder with control.csv and state_motor.csv; point at a SAGE folder")
     for folder in folders:
-        yield os.path.basename(os.path.abspath(folder)), refuse_absurd(_read_motion(folder, robot, joint_map), robot)
+        yield os.path.basename(os.path.abspath(folder)), partial(_read_motion, folder, robot, joint_map)
 
 
 def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | None) -> Log:
@@ -48,9 +60,7 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
     raw_names = [line.strip() for line in _text(list_file).splitlines() if line.strip()]
     if not raw_names:
         raise LogError(f"{list_file}: empty; one joint name a line, in the order of the columns")
-    names = tuple(robot.resolve(name, str(list_file), joint_map) for name in raw_names)
-    if len(set(names)) != len(names):
-        raise LogError(f"{list_file}: two names map to one joint: {', '.join(names)}; mend --map")
+    names = tuple(resolve_all(raw_names, robot, str(list_file), joint_map))
     control, state = folder / "control.csv", folder / "state_motor.csv"
     ctrl_time, ctrl = _read_csv(control, len(names), "control")
     state_time, values = _read_csv(state, len(names), "state_motor")

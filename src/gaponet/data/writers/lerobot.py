@@ -24,10 +24,10 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
-from gaponet.data.formats.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry, dataset_hash
+from gaponet.data.writers.lerobot_stats import EpisodeStats, episode_stats, pool
 from gaponet.errors import DatasetError
 from gaponet.files import MARK, sync, writing
 from gaponet.progress import Progress, silent

@@ -1,0 +1,197 @@
+"""A logs.toml for strange logs, filled in as far as names and numbers show it; what is a guess is marked as one."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.describe.recording import SECONDS, Recording
+from gaponet.errors import JointMismatchError, LogError
+from gaponet.robot import RobotSpec
+
+# Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
+WORDS = {
+    "ctrl": ("ctrl", "cmd", "command", "commanded", "des", "desired", "target", "goal", "ref", "reference", "action",
+             "setpoint", "sp"),
+    "qvel": ("qvel", "vel", "velocity", "velocities", "dq", "qd", "speed", "dof_vel"),
+    "tau": ("tau", "torque", "torques", "effort", "trq", "tau_est", "current"),
+    "temperature": ("temperature", "temp"),
+    "qpos": ("qpos", "pos", "position", "positions", "q", "meas", "measured", "actual", "act", "state", "angle", "enc"),
+}  # fmt: skip
+CLOCKS = ("time", "t", "timestamp", "stamp", "time_s", "time_ms", "time_us", "time_ns", "clock", "ts")
+NOT_POSITIONS = ("qvel", "tau", "temperature")
+ROWS = 4000  # that are looked at
+
+
+def guess_logs(recordings: list[Recording], robot: RobotSpec, fmt: str, known: dict[str, Any]) -> str:
+    """The text of a logs.toml.
+
+    Args:
+        recordings: Of one kind; the first is looked at, the names of all are listed.
+        known: What is said already (a logs.toml, the format's own), which is kept.
+    """
+    if not recordings:
+        raise LogError("no recording found")
+    first = recordings[0]
+    told = dict(known) | {k: v for k, v in first.default.items() if k not in known}
+    lines = [f"# {fmt}, {len(recordings)} recording(s); the first: {first.where or first.source}",
+             f"# its columns: {first.shown(40)}", "# Lines with a ? are guesses: look at them.", ""]  # fmt: skip
+    said = {c: told[c] for c in WORDS if c in told and _values(first, told[c]) is not None}
+    channels = _channels(first) | said
+    joints = _joints(first, channels)
+    lines += _clock(first, told)
+    lines += _positions(first, channels)
+    lines += [f"{channel} = {_text(name)}" for channel, name in channels.items()]
+    for need in ("ctrl", "qpos"):
+        if need not in channels:
+            lines.append(f'# {need} = "…"          ? none of the names looks like it')
+    lines += _names(channels, joints, robot)
+    lines += ["", "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
+              f"# names here: {', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
+              f"motion = {_text(_pattern([r.name for r in recordings]))}",
+              '# manifest = "sheet.csv"', '# unit = "…"', "# payload = 0.0        # kg",
+              "# kp = …               # N·m/rad while recording; default: robot.toml's"]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def _text(value: str) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _tokens(name: str) -> list[str]:
+    return [w for w in re.split(r"[^a-z0-9]+", re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()) if w]
+
+
+def _kind(name: str) -> str | None:
+    """Which channel a name speaks of; of a command's, positions only."""
+    found = [channel for channel, words in WORDS.items() if any(w in words for w in _tokens(name))]
+    if found and found[0] == "ctrl" and any(c in found for c in NOT_POSITIONS):
+        return None  # a commanded velocity or torque
+    return found[0] if found else None
+
+
+def _channels(recording: Recording) -> dict[str, str]:
+    """channel → array, or pattern of columns with {joint}."""
+    found: dict[str, str] = {}
+    arrays = [n for n, labels in recording.signals.items() if labels]
+    for name in sorted(arrays, key=lambda n: -len(recording.signals[n])):
+        kind = _kind(name)
+        if kind:
+            found.setdefault(kind, name)
+    singles = [n for n, labels in recording.signals.items() if not labels and n.lower() not in CLOCKS]
+    shapes: dict[str, dict[str, int]] = {}
+    for name in singles:
+        kind = _kind(name)
+        for pattern in _patterns(name) if kind else ():
+            counts = shapes.setdefault(str(kind), {})
+            counts[pattern] = counts.get(pattern, 0) + 1
+    for kind, counts in shapes.items():
+        best = max(counts, key=lambda p: (counts[p], len(p)))
+        if kind not in found:
+            found[kind] = best
+    return found
+
+
+def _patterns(name: str) -> list[str]:
+    """Each way to read a name as joint and word: shoulder_pan_des → {joint}_des; cmd_1 → cmd_{joint}."""
+    found = []
+    for match in re.finditer(r"[A-Za-z0-9]+", name):
+        word = match[0].lower()
+        if any(word in words for words in WORDS.values()):
+            before, after = name[: match.start()], name[match.end() :]
+            if after and not re.search("[A-Za-z0-9]", before):
+                found.append(name[: match.end()] + after[0] + "{joint}" if not after[0].isalnum() else "{joint}")
+            elif before:
+                found.append("{joint}" + name[match.start() - 1 :])
+    return found or [name]
+
+
+def _joints(recording: Recording, channels: dict[str, str]) -> list[str]:
+    """Names of the joints as the log has them, in its order; digits where it has none."""
+    pattern = channels.get("qpos") or channels.get("ctrl")
+    if pattern is None:
+        return []
+    if "{joint}" not in pattern:
+        return list(recording.signals.get(pattern) or ("0",))
+    before, after = map(re.escape, pattern.split("{joint}"))
+    return [m[1] for c in recording.columns if (m := re.fullmatch(f"{before}(.+?){after}", c))]
+
+
+def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> list[str]:
+    """joints and [names]."""
+    if not joints:
+        return []
+    if all(j.isdigit() for j in joints) and "{joint}" not in (channels.get("qpos") or channels["ctrl"]):
+        n = len(joints)
+        own = list(robot.joint_names[:n]) + [""] * (n - len(robot.joint_names))
+        said = "the robot's order: is it the log's?" if n >= len(robot.joint_names) else "which joints are these?"
+        return [f"joints = {json.dumps(own)}  # ? {said}"]
+    strange = []
+    for joint in joints:
+        try:
+            robot.resolve(joint, "")
+        except JointMismatchError:
+            strange.append(joint)
+    if not strange:
+        return []
+    left = [j for j in robot.joint_names if j not in joints]
+    in_order = len(left) == len(strange)
+    lines = ["", "[names]  # ? the log's = the robot's" + (", in the order of both" if in_order else "")]
+    for i, joint in enumerate(strange):
+        lines.append(f"{_text(joint)} = {_text(left[i] if in_order else '…')}")
+    return lines
+
+
+def _clock(recording: Recording, told: dict[str, Any]) -> list[str]:
+    """time or rate, and time_unit."""
+    if "rate" in told:
+        return [f"rate = {told['rate']:g}  # Hz"]
+    named = [n for n, labels in recording.signals.items() if not labels]
+    clock = next((n for n in named if n == told.get("time") or n.lower() in CLOCKS), None)
+    if clock is None:
+        own = [n for n in list(recording.signals)[:1] if recording.load([n])[n].time is not None]
+        return [] if own else ["rate = 50.0  # ? Hz: the log has no clock"]
+    period = float(np.median(np.diff(recording.load([clock])[clock].values[:ROWS])))
+    units = [u for u, s in SECONDS.items() if 5e-4 <= period * s <= 0.2]
+    unit = units[0] if units else "s"
+    lines = [] if clock == "time" else [f"time = {_text(clock)}"]
+    return [*lines, f'time_unit = "{unit}"  # the median period is {period * SECONDS[unit]:.6g} s']
+
+
+def _values(recording: Recording, pattern: str) -> Array | None:
+    """(rows, joints) of a channel, in the log's own order."""
+    if pattern in recording.signals:
+        values = recording.load([pattern])[pattern].values[:ROWS]
+        return values if values.ndim == 2 else values[:, None]
+    if "{joint}" not in pattern:
+        return None
+    before, after = map(re.escape, pattern.split("{joint}"))
+    names = [c for c in recording.columns if re.fullmatch(f"{before}(.+?){after}", c) and c in recording.signals]
+    if not names:
+        return None
+    loaded = recording.load(names)
+    return np.stack([loaded[n].values[:ROWS] for n in names], axis=1)
+
+
+def _positions(recording: Recording, channels: dict[str, str]) -> list[str]:
+    values = _values(recording, channels.get("qpos") or channels.get("ctrl") or "")
+    if values is None or not np.isfinite(values).any():
+        return ['position_unit = "rad"  # ?']
+    span = float(np.nanmax(np.abs(values)))
+    unit = "rad" if span <= 7 else "deg"
+    return [f'position_unit = "{unit}"  # ? values up to {span:.3g}']
+
+
+def _pattern(names: list[str]) -> str:
+    """What the names have in common: a payload with its unit, a trailing number."""
+    pattern = "{motion}"
+    if all(re.search(r"_\d+(?:[.p]\d+)?kg", n) for n in names):
+        pattern += "_{payload:g}kg"
+    if all(re.search(r"_(?:rep|r|run|take)?\d+$", n) for n in names):
+        word = re.search(r"_(rep|r|run|take)?\d+$", names[0])
+        pattern += f"_{word[1] or '' if word else ''}" + "{rep}"
+    return pattern

@@ -1,0 +1,50 @@
+"""Names of joints in a log → the robot's own."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+
+from gaponet.errors import JointMismatchError
+from gaponet.robot import RobotSpec
+
+
+def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None) -> list[str]:
+    """The robot's joint of each name in a log, in the same order; one error for all that it does not have.
+
+    Args:
+        names: As the log writes them; /robot/link/joint is reduced to its last part.
+        where: File, for the error.
+        joint_map: The log's name → the robot's, tried first.
+
+    Raises:
+        JointMismatchError: A name is no joint of this robot, or two names are one joint.
+    """
+    found, strange = [], []
+    for name in names:
+        try:
+            found.append(robot.resolve(name, where, joint_map))
+        except JointMismatchError as error:
+            strange.append((name, error))
+    if len(strange) == 1:
+        raise strange[0][1]
+    if strange:
+        free = [j for j in robot.joint_names if j not in found]
+        maps = []
+        for name, _ in strange:
+            close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.3)
+            maps.append(f"--map {name}={close[0] if close else '…'}")
+            free = [j for j in free if j not in close]
+        raise JointMismatchError(
+            f"{where} names joints {', '.join(n for n, _ in strange)}, but robot '{robot.name}' has: "
+            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml"
+        )
+    if len(set(found)) != len(found):
+        raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map or [names]")
+    return found
+
+
+def ignored(name: str, patterns: Sequence[str]) -> bool:
+    """Whether a name in the log was said to be no joint of this robot."""
+    return not name or any(fnmatchcase(name, pattern) for pattern in patterns)

@@ -1,0 +1,86 @@
+"""What a log may hold: units become SI, and what no joint of this robot does is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.log import UNITS, Log
+from gaponet.errors import LogError
+from gaponet.robot import RobotSpec
+
+# Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
+MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
+UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
+
+
+def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: list[str], robot: RobotSpec) -> Array:
+    """Positions or velocities in the unit of the log → rad or rad/s.
+
+    Args:
+        name: Channel: an offset applies to positions (ctrl, qpos) only; torques and temperatures pass untouched.
+        values: (k, n), columns in the order of joint_names.
+        joint_names: The robot's own names, (n).
+        units: Unit of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
+        robot: Whose joint ranges give a fraction its meaning.
+    """
+    if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
+        return values
+    out = np.array(values, float)
+    for column, (joint, unit) in enumerate(zip(joint_names, units, strict=True)):
+        if unit == "deg":
+            out[:, column] *= np.pi / 180
+        if unit == "fraction":
+            low, high = robot.qpos_range[robot.joint_names.index(joint)]
+            out[:, column] = out[:, column] * (high - low) + (0.0 if name == "qvel" else low)
+    return out
+
+
+def refuse_absurd(log: Log, robot: RobotSpec) -> Log:
+    """Return the log, or refuse positions that can only be degrees (or another joint's), and what no motor does.
+
+    A sensor may read more torque than the motor has, not 20 times as much.
+    """
+    columns = robot.index(log.joint_names)
+    still, moved = (np.ptp(log.channels[name].values, axis=0).max() for name in ("ctrl", "qpos"))
+    if still == 0 and moved > UNASKED:
+        raise LogError(
+            f"{log.source}: every commanded position stands still while the joints move by up to {moved:.3g} rad: a "
+            "robot driven by torques, by velocities or by hand; such commands are no position targets to learn from"
+        )
+    for name in (n for n in UNITS if n in log.channels):
+        values = log.channels[name].values
+        if name in ("ctrl", "qpos"):
+            refuse_degrees(values, log.joint_names, robot, partial(_place, log, name))
+            continue
+        most = np.maximum(20 * robot.effort_limit[columns], 100.0) if name == "tau" else MOST[name]
+        beyond = np.argwhere(np.abs(values) > most)
+        if len(beyond):
+            row, column = beyond[0]
+            raise LogError(
+                f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
+                f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
+            )
+    return log
+
+
+def _place(log: Log, name: str, row: int) -> str:
+    return f"{log.row(name, row)}: {name}"
+
+
+def refuse_degrees(values: Array, joint_names: tuple[str, ...], robot: RobotSpec, where: Callable[[int], str]) -> None:
+    """Refuse positions (k, n) that can only be degrees, or another joint's; where: what to call a row in the error.
+
+    A real joint may pass its MJCF limit by a calibration offset, not by a radian and half a turn.
+    """
+    for column, joint in enumerate(joint_names):
+        row = int(abs(values[:, column]).argmax())
+        value, (low, high) = values[row, column], robot.qpos_range[robot.joint_names.index(joint)]
+        if abs(value) > 3.3 and (not low - 1.0 <= value <= high + 1.0 or abs(value) > MOST["qpos"]):
+            raise LogError(
+                f"{where(row)} of {joint} is {value:.3f}, outside its range [{low:.2f}, {high:.2f}] rad; positions "
+                "must be in radians: these look like degrees (--position-unit deg)"
+            )

@@ -1,0 +1,205 @@
+"""logs.toml: what a lab's logs mean, said once. It lies in the folder of the logs, or is given with --logs.
+
+format = "table"                          # where it cannot be seen
+motion = "{motion}_{payload:g}kg_{rep}"   # what the name of a recording says; with a slash: of its path
+manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, side, rep, kp, kd, kp.<joint>
+unit = "lab-1"                            # of all recordings; payload = 0.0, side = "both" likewise
+time = "t"                                # column of the clock; or rate = 50.0 (Hz) where the log has none
+time_unit = "ms"                          # s, ms, us, ns
+position_unit = "deg"                     # rad, deg, fraction (0..1 of the joint's range); velocities: per second
+ctrl = "{joint}_des"                      # columns of commanded positions; qpos, qvel, tau, temperature likewise
+command_file = "{name}_cmd.csv"           # where commands lie in a file beside the state's
+header = ["t", "q1_des", "q1"]            # names of the columns of a table that has none
+joints = ["shoulder", "elbow"]            # of the columns of an array that does not name them, in its order
+ignore = ["left_*"]                       # columns that are no joints of this robot; "" in joints does the same
+action_scale = 0.25                       # ctrl holds a policy's action: the target is home + scale · action
+kp = 20.0                                 # while recording, N·m/rad; kd likewise; [kp] elbow = 20.0 for one joint,
+                                          # or the name of an array that holds them, in the order of `joints`
+[columns]                                 # single columns: ours = the log's
+"ctrl.elbow" = "cmd_1"
+[names]                                   # the log's joint = the robot's
+[joint_units]                             # where one joint's position is in another unit
+[signs]                                   # elbow = -1: the log counts the other way round
+[offsets]                                 # rad to add to positions, after unit and sign
+[clock]                                   # a channel's own clock: ctrl = "t_cmd"
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
+
+from gaponet.errors import LogError, UsageError
+from gaponet.structure import read_toml
+
+NAME = "logs.toml"
+HINT = "gaponet import LOGS --robot ROBOT --guess writes one to start from"
+Text = Annotated[str, Len(1, 300)]
+Gain = Annotated[float, Interval(ge=0, le=1e6)]
+Sign = Annotated[int, Interval(ge=-1, le=1)]
+Offset = Annotated[float, Interval(ge=-10, le=10)]
+# What a name or a sheet may say of a recording: its word here → field of SequenceMeta, and what it looks like.
+FIELDS = {
+    "motion": ("motion", r".+"), "unit": ("unit_id", r".+"), "side": ("payload_side", r"[^_/]+"),
+    "payload": ("payload_mass", r"\d+(?:[.p]\d+)?"), "rep": ("repetition", r"\d+"),
+    "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "": ("", r".+?"),
+}  # fmt: skip
+NUMBERS = ("payload_mass", "repetition", "kp", "kd")
+
+
+class LogsFile(TypedDict, total=False):
+    """The fields of logs.toml, as the module says."""
+
+    format: Text
+    motion: Text
+    manifest: Text
+    unit: Text
+    payload: Annotated[float, Interval(ge=0, le=100)]
+    side: Text
+    time: Text
+    rate: Annotated[float, Interval(ge=1, le=10_000)]
+    time_unit: Text
+    position_unit: Text
+    ctrl: Text
+    qpos: Text
+    qvel: Text
+    tau: Text
+    temperature: Text
+    command_file: Text
+    header: Annotated[list[str], Len(1, 2000)]
+    joints: Annotated[list[str], Len(1, 500)]
+    ignore: list[str]
+    action_scale: Annotated[float, Interval(ge=1e-6, le=1e3)]
+    kp: Gain | dict[str, Gain] | Text
+    kd: Gain | dict[str, Gain] | Text
+    columns: dict[str, str]
+    names: dict[str, str]
+    joint_units: dict[str, str]
+    signs: dict[str, Sign]
+    offsets: dict[str, Offset]
+    clock: dict[str, str]
+
+
+def find_file(src: Path) -> Path | None:
+    """logs.toml in the folder of the logs, or beside the file."""
+    place = (src if src.is_dir() else src.parent) / NAME
+    return place if place.is_file() else None
+
+
+def read_logs_file(file: Path) -> LogsFile:
+    """What a logs.toml says."""
+    return read_toml(LogsFile, file, UsageError, f"docs/data-format.md lists the fields; {HINT}")
+
+
+class Naming:
+    """What the names of recordings say of them: by the pattern `motion`, and by the sheet `manifest`."""
+
+    def __init__(self, told: LogsFile, where: Path | None) -> None:
+        self.where = str(where or "logs.toml")
+        self.pattern, self.by_path = _pattern(told.get("motion"), self.where)
+        self.text = told.get("motion", "")
+        self.sheet = _read_sheet((where or Path()).parent / told["manifest"]) if "manifest" in told else None
+        self.unused = set(range(len(self.sheet or ())))
+        said = {k: told[k] for k in ("unit", "payload", "side", "kp", "kd") if k in told}
+        self.all = {FIELDS[k][0]: v for k, v in said.items() if k in ("unit", "side") or not isinstance(v, str)}
+
+    def of(self, name: str, path: str) -> dict[str, Any]:
+        """Fields of SequenceMeta for a recording called `name` at a path relative to the logs."""
+        found, path = dict(self.all), "#".join(map(_stem, path.split("#")))
+        if self.pattern:
+            match = self.pattern.fullmatch(path if self.by_path else name)
+            if not match:
+                raise LogError(
+                    f'{path}: its name does not look like motion = "{self.text}" of {self.where}; rename it, or list '
+                    "the recordings in a manifest"
+                )
+            found |= _fields(match.groupdict(), path)
+        if self.sheet is not None:
+            rows = [
+                i for i, row in enumerate(self.sheet)
+                if any(fnmatchcase(word, _stem(row["file"])) for word in (name, path, path.split("#")[0]))
+            ]  # fmt: skip
+            if len(rows) != 1:
+                raise LogError(
+                    f"{path}: {len(rows) or 'no'} rows of the manifest of {self.where} name it; one must: write "
+                    f"{name} under file"
+                )
+            self.unused -= set(rows)
+            found |= _fields({k: v for k, v in self.sheet[rows[0]].items() if k != "file"}, path)
+        return found
+
+    def require_all_used(self) -> None:
+        """Refuse rows of the sheet that name no recording: one that is missing, or a name with a slip."""
+        if self.sheet and self.unused:
+            names = ", ".join(self.sheet[i]["file"] for i in sorted(self.unused))
+            raise LogError(f"the manifest of {self.where} names recordings that are not there: {names}; mend the names")
+
+
+def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool]:
+    """The regular expression of "{motion}_{payload:g}kg", and whether it is of the path."""
+    if text is None:
+        return None, False
+    parts, seen = [], set()
+    for literal, word, brace in re.findall(r"([^{}]+)|\{(\w*)(?::[^{}]*)?\}|([{}])", text):
+        if brace or (not literal and (word not in FIELDS or (word and word in seen))):
+            known = ", ".join("{" + k + "}" for k in FIELDS)
+            raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
+        seen.add(word)
+        parts.append(re.escape(literal) if literal else f"(?P<{word}>{FIELDS[word][1]})" if word else FIELDS[""][1])
+    return re.compile("".join(parts)), "/" in text
+
+
+def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
+    """Words and their texts → fields of SequenceMeta; kp.<joint> becomes {"kp": {joint: number}}."""
+    found: dict[str, Any] = {}
+    for word, text in said.items():
+        if text is None or not text.strip():
+            continue
+        kind, _, joint = word.partition(".")
+        field = FIELDS[kind][0]
+        value: Any = text.strip()
+        if field in NUMBERS:
+            try:
+                value = float(value.replace("p", "."))
+                if not (np.isfinite(value) and value >= 0 and (field != "repetition" or value == int(value))):
+                    raise ValueError
+            except ValueError:
+                raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
+            value = int(value) if field == "repetition" else value
+        if joint:
+            gains = found.get(field, {})
+            value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
+        found[field] = value
+    return found
+
+
+def _stem(file: str) -> str:
+    return re.sub(r"\.(csv|txt|parquet|npz|pt|mat|h5|hdf5|db3|mcap|json|pkl|dat|tsv)$", "", file)
+
+
+def _read_sheet(file: Path) -> list[dict[str, str]]:
+    """The rows of a manifest; columns that say nothing here are left alone."""
+    if not file.is_file() or file.stat().st_size > 16 << 20:
+        raise UsageError(f"{file}: the manifest is missing, or no table; a CSV with a column file")
+    try:
+        rows = list(csv.DictReader(io.StringIO(file.read_text(encoding="utf-8-sig"))))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UsageError(f"{file}: not a CSV table ({error})") from None
+    if not rows or not rows[0].get("file"):
+        raise UsageError(f"{file}: a manifest has a column file, and a row for each recording")
+    columns = ["file", *_known(rows[0])]
+    return [{c: row[c] or "" for c in columns if row.get(c) is not None} for row in rows if row.get("file")]
+
+
+def _known(columns: Iterable[Any]) -> list[str]:
+    return [c for c in columns if isinstance(c, str) and c and c.partition(".")[0] in FIELDS and c.count(".") <= 1
+            and ("." not in c or c.partition(".")[0] in ("kp", "kd"))]  # fmt: skip

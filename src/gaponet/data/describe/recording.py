@@ -1,0 +1,310 @@
+"""A recording as it lies in a file: named signals, of which logs.toml says what they are. `to_log` is the way on."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.describe.joints import ignored, resolve_all
+from gaponet.data.describe.limits import to_radians
+from gaponet.data.describe.logs_file import HINT, LogsFile
+from gaponet.data.log import CHANNELS, REQUIRED, Channel, Log
+from gaponet.errors import LogError, UsageError
+from gaponet.robot import LOG_UNITS, RobotSpec
+
+WIDEST = 500  # columns of an array that may be joints
+SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SAY_UNITS = "--position-unit rad --time-unit s (or position_unit and time_unit in logs.toml)"
+COMMAND = "command:"  # before the names of signals that lie in a command_file
+NO_COMMANDS = (
+    "without commanded positions there is no gap to measure: a state says where the robot was, not where it was told "
+    "to go, and the commands of a robot driven by torques or velocities are no position targets, from which this "
+    "version cannot learn. What can still be done: record the position controller's targets beside the state, or play "
+    "the recorded positions again as a motion (gaponet run) with both recorded"
+)
+
+
+class Signal(NamedTuple):
+    """values (k,) or (k, n); time (k,) s where the signal has a clock of its own."""
+
+    values: Array
+    time: Array | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recording.
+
+    Attributes:
+        name: Its motion, unless something says better.
+        source: File or folder, with #part where a file holds several.
+        signals: Name → names of its columns, (n); digits where the file does not name them; () for a single column.
+        load: Reads the signals of these names.
+        where: What to call the place of the names in errors.
+        files: What it was read from, for the hash.
+        first_line: Of its rows in the file.
+        meta: What the format says beside: stated, dt, notes, as in Log.meta.
+        default: What of logs.toml this recording itself shows, unless something else is said.
+    """
+
+    name: str
+    source: str
+    signals: dict[str, tuple[str, ...]]
+    load: Callable[[list[str]], dict[str, Signal]]
+    where: str = ""
+    files: tuple[str, ...] = ()
+    first_line: int = 1
+    meta: dict[str, Any] = field(default_factory=dict)
+    default: LogsFile = field(default_factory=lambda: LogsFile())
+
+    @property
+    def columns(self) -> dict[str, tuple[str, int | None]]:
+        """Every column by the name that logs.toml may call it: "signal" or "signal[label]" → (signal, which)."""
+        return {
+            f"{name}[{label}]" if labels else name: (name, i if labels else None)
+            for name, labels in self.signals.items()
+            for i, label in enumerate(labels or ("",))
+        }
+
+    def shown(self, most: int = 12) -> str:
+        """The signals, for an error."""
+        names = [f"{name}[{len(labels)}]" if labels else name for name, labels in self.signals.items()]
+        return ", ".join(names[:most]) + (", …" if len(names) > most else "")
+
+    def beside(self, commands: Recording) -> Recording:
+        """This recording with the signals of another file, under COMMAND."""
+
+        def load(names: list[str]) -> dict[str, Signal]:
+            theirs = [n.removeprefix(COMMAND) for n in names if n.startswith(COMMAND)]
+            loaded = {COMMAND + n: s for n, s in commands.load(theirs).items()} if theirs else {}
+            return self.load([n for n in names if not n.startswith(COMMAND)]) | loaded
+
+        signals = self.signals | {COMMAND + n: labels for n, labels in commands.signals.items()}
+        files = self.files + commands.files
+        return Recording(
+            self.name, self.source, signals, load, self.where, files, self.first_line, self.meta, self.default
+        )
+
+
+def from_arrays(
+    file: Path, arrays: dict[str, Any], names: tuple[str, ...] = (), name: str = "", part: str = "", **more: Any
+) -> Recording:
+    """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
+
+    Args:
+        names: Of the columns of arrays that have so many.
+        name: Default the file's.
+        part: Which of several in the file.
+        more: meta, default.
+    """
+    kept = {
+        n: a
+        for n, a in arrays.items()
+        if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
+        and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
+    }  # fmt: skip
+    signals = {
+        n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
+        for n, a in kept.items()
+    }
+    source = f"{file}#{part}" if part else str(file)
+    load = lambda wanted: {n: Signal(kept[n].astype(float)) for n in wanted}  # noqa: E731
+    return Recording(name or file.stem, source, signals, load, source, (str(file),), **more)
+
+
+@contextmanager
+def reading(file: Path, what: str) -> Iterator[None]:
+    """Whatever a damaged file makes a library do becomes one error: they raise a dozen kinds, and name none."""
+    try:
+        yield
+    except LogError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise LogError(
+            f"{file}: not a readable {what} ({reason}); it may be cut short: copy or record it again"
+        ) from None
+
+
+Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
+Chosen = dict[str, Columns]  # by channel
+
+
+def to_log(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Log:
+    """A Log of the columns that `told` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
+    told = recording.default | told
+    chosen = _choose(recording, robot, told, joint_map)
+    units = _units(robot, told, list(chosen["ctrl"]), joint_map)
+    clocks = {channel: told.get("clock", {}).get(channel) or told.get("time") for channel in chosen}
+    gains = {name: _gain_columns(recording, told, name, chosen["ctrl"]) for name in ("kp", "kd")}
+    names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
+    loaded = recording.load([*names, *{c for c in clocks.values() if c in recording.signals and c not in names}])
+    times = {channel: _time(recording, told, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen}
+    joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
+    in_units = [units[j] for j in joints]
+    channels = {}
+    for channel, columns in chosen.items():
+        values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
+        if channel == "ctrl" and "action_scale" in told:
+            values = robot.qpos_home[robot.index(joints)] + told["action_scale"] * values
+        channels[channel] = Channel(times[channel], to_radians(channel, values, joints, in_units, robot))
+    start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
+    shifted = {id(c.time): c.time - start for c in channels.values()}  # epoch nanoseconds would lose their digits
+    meta = dict(recording.meta)
+    for name, columns in gains.items():
+        if columns:
+            meta[name] = [_constant(recording, name, _column(loaded, *columns[j])) for j in joints]
+    if "rate" in told:
+        meta["dt"] = 1 / told["rate"]
+    return Log(
+        robot.name, joints, {n: Channel(shifted[id(c.time)], c.values) for n, c in channels.items()}, recording.source,
+        meta | {
+            "files": dict.fromkeys(channels, recording.files[0] if recording.files else recording.source),
+            "all_files": recording.files,
+            "first_line": recording.first_line,
+            "converted_from": {j: u for j, u in zip(joints, in_units, strict=True) if u != "rad"},
+        },
+    )  # fmt: skip
+
+
+def _choose(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Chosen:
+    """Which column holds what."""
+    where, columns = recording.where or recording.source, recording.columns
+    single = told.get("columns", {})
+    for ours, theirs in single.items():
+        if ours.partition(".")[0] not in CHANNELS or "." not in ours:
+            raise UsageError(f"logs.toml: '{ours}' is neither time nor {'.<joint>, '.join(CHANNELS)}.<joint>")
+        if theirs not in columns:
+            raise LogError(f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}")
+    found: Chosen = {}
+    for channel in CHANNELS:
+        named = _matching(recording, told, channel, set(single.values()))
+        named += [(ours.partition(".")[2], theirs) for ours, theirs in single.items() if ours.startswith(f"{channel}.")]
+        named = [(joint, column) for joint, column in named if not ignored(joint, told.get("ignore", ()))]
+        if not named:
+            continue
+        joints = resolve_all([joint for joint, _ in named], robot, where, joint_map)
+        found[channel] = {joint: columns[column] for joint, (_, column) in zip(joints, named, strict=True)}
+    _require_complete(found, recording, told)
+    return found
+
+
+def _matching(recording: Recording, told: LogsFile, channel: str, taken: set[str]) -> list[tuple[str, str]]:
+    """(joint, column) of a pattern: "{joint}_des", or an array whose columns are joints."""
+    pattern = told.get(channel)
+    if not isinstance(pattern, str):
+        return []
+    if pattern in recording.signals and "{joint}" not in pattern:
+        own, given = recording.signals[pattern], told.get("joints")
+        labels = own or ("0",)
+        if all(label.isdigit() for label in labels):
+            if given is None or len(given) != len(labels):
+                said = f"joints has {len(given)}" if given else "nothing names them"
+                raise LogError(
+                    f"{recording.where or recording.source}: {pattern} has {len(labels)} columns and {said}; write "
+                    f"joints = [{len(labels)} names, in its order] into logs.toml"
+                )
+            labels = tuple(given)
+        return [(joint, f"{pattern}[{x}]" if own else pattern) for joint, x in zip(labels, own or "0", strict=True)]
+    if pattern.count("{joint}") != 1:
+        return []  # an array that this recording does not have
+    before, after = map(re.escape, pattern.split("{joint}"))
+    fits = re.compile(f"{before}(?P<joint>.+?){after}")
+    return [
+        (m["joint"], column)
+        for column in recording.columns
+        if column not in taken and (m := fits.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
+    ]
+
+
+def _gain_columns(recording: Recording, told: LogsFile, name: str, ctrl: Columns) -> Columns:
+    """joint → column, where logs.toml says that an array holds the gains; it has the columns of the command's."""
+    said = told.get(name)
+    if not isinstance(said, str):
+        return {}
+    widths = {len(recording.signals[signal]) for signal, _ in ctrl.values()}
+    if said not in recording.signals or widths != {len(recording.signals[said])}:
+        raise LogError(
+            f'{recording.where or recording.source}: {name} = "{said}" is no array like the command\'s; there are: '
+            f"{recording.shown()}"
+        )
+    return {joint: (said, which) for joint, (_, which) in ctrl.items()}
+
+
+def _constant(recording: Recording, name: str, values: Array) -> float:
+    """A gain that stood still."""
+    if np.ptp(values) > 1e-3 * max(abs(float(values[0])), 1e-9):
+        raise LogError(
+            f"{recording.source}: {name} changes from {values.min():g} to {values.max():g} while it is "
+            "recorded; cut the log where it does"
+        )
+    return float(values[0])
+
+
+def _require_complete(found: Chosen, recording: Recording, told: LogsFile) -> None:
+    where = recording.where or recording.source
+    for need in REQUIRED:
+        if need in found:
+            continue
+        said = f' (said to be "{told[need]}")' if need in told else ""  # type: ignore[literal-required]
+        why = f": {NO_COMMANDS}" if need == "ctrl" else ""
+        raise LogError(
+            f'{where}: no column holds {need}.<joint>{said}; there are: {recording.shown()}. Say {need} = "…" in '
+            f"logs.toml ({HINT}){why}"
+        )
+    for kind in found:
+        odd = sorted(found["ctrl"].keys() ^ found[kind].keys())
+        if odd:
+            other = kind if odd[0] in found["ctrl"] else "ctrl"
+            raise LogError(f"{where}: column '{other}.{odd[0]}' is missing: every channel needs the same joints")
+
+
+def _units(robot: RobotSpec, told: LogsFile, joints: list[str], joint_map: dict[str, str] | None) -> dict[str, str]:
+    """The unit of each joint's positions; refuses one that nobody said."""
+    single = {
+        robot.resolve(j, "[joint_units] of logs.toml", joint_map): u for j, u in told.get("joint_units", {}).items()
+    }
+    for what, unit, known in (
+        ("time unit", told.get("time_unit", "s" if "rate" in told else ""), tuple(SECONDS)),
+        ("position unit", told.get("position_unit", ""), LOG_UNITS),
+        *((f"unit of {joint}", unit, LOG_UNITS) for joint, unit in single.items()),
+    ):
+        if unit not in known:
+            given = f"'{unit}' is not one of {', '.join(known)}" if unit else "is not given"
+            raise UsageError(f"the table's {what} {given}; say it with {SAY_UNITS}")
+    return {joint: single.get(joint, told["position_unit"]) for joint in joints}
+
+
+def _time(
+    recording: Recording, told: LogsFile, loaded: dict[str, Signal], clock: str | None, channel: str,
+    columns: Columns,
+) -> Array:  # fmt: skip
+    """The time stamps of a channel, s, from any start."""
+    where = recording.where or recording.source
+    own = next(loaded[signal] for signal, _ in columns.values())
+    if channel not in told.get("clock", {}) and own.time is not None:
+        return own.time
+    if "rate" in told:
+        return np.arange(len(own.values)) / told["rate"]
+    if clock not in recording.signals:
+        said = f"'{clock or 'time'}' (the clock of {channel})"
+        raise LogError(
+            f'{where}: column {said} is missing; there are: {recording.shown()}. Say time = "…" in logs.toml, or '
+            f"rate = 50.0 (Hz) where the log has no clock ({HINT})"
+        )
+    time = np.asarray(loaded[clock].values, float)
+    if time.shape != (len(own.values),):
+        raise LogError(f"{where}: clock '{clock}' has shape {time.shape}, {channel} {len(own.values)} rows")
+    return time * SECONDS[told.get("time_unit", "s")]
+
+
+def _column(loaded: dict[str, Signal], signal: str, which: int | None) -> Array:
+    values = loaded[signal].values
+    return values if which is None else values[:, which]

@@ -1,0 +1,108 @@
+"""NumPy .npz, or a folder of them: ours, GAPONet's motion files, ASAP's, or any with arrays of one row per sample.
+
+What gaponet data export wrote says everything itself. GAPONet's files hold many motions in one: real_dof_positions_cmd,
+real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero rows, or one array
+per motion; joint_sequence; payloads. They have no clock: logs.toml says rate = 50.0. In plain files logs.toml says
+which array is what; text in joint_names names the columns. Arrays of objects are opened as data.formats.pickles says.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, from_arrays, reading
+from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.log import CHANNELS, DERIVED
+from gaponet.errors import LogError
+from gaponet.structure import LARGEST_ARRAYS, parse_json
+
+OPTIONS = DESCRIBED
+EXTRA = ""
+DEFAULT: LogsFile = {"time": "time"}
+GAPONET: LogsFile = {
+    "ctrl": "real_dof_positions_cmd", "qpos": "real_dof_positions", "qvel": "real_dof_velocities",
+    "tau": "real_dof_torques", "position_unit": "rad",
+}  # fmt: skip
+NAMES = ("joint_names", "joint_sequence", "dof_names")
+OURS = "gaponet"  # array with JSON in a file of ours
+
+
+def detects(path: Path) -> bool:
+    """A file of that suffix, or a folder with one at or below it."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """The files."""
+    return files_under(path, (".npz",))
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every file, or every motion in it."""
+    for file in find(path):
+        arrays = _read(file)
+        names = next((tuple(map(str, arrays[n].ravel())) for n in NAMES if n in arrays), ())
+        if OURS in arrays:
+            yield _ours(file, arrays, names)
+        elif all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
+            yield from _motions(file, arrays, names)
+        else:
+            yield from_arrays(file, arrays, names)
+
+
+def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recording:
+    """What data.writers.npz wrote: SI, and all that we know of it."""
+    told = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
+    stated = told.get("stated") if isinstance(told.get("stated"), dict) else {}
+    default = LogsFile(time_unit="s", position_unit="rad")
+    default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
+    meta = {"stated": stated} | ({"dt": told["dt"]} if isinstance(told.get("dt"), float) else {})
+    return from_arrays(file, arrays, names, meta=meta, default=default)
+
+
+def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[Recording]:
+    """GAPONet's: the first axis counts motions."""
+    keys = [k for k in GAPONET.values() if k in arrays]
+    count = min(len(arrays[k]) for k in keys)
+    payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
+    for i in range(count):
+        one = {k: np.asarray(arrays[k][i], float) for k in keys}
+        if any(a.ndim != 2 for a in one.values()):
+            raise LogError(f"{file}: motion {i} of {', '.join(keys)} is not rows of joints; write it again")
+        rows = min(len(a) for a in one.values())
+        used = np.flatnonzero(
+            one["real_dof_positions"][:rows].any(axis=1) | one["real_dof_positions_cmd"][:rows].any(axis=1)
+        )
+        end = int(used[-1]) + 1 if len(used) else 0  # behind it zeros pad the array
+        stated = {"payload_mass": float(payloads[i])} if len(payloads) == count else {}
+        default = {k: v for k, v in GAPONET.items() if v in one or k == "position_unit"}
+        one = {k: a[:end] for k, a in one.items()}
+        yield from_arrays(file, one, names, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Every array; those of objects through pickles.load."""
+    with reading(file, "npz file"), zipfile.ZipFile(file) as packed:
+        parts = packed.infolist()
+        if sum(part.file_size for part in parts) > LARGEST_ARRAYS:
+            raise LogError(f"{file}: unpacks to more than {LARGEST_ARRAYS >> 20} MiB; split it")
+        return {p.filename.removesuffix(".npy"): _array(packed.read(p), f"{file}: {p.filename}") for p in parts}
+
+
+def _array(data: bytes, where: str) -> Any:
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if header is None or not header(stream)[2].hasobject:
+        return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+    found = pickles.load(stream.read(), where)
+    if not isinstance(found, np.ndarray):
+        raise LogError(f"{where}: not an array")
+    return found

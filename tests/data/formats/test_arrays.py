@@ -1,0 +1,168 @@
+"""npz, HDF5, .mat, .pt and ASAP's pickle: the same motion in each, and what may not be opened."""
+
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+import strange_logs
+from strange_logs import motion
+
+from gaponet.cli.main import main
+from gaponet.data.formats import detect, pickles, read_logs
+from gaponet.errors import LogError, UsageError
+
+WRITERS = {
+    "npz": strange_logs.write_npz, "hdf5": strange_logs.write_aloha, "mat": strange_logs.write_mat,
+    "pace": strange_logs.write_pace, "asap": strange_logs.write_asap,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fmt", WRITERS)
+def test_the_same_motion_comes_out_of_each(tmp_path, arm, fmt):
+    WRITERS[fmt](tmp_path)
+    assert detect(tmp_path) == fmt
+    ((name, log),) = read_logs(tmp_path, arm, allow_pickle=True)
+    ctrl, qpos = motion()
+    assert name == {"hdf5": "episode_0", "asap": "walk"}.get(fmt, "a")
+    assert log.joint_names == ("shoulder", "elbow")
+    assert np.allclose(log.channels["ctrl"].values, ctrl)
+    assert np.allclose(log.channels["qpos"].values, qpos)
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
+
+
+@pytest.mark.parametrize("fmt", WRITERS)
+def test_half_a_file_is_one_clear_error(tmp_path, arm, fmt):
+    WRITERS[fmt](tmp_path)
+    file = next(f for f in tmp_path.iterdir() if f.suffix != ".toml")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(LogError, match=file.name + ".*not a "):
+        list(read_logs(tmp_path, arm, fmt, allow_pickle=True))
+
+
+@pytest.mark.parametrize("fmt", ["pace", "hdf5", "mat"])
+def test_an_array_without_names_asks_for_them(tmp_path, arm, fmt):
+    WRITERS[fmt](tmp_path)
+    toml = tmp_path / "logs.toml"
+    toml.write_text(toml.read_text().replace('joints = ["shoulder", "elbow"]\n', ""))
+    with pytest.raises(LogError, match=r"has 2 columns and nothing names them; write joints = \[2 names"):
+        list(read_logs(tmp_path, arm))
+    toml.write_text('joints = ["shoulder"]\n' + toml.read_text())
+    with pytest.raises(LogError, match="has 2 columns and joints has 1"):
+        list(read_logs(tmp_path, arm))
+
+
+@pytest.mark.parametrize("objects", [True, False])
+def test_gaponets_motion_file_holds_several_with_their_payloads(tmp_path, arm, objects):
+    strange_logs.write_gaponet(tmp_path, objects=objects)
+    found = list(read_logs(tmp_path, arm))
+    assert [name for name, _ in found] == ["a-0000", "a-0001"]
+    assert [log.meta["stated"]["payload_mass"] for _, log in found] == [0.0, 0.2]
+    assert [len(log.channels["qpos"].time) for _, log in found] == [40, 37 if objects else 40]
+    assert np.allclose(found[0][1].channels["ctrl"].values, motion()[0])
+
+
+def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
+    h5py = pytest.importorskip("h5py")
+    ctrl, qpos = motion()
+    with h5py.File(tmp_path / "low_dim.hdf5", "w") as file:
+        for i in (10, 2):
+            file[f"data/demo_{i}/obs/robot0_joint_pos"] = qpos
+            file[f"data/demo_{i}/targets"] = ctrl + 0.01 * i
+            file[f"data/demo_{i}/actions"] = np.zeros((40, 7))
+    with pytest.raises(LogError, match=r"no column holds ctrl.* there are: actions\[7\], obs/robot0_joint_pos\[2\]"):
+        list(read_logs(tmp_path, arm))
+    (tmp_path / "logs.toml").write_text(
+        strange_logs.sheet(ctrl="targets", qpos="obs/robot0_joint_pos", joints=arm.joint_names, rate=20.0,
+                           position_unit="rad")
+    )  # fmt: skip
+    found = list(read_logs(tmp_path, arm))
+    assert [name for name, _ in found] == ["low_dim-demo_2", "low_dim-demo_10"]
+    assert np.allclose(found[1][1].channels["ctrl"].values, ctrl + 0.1)
+
+
+def test_links_in_an_hdf5_file_are_not_followed(tmp_path, arm):
+    h5py = pytest.importorskip("h5py")
+    strange_logs.write_aloha(tmp_path)
+    with h5py.File(tmp_path / "episode_0.hdf5", "a") as file:
+        del file["action"]
+        file["action"] = h5py.ExternalLink(str(tmp_path / "other.hdf5"), "/action")
+        file["observations/loop"] = h5py.SoftLink("/observations")
+    with pytest.raises(
+        LogError, match=r"no column holds ctrl.* there are: observations/qpos\[2\], observations/qvel\[2\]\."
+    ):
+        list(read_logs(tmp_path, arm))
+
+
+def test_a_pickle_is_opened_only_where_that_was_allowed(tmp_path, arm, capsys):
+    strange_logs.write_asap(tmp_path)
+    with pytest.raises(UsageError, match="are Python pickles, which can hold anything; add --allow-pickle"):
+        list(read_logs(tmp_path, arm))
+    told = ["import", str(tmp_path), "--robot", str(arm.mjcf.parent), "--unit-id", "a", "--payload-mass", "0"]
+    assert main([*told, "--out", str(tmp_path / "data")]) == 2
+    assert main([*told, "--out", str(tmp_path / "data"), "--allow-pickle"]) == 0
+
+
+class Evil:
+    """Says to a pickle what to call."""
+
+    def __init__(self, *call):
+        self.call = call
+
+    def __reduce__(self):
+        return self.call
+
+
+def evil(tmp_path):
+    import os
+    import subprocess
+
+    mark = str(tmp_path / "ran")
+    yield from (Evil(os.system, (f"touch {mark}",)), Evil(subprocess.call, (["touch", mark],)))
+    yield from (Evil(eval, (f"open({mark!r}, 'w')",)), Evil(np.load, (mark,)))
+    yield from (Evil(np.fromfile, (mark,)), Evil(np.ndarray, ((1 << 40,),)), Evil(bytearray, (1 << 60,)))
+
+
+def test_a_hostile_pickle_runs_nothing(tmp_path, arm):
+    (tmp_path / "logs.toml").write_text('joints = ["shoulder", "elbow"]\naction_scale = 0.25\n')
+    for thing in evil(tmp_path):
+        for data in ({"walk": {"dof": thing}}, [thing], {"walk": {"dof": np.array([thing], object), "fps": 50}}):
+            (tmp_path / "a.pkl").write_bytes(pickle.dumps(data))
+            with pytest.raises(LogError):
+                list(read_logs(tmp_path, arm, allow_pickle=True))
+    for protocol in range(6):
+        found = pickles.load(pickle.dumps({"a": np.arange(6.0).reshape(2, 3), "b": [1, "x", None]}, protocol), "x")
+        assert np.array_equal(found["a"], np.arange(6.0).reshape(2, 3))
+        assert found["b"] == [1, "x", None]
+    assert not (tmp_path / "ran").exists()
+
+
+def test_hostile_objects_in_an_npz_run_nothing(tmp_path, arm):
+    for thing in evil(tmp_path):
+        np.savez(tmp_path / "a.npz", real_dof_positions=np.array([thing], object), real_dof_positions_cmd=np.zeros(1))
+        with pytest.raises(LogError, match="nothing of it was run"):
+            list(read_logs(tmp_path, arm))
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_pt_file_that_is_no_tensors_runs_nothing(tmp_path, arm):
+    import torch
+
+    for thing in evil(tmp_path):
+        torch.save({"time": thing}, tmp_path / "a.pt")
+        with pytest.raises(LogError, match=r"a\.pt: not a readable"):
+            list(read_logs(tmp_path, arm))
+    big = torch.zeros(1).expand(1 << 40)
+    torch.save({"time": big, "dof_pos": big, "des_dof_pos": big}, tmp_path / "a.pt")
+    with pytest.raises(LogError, match="no column holds ctrl"):
+        list(read_logs(tmp_path, arm))
+    assert not (tmp_path / "ran").exists()
+
+
+def test_an_array_that_says_it_is_huge_is_refused(tmp_path, arm):
+    strange_logs.write_npz(tmp_path)
+    huge = tmp_path / "a.npz"
+    with zipfile.ZipFile(huge, "w", zipfile.ZIP_DEFLATED) as packed:
+        packed.writestr("q.npy", bytes(600 << 20))
+    with pytest.raises(LogError, match="unpacks to more than 512 MiB"):
+        list(read_logs(tmp_path, arm))

@@ -1,0 +1,217 @@
+"""logs.toml: patterns, units, signs, clocks, names of recordings, sheets; and the one that --guess writes."""
+
+import json
+
+import numpy as np
+import pytest
+from logs import arm_columns, table_text, wave
+
+from gaponet.cli.main import main
+from gaponet.data.formats import detect, read_logs
+from gaponet.data.log import skipping
+from gaponet.data.store import Dataset
+from gaponet.errors import JointMismatchError, LogError, UsageError
+
+UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
+
+
+def theirs(rows=60, **names):
+    """The arm's table under a lab's own names."""
+    columns = arm_columns(rows)
+    told = {"time": "t", "ctrl.shoulder": "shoulder_des", "ctrl.elbow": "elbow_des", "qpos.shoulder": "shoulder_pos",
+            "qpos.elbow": "elbow_pos"} | names  # fmt: skip
+    return {told[name]: values for name, values in columns.items()}
+
+
+def write(folder, toml, name="wave.csv", columns=None):
+    folder.mkdir(exist_ok=True)
+    (folder / name).write_text(table_text(theirs() if columns is None else columns))
+    (folder / "logs.toml").write_text(UNITS + toml)
+    return folder
+
+
+NAMES = 'time = "t"\nctrl = "{joint}_des"\nqpos = "{joint}_pos"\n'
+
+
+def test_a_pattern_stands_for_all_joints(tmp_path, arm):
+    ((name, log),) = read_logs(write(tmp_path / "logs", NAMES), arm)
+    assert name == "wave"
+    assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
+    assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(60))
+
+
+def test_the_name_of_a_file_says_motion_payload_repetition_and_gain(tmp_path, arm):
+    told = NAMES + 'motion = "{motion}_{payload:g}kg_kp{kp:g}_{rep}"\n'
+    ((name, log),) = read_logs(write(tmp_path / "logs", told, "lift_fast_0.5kg_kp12_3.csv"), arm)
+    assert name == "lift_fast"
+    assert log.meta["stated"] == {"payload_mass": 0.5, "repetition": 3}
+    assert log.meta["kp"] == [12.0, 12.0]
+    (tmp_path / "logs" / "other.csv").write_text(table_text(theirs()))
+    with pytest.raises(LogError, match=r"other: its name does not look like motion = .*; rename it, or list"):
+        list(read_logs(tmp_path / "logs", arm))
+
+
+def test_a_sheet_says_what_names_do_not_and_every_recording_stands_in_it_once(tmp_path, arm):
+    folder = write(tmp_path / "logs", NAMES + 'manifest = "sheet.csv"\n', "run_7.csv")
+    sheet = folder / "sheet.csv"
+    sheet.write_text("file,motion,payload,unit,rep,kp,kp.elbow,who\nrun_7.csv,lift,0.2,b,1,15,9,Ann\n")
+    ((name, log),) = read_logs(folder, arm)
+    assert (name, log.meta["kp"]) == ("lift", [15.0, 9.0])
+    assert log.meta["stated"] == {"payload_mass": 0.2, "unit_id": "b", "repetition": 1}
+    sheet.write_text("file,motion\nrun_8.csv,lift\n")
+    with pytest.raises(LogError, match="run_7: no rows of the manifest"):
+        list(read_logs(folder, arm))
+    sheet.write_text("file,motion\nrun_7,lift\nrun_9,lift\n")
+    with pytest.raises(LogError, match="names recordings that are not there: run_9"):
+        list(read_logs(folder, arm))
+    sheet.write_text("file,payload\nrun_7,heavy\n")
+    with pytest.raises(LogError, match="payload is 'heavy', not a number"):
+        list(read_logs(folder, arm))
+
+
+def test_signs_and_offsets_come_after_units_and_are_noted(tmp_path, arm):
+    told = NAMES + "[signs]\nelbow = -1\n[offsets]\nelbow = 0.1\n"
+    ((_, log),) = read_logs(write(tmp_path / "logs", told), arm)
+    assert np.allclose(log.channels["qpos"].values[:, 1], 0.1 - arm_columns()["qpos.elbow"])
+    assert np.array_equal(log.channels["qpos"].values[:, 0], arm_columns()["qpos.shoulder"])
+    assert log.meta["notes"] == {"signs": {"elbow": -1}, "offsets": {"elbow": 0.1}}
+
+
+def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp_path, arm):
+    columns = theirs() | {f"{j}_{w}": np.zeros(60) for j in ("hip", "knee") for w in ("des", "pos")}
+    folder = write(tmp_path / "logs", NAMES, columns=columns)
+    with pytest.raises(
+        JointMismatchError, match=r"names joints hip, knee, but .* Map them with --map hip=\S+ --map knee="
+    ):
+        list(read_logs(folder, arm))
+    write(tmp_path / "logs", NAMES + 'ignore = ["hip", "kn*"]\n', columns=columns)
+    assert next(read_logs(folder, arm))[1].joint_names == ("shoulder", "elbow")
+
+
+@pytest.mark.parametrize("delimiter", [",", "\t", "   ", ";"])
+def test_a_table_without_header(tmp_path, arm, delimiter):
+    told = UNITS + NAMES + 'header = ["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"]\n'
+    body = table_text(theirs()).split("\n", 1)[1].replace(",", delimiter)
+    (tmp_path / "wave.txt").write_text(body)
+    (tmp_path / "logs.toml").write_text(told)
+    ((_, log),) = read_logs(tmp_path / "wave.txt", arm)
+    assert np.array_equal(log.channels["qpos"].values[:, 0], arm_columns()["qpos.shoulder"])
+    (tmp_path / "logs.toml").write_text(told.replace('"t", ', ""))
+    with pytest.raises(LogError, match=r"wave\.txt:1: 5 cells, header in logs.toml names 4"):
+        list(read_logs(tmp_path / "wave.txt", arm))
+
+
+def test_commands_in_a_file_of_their_own_keep_their_clock(tmp_path, arm):
+    state = {k: v for k, v in theirs().items() if not k.endswith("_des")}
+    command = {"t": 0.005 + 0.1 * np.arange(12)} | {
+        f"{j}_des": wave(12, 2, 0.1)[:, i] for i, j in enumerate(arm.joint_names)
+    }
+    folder = write(tmp_path / "logs", NAMES + 'command_file = "{name}_cmd.csv"\n', columns=state)
+    (folder / "wave_cmd.csv").write_text(table_text(command))
+    ((name, log),) = read_logs(folder, arm)
+    assert name == "wave"
+    assert log.channels["ctrl"].time == pytest.approx(command["t"])
+    assert len(log.channels["qpos"].time) == 60
+    (folder / "wave_cmd.csv").rename(folder / "cmd.csv")
+    with pytest.raises(LogError, match=r'its command_file ".*_cmd.csv" is not beside it'):
+        list(read_logs(folder, arm))
+
+
+def test_a_log_without_a_clock_has_the_rate_that_was_said(tmp_path, arm):
+    columns = {k: v for k, v in theirs().items() if k != "t"}
+    folder = write(tmp_path / "logs", NAMES.replace('time = "t"\n', ""), columns=columns)
+    with pytest.raises(LogError, match=r"Say time = .* or rate = 50.0 \(Hz\)"):
+        list(read_logs(folder, arm))
+    write(folder, NAMES.replace('time = "t"', "rate = 100.0"), columns=columns)
+    ((_, log),) = read_logs(folder, arm)
+    assert log.channels["qpos"].time[-1] == pytest.approx(0.59)
+
+
+def test_a_log_without_commands_says_what_can_still_be_done(tmp_path, arm):
+    folder = write(tmp_path / "logs", NAMES, columns={k: v for k, v in theirs().items() if not k.endswith("_des")})
+    with pytest.raises(LogError, match=r"no column holds ctrl.<joint> .* What can still be done: record"):
+        list(read_logs(folder, arm))
+
+
+def test_a_robot_driven_by_torques_is_refused_in_a_sentence(tmp_path, arm):
+    columns = theirs() | {"shoulder_des": np.zeros(60), "elbow_des": np.zeros(60), "elbow_pos": np.linspace(0, 1.4, 60)}
+    with pytest.raises(LogError, match="every commanded position stands still while the joints move by up to"):
+        list(read_logs(write(tmp_path / "logs", NAMES, columns=columns), arm))
+
+
+def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, capsys):
+    folder = write(tmp_path / "logs", NAMES)
+    lines = (folder / "wave.csv").read_text().split("\n")
+    lines[5] = lines[5].replace(",", ",x", 1)  # no number
+    lines[9] = ",".join(["nan"] * 5)
+    lines[20] = lines[10]  # back in time
+    (folder / "wave.csv").write_text("\n".join(lines))
+    (folder / "short.csv").write_text("t,shoulder_des\n0,1\n")
+    with skipping() as bad:
+        ((_, log),) = read_logs(folder, arm)
+    assert [line.rpartition("/")[2].split(":")[1] for line in bad if line.endswith("cut")] == ["6", "10", "21"]
+    assert any(line.startswith("left out: ") and "short.csv" in line for line in bad)
+    assert len(log.channels["qpos"].time) == 57
+    assert log.meta["notes"]["rows_cut"] == 3
+    told = ["--robot", str(arm.mjcf.parent), "--unit-id", "lab", "--payload-mass", "0", "--out", str(tmp_path / "data")]
+    assert main(["import", str(folder), *told]) == 2
+    assert main(["import", str(folder), *told, "--skip-bad", "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["cut"]) == 4
+    (entry,) = Dataset(tmp_path / "data").entries
+    assert entry.rows == 60  # nothing is stretched: what was cut is interpolated on the same clock
+    assert "resampled" in entry.meta.notes["rows"]
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        ('motion = "{motion}_{speed}"', "use each of {motion}, {unit}, {side}, {payload}"),
+        ('motion = "{motion}_{motion}"', "at most once"),
+        ('manifest = "no.csv"', "the manifest is missing, or no table"),
+        ("[signs]\nelbow = 0", "a sign is 1 or -1"),
+        ("kp = -1.0", "kp"),
+        ("rate = 0.0", "rate: should be greater than or equal to 1"),
+        ('[columns]\n"speed.elbow" = "t"', "'speed.elbow' is neither time nor ctrl"),
+    ],
+)
+def test_a_wrong_logs_toml_is_refused(tmp_path, arm, toml, message):
+    with pytest.raises((UsageError, LogError), match=message):
+        list(read_logs(write(tmp_path / "logs", NAMES + toml), arm))
+
+
+def test_a_folder_of_two_formats_asks_which(tmp_path, arm):
+    folder = write(tmp_path / "logs", NAMES)
+    np.savez(folder / "a.npz", q=np.zeros((3, 2)))
+    with pytest.raises(LogError, match=r"could be table \(.*\) and npz \(.*\); say --format table or --format npz"):
+        detect(folder)
+
+
+def test_the_guess_for_a_strange_table_reads_it(tmp_path, arm, capsys):
+    folder = write(tmp_path / "logs", "", "lift_0.2kg_1.csv")
+    right = next(read_logs(write(tmp_path / "other", NAMES), arm))[1]
+    (folder / "logs.toml").unlink()
+    assert main(["import", str(folder), "--robot", str(arm.mjcf.parent), "--guess"]) == 0
+    (folder / "logs.toml").write_text(capsys.readouterr().out)
+    ((name, log),) = read_logs(folder, arm)
+    assert name == "lift"
+    assert log.meta["stated"] == {"payload_mass": 0.2, "repetition": 1}
+    for channel in ("ctrl", "qpos"):
+        assert np.array_equal(log.channels[channel].values, right.channels[channel].values)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("timestamp", "cmd_shoulder", "cmd_elbow", "q_shoulder", "q_elbow"),
+        ("t", "shoulder.target", "elbow.target", "shoulder.position", "elbow.position"),
+        ("time", "shoulder/command", "elbow/command", "shoulder/actual", "elbow/actual"),
+    ],
+)
+def test_the_guess_knows_how_others_call_things(tmp_path, arm, capsys, names):
+    folder = write(tmp_path / "logs", "", columns=dict(zip(names, arm_columns().values(), strict=True)))
+    (folder / "logs.toml").unlink()
+    assert main(["import", str(folder), "--robot", str(arm.mjcf.parent), "--guess"]) == 0
+    (folder / "logs.toml").write_text(capsys.readouterr().out)
+    ((_, log),) = read_logs(folder, arm)
+    assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
+    assert np.array_equal(log.channels["qpos"].values[:, 1], arm_columns()["qpos.elbow"])

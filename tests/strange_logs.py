@@ -1,0 +1,179 @@
+"""The same two-joint motion in the files of other tools, for tests of readers and for fuzzing."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+from logs import late, wave
+
+ROWS = 40
+JOINTS = ("shoulder", "elbow")
+TOML = 'joints = ["shoulder", "elbow"]\n'
+
+
+def motion(rows: int = ROWS) -> tuple[np.ndarray, np.ndarray]:
+    """Commands and positions (rows, 2)."""
+    ctrl = wave(rows, 2, 0.02)
+    return ctrl, late(ctrl, 2)
+
+
+def write_npz(folder: Path, rows: int = ROWS) -> None:
+    """A plain one."""
+    ctrl, qpos = motion(rows)
+    np.savez(folder / "a.npz", target=ctrl, q=qpos, time=0.02 * np.arange(rows), joint_names=np.array(JOINTS))
+    (folder / "logs.toml").write_text('ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n')
+
+
+def write_gaponet(folder: Path, rows: int = ROWS, objects: bool = True) -> None:
+    """GAPONet's own motion file of two motions: arrays of objects, or one padded array."""
+    ctrl, qpos = motion(rows)
+    parts = {"real_dof_positions_cmd": ctrl, "real_dof_positions": qpos, "real_dof_velocities": 0 * qpos}
+    pad = lambda x: np.concatenate([x, np.zeros((5, 2))])  # noqa: E731
+    stack = {k: np.stack([pad(v), pad(v[::-1])]) for k, v in parts.items()}
+    if objects:
+        for name, x in parts.items():
+            stack[name] = np.empty(2, object)
+            stack[name][:] = [x, x[::-1][:-3]]
+    np.savez(folder / "a.npz", **stack, joint_sequence=np.array(JOINTS, object), payloads=np.array([0.0, 0.2]))
+    (folder / "logs.toml").write_text("rate = 50.0\n")
+
+
+def write_aloha(folder: Path, rows: int = ROWS) -> None:
+    """An ALOHA episode."""
+    import h5py
+
+    ctrl, qpos = motion(rows)
+    with h5py.File(folder / "episode_0.hdf5", "w") as file:
+        file["action"], file["observations/qpos"], file["observations/qvel"] = ctrl, qpos, 0 * qpos
+        file["observations/images/top"] = np.zeros((rows, 2, 2, 3), np.uint8)
+    (folder / "logs.toml").write_text("rate = 50.0\n" + TOML)
+
+
+def write_mat(folder: Path, rows: int = ROWS) -> None:
+    """A struct and a clock."""
+    from scipy.io import savemat
+
+    ctrl, qpos = motion(rows)
+    savemat(folder / "a.mat", {"log": {"cmd": ctrl, "q": qpos}, "t": 20.0 * np.arange(rows)})
+    (folder / "logs.toml").write_text(
+        TOML + 'time = "t"\ntime_unit = "ms"\nposition_unit = "rad"\nctrl = "log.cmd"\nqpos = "log.q"\n'
+    )
+
+
+def write_pace(folder: Path, rows: int = ROWS) -> None:
+    """A dictionary of tensors."""
+    import torch
+
+    ctrl, qpos = map(torch.tensor, motion(rows))
+    torch.save({"time": 0.02 * torch.arange(rows), "dof_pos": qpos, "des_dof_pos": ctrl}, folder / "a.pt")
+    (folder / "logs.toml").write_text(TOML)
+
+
+def write_asap(folder: Path, rows: int = ROWS) -> None:
+    """Actions as ASAP's policy gives them: a quarter of them is added to home."""
+    ctrl, qpos = motion(rows)
+    (folder / "a.pkl").write_bytes(pickle.dumps({"walk": {"dof": qpos, "action": ctrl / 0.25, "fps": 50}}))
+    (folder / "logs.toml").write_text(TOML + "action_scale = 0.25\n")
+
+
+def write_bag(
+    bag: Path,
+    storage: str = "mcap",
+    command: str = "state",
+    drift: float = 0.0,
+    away: float = 0.0,
+    twice: bool = False,
+    rows: int = ROWS,
+    with_command: bool = True,
+) -> Path:
+    """States at 50 Hz and commands at 25 Hz, on two topics.
+
+    Args:
+        command: What kind of message: state, trajectory, array, controller, unitree.
+        drift, away: Of the command's clock against the recorder's, s/s and s.
+        twice: Every state is recorded two times.
+    """
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from gaponet.data.formats.rosbag import CONTROLLER, HG
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in HG.items():
+        store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
+    store.register(get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState"))
+    make = lambda kind, **fields: store.types[kind](**fields)  # noqa: E731
+    ctrl, qpos = motion(rows)
+    none = np.array([])
+
+    def header(t: float) -> object:
+        stamp = make("builtin_interfaces/msg/Time", sec=int(t), nanosec=round(t % 1 * 1e9))
+        return make("std_msgs/msg/Header", stamp=stamp, frame_id="")
+
+    def state(t: float, x: np.ndarray) -> tuple[str, object]:
+        kind = "sensor_msgs/msg/JointState"
+        return kind, make(kind, header=header(t), name=list(JOINTS), position=x, velocity=none, effort=none)
+
+    def point(x: np.ndarray) -> object:
+        zero = make("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+        return make("trajectory_msgs/msg/JointTrajectoryPoint", positions=x, velocities=none, accelerations=none,
+                    effort=none, time_from_start=zero)  # fmt: skip
+
+    def motors(kind: str, x: np.ndarray) -> list[object]:
+        rest = {"mode": 1, "reserve": 0, "tau": 0.0, "kp": 20.0, "kd": 1.0} if kind.endswith("Cmd") else {
+            "mode": 1, "ddq": 0.0, "tau_est": 0.0, "temperature": np.zeros(2, np.int16), "vol": 0.0, "motorstate": 0,
+            "sensor": np.zeros(2, np.uint32), "reserve": np.zeros(4, np.uint32)}  # fmt: skip
+        return [make(kind, q=float(x[i]) if i < 2 else 0.0, dq=0.0, **rest) for i in range(35)]
+
+    def message(kind: str, t: float, x: np.ndarray) -> tuple[str, object]:
+        if kind == "trajectory":
+            told = "trajectory_msgs/msg/JointTrajectory"
+            return told, make(told, header=header(t), joint_names=list(JOINTS), points=[point(x)])
+        if kind == "array":
+            layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+            return "std_msgs/msg/Float64MultiArray", make("std_msgs/msg/Float64MultiArray", layout=layout, data=x)
+        if kind == "controller":
+            told = "control_msgs/msg/JointTrajectoryControllerState"
+            return told, make(told, header=header(t), joint_names=list(JOINTS), reference=point(x), feedback=point(x),
+                              error=point(0 * x), output=point(none))  # fmt: skip
+        if kind == "unitree":
+            told, four = "unitree_hg/msg/LowCmd", np.zeros(4, np.uint32)
+            return told, make(told, mode_pr=0, mode_machine=0, motor_cmd=motors("unitree_hg/msg/MotorCmd", x),
+                              reserve=four, crc=0)  # fmt: skip
+        return state(t, x)
+
+    def low_state(x: np.ndarray) -> tuple[str, object]:
+        three = np.zeros(3, np.float32)
+        imu = make("unitree_hg/msg/IMUState", quaternion=np.zeros(4, np.float32), gyroscope=three, accelerometer=three,
+                   rpy=three, temperature=0)  # fmt: skip
+        told = "unitree_hg/msg/LowState"
+        return told, make(told, version=np.zeros(2, np.uint32), mode_pr=0, mode_machine=0, tick=0, imu_state=imu,
+                          motor_state=motors("unitree_hg/msg/MotorState", x), wireless_remote=np.zeros(40, np.uint8),
+                          reserve=np.zeros(4, np.uint32), crc=0)  # fmt: skip
+
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer(bag, version=9, storage_plugin=plugin) as writer:
+        topics: dict[str, object] = {}
+
+        def send(topic: str, received: float, told: tuple[str, object]) -> None:
+            kind, content = told
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(topics[topic], round(received * 1e9), store.serialize_cdr(content, kind))
+
+        for i in range(rows):
+            t = 100.0 + 0.02 * i
+            for _ in range(1 + twice):
+                send("/joint_states", t + 0.001, low_state(qpos[i]) if command == "unitree" else state(t, qpos[i]))
+            if i % 2 == 0 and with_command:
+                told = message(command, t + 0.004 + away + drift * (t - 100.0), ctrl[i])
+                send("/arm/commands", t + 0.005, told)
+    return bag
+
+
+def sheet(**said: object) -> str:
+    """A logs.toml."""
+    return "".join(f"{k} = {json.dumps(v)}\n" for k, v in said.items())
