@@ -33,6 +33,7 @@ def write_sage(
     tau: np.ndarray | None = None,
     names: tuple[str, ...] = SERVO_NAMES,
     time: np.ndarray | None = None,
+    qvel: np.ndarray | None = None,
 ) -> Path:
     """One motion folder; time in µs, (rows,)."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -40,7 +41,8 @@ def write_sage(
     (folder / "joint_list.txt").write_text("\n".join(names) + "\n")
     (folder / "event.csv").write_text("type,timestamp,event\nEVENT,0,CONTROL_MODE_ENABLE\nEVENT,7.1,MOTION_START\n")
     numbers = lambda row: '"[' + ", ".join(repr(float(x)) for x in row) + ']"'  # noqa: E731
-    qvel, tau = np.zeros_like(qpos), np.zeros_like(qpos) if tau is None else tau
+    qvel = np.zeros_like(qpos) if qvel is None else qvel
+    tau = np.zeros_like(qpos) if tau is None else tau
     control = [f"CONTROL,{t},{numbers(u)}" for t, u in zip(time, ctrl, strict=True)]
     state = [
         f"STATE_MOTOR,{t},{numbers(q)},{numbers(v)},{numbers(f)}"

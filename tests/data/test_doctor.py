@@ -97,8 +97,8 @@ def test_a_state_of_another_scale_is_a_warning(arm, tmp_path):
 def test_a_command_that_is_the_state_is_an_error(arm, tmp_path):
     _, qpos = good()
     diagnosis = examine(arm, tmp_path, arm_sequence(arm, qpos, qpos))
-    said = [f.message for f in diagnosis.findings if (f.check, f.level) == ("copied", "error")]
-    assert said[1].startswith("command and state of elbow are the same numbers in m: one was logged as both")
+    said = found(diagnosis, "copied", "error").message
+    assert said.startswith("command and state of shoulder, elbow are the same numbers in m: one was logged as both")
 
 
 def test_a_state_that_comes_before_its_command_is_an_error(arm, tmp_path):

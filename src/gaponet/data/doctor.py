@@ -12,6 +12,7 @@ from gaponet.data.checks import CHECKS
 from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
+from gaponet.data.checks.rests import rests
 from gaponet.data.checks.touching import Heights, Standing, standing, touching
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
@@ -80,10 +81,20 @@ def diagnose(
         progress(len(surveys), len(dataset), entry.meta.motion)
     findings = [f for check in CHECKS for f in check(surveys, robot)]
     if model is not None:
-        findings += gravity(surveys, robot, model)
+        findings += _weighed(findings, surveys, robot, model)
     findings += touching(stands)
     findings.sort(key=lambda f: -LEVELS.index(f.level))
     return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
+
+
+def _weighed(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:
+    """What gravity says, where nothing is wrong that it would only say in other words."""
+    wrong = [f.check for f in findings if f.level == "error" or "slope" in f.values]
+    if wrong:
+        text = f"zeros, offsets, gains and payloads are judged by gravity once this is mended: {', '.join(set(wrong))}"
+        return [Finding("ok", "gravity", text)]
+    found = [*gravity(surveys, robot, model)]
+    return found if any(f.level == "warning" for f in found) else [*found, *rests(surveys, robot, model)]
 
 
 def inventory(dataset: Dataset) -> str:
@@ -111,12 +122,12 @@ def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:
 
 
 def _joint_rows(surveys: list[Survey], robot: RobotSpec) -> list[dict[str, Any]]:
-    lags, rests = fast_lags(surveys, robot), static_errors(surveys, robot)
+    lags, errors = fast_lags(surveys, robot), static_errors(surveys, robot)
     ctrl = np.array([s.ctrl_limits for s in surveys])  # (sequences, n, 2)
     qpos = np.array([s.qpos_limits for s in surveys])
     rows = []
     for i, name in enumerate(robot.joint_names):
-        rest = rests.get(name)
+        rest = errors.get(name)
         rows.append({
             "joint": name,
             "operated": name in robot.operated,

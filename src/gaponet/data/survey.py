@@ -26,17 +26,20 @@ TORQUE_NOISE = 0.05  # of the limit; a reading may exceed it by that
 COPIED = 1e-5  # command and state closer than this are one signal, rad
 JUMP, JUMP_ACCELERATION = 0.1, 1000.0  # off the line between its neighbours by this, rad, no joint turns back so fast
 DROPPED = 0.05  # a row of zeros so far from the next row was not measured, rad
+FLAT = 0.02  # rad that a joint moves while its torque says one number
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
 
 
 @dataclass(frozen=True)
 class Torque:
-    """Torques of one sequence, per joint (n): least and greatest, N·m; rows above the limit; rows that are spikes."""
+    """Torques of one sequence, per joint (n): least and greatest, N·m; rows above the limit; rows that are spikes;
+    rows at exactly the greatest size while the joint moves on."""
 
     low: Array
     high: Array
     over_limit: Array
     spikes: Array
+    flat: Array
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,8 @@ class Survey:
         qvel_gain: Recorded qvel over the derivative of qpos, (n); NaN where the joint hardly moves.
         blocked_s, blocked_at: Longest stand-still far from a command that moves on, (n) s, and where, rad.
         frozen_s: Longest stretch in which no sample of the state changed while the command moved, s.
+        stopped_s: Longest stretch in which a joint repeated one number while its command had long moved on, (n) s.
+        step: Steps in which positions are told, (n) rad; 0 where they are fine, or too few to tell.
         torque: None where no torque was recorded.
         holds: Rests.
         loads: Joint angles and torques, (k, n) each, in slow rows; None where no torque was recorded.
@@ -84,6 +89,8 @@ class Survey:
     blocked_s: Array
     blocked_at: Array
     frozen_s: float
+    stopped_s: Array
+    step: Array
     torque: Torque | None
     holds: Holds
     loads: tuple[Array, Array] | None
@@ -131,6 +138,8 @@ def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         blocked_s=blocked_s,
         blocked_at=blocked_at,
         frozen_s=_frozen(sequence),
+        stopped_s=_stopped(ctrl, qpos, dt),
+        step=_step(qpos),
         torque=_torque(sequence, robot),
         holds=find_holds(sequence, robot.operated_index),
         loads=_loads(sequence),
@@ -220,6 +229,31 @@ def _frozen(sequence: Sequence) -> float:
     return max((r.stop - r.start for r in told), default=0) * sequence.dt
 
 
+def _stopped(ctrl: Array, qpos: Array, dt: float) -> Array:
+    """A loaded or stuck joint stands still, but noise and encoder steps change its number, and it gives in at last."""
+    late = round(MAX_LAG_S / 2 / dt)
+    seconds = np.zeros(qpos.shape[1])
+    for j, same in enumerate((np.diff(qpos, axis=0) == 0).T):
+        for r in _runs(same):
+            asked = ctrl[r.start : max(r.stop - late, r.start), j]
+            if len(asked) and np.ptp(asked) > FROZEN_CHANGE:
+                seconds[j] = max(seconds[j], (r.stop - r.start) * dt)
+    return seconds
+
+
+def _step(qpos: Array) -> Array:
+    """Of which all positions are multiples but for a constant, where a few dozen numbers are all there are."""
+    found = np.zeros(qpos.shape[1])
+    for j, column in enumerate(qpos.T):
+        levels = np.unique(column.astype(float))
+        gaps = np.diff(levels)
+        if 8 <= len(levels) <= len(column) / 4:
+            step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
+            if np.abs(gaps / step - np.round(gaps / step)).max() < 0.1:
+                found[j] = step
+    return found
+
+
 def _runs(mask: Array) -> list[slice]:
     """Runs of True in (T,)."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False]))
@@ -239,4 +273,10 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
         high=tau.max(axis=0),
         over_limit=(size > robot.effort_limit * (1 + TORQUE_NOISE)).sum(axis=0),
         spikes=(size - usual > SPIKE_SHARE * robot.effort_limit).sum(axis=0),
+        flat=np.array(
+            [
+                sum(r.stop - r.start for r in _runs(column == column.max()) if r.stop - r.start >= FLAT)
+                for column in size.T
+            ]
+        ),
     )

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator
 
 from gaponet.data.checks.finding import Finding
 from gaponet.data.checks.motor import lag, sag, torque
-from gaponet.data.checks.recording import blocked, jumps, rate, regularity, saturation, stuck
+from gaponet.data.checks.recording import blocked, jumps, rate, regularity, resolution, saturation, stuck
 from gaponet.data.checks.wiring import copied, labels, limits, order, sign, unit
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
 CHECKS: tuple[Callable[[list[Survey], RobotSpec], Iterator[Finding]], ...] = (
-    order, sign, copied, unit, limits, rate, regularity, jumps, blocked, saturation, stuck, lag, sag, torque, labels,
+    order, sign, copied, unit, limits, rate, regularity, jumps, blocked, saturation, resolution, stuck,
+    lag, sag, torque, labels,
 )  # fmt: skip

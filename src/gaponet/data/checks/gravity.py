@@ -3,13 +3,15 @@
 A zero or a sign that is wrong in command and state alike shows in neither. It shows in the torque: an arm holds its own
 weight, and how much depends on where it is. The recorded torque, where it has a sign, and the servo's kp (ctrl − qpos)
 at rest are compared with the gravity of the nominal model, at the angles as logged and with one joint turned or
-mirrored. Not seen is a mirrored joint that weighs the same both ways.
+mirrored, or joints in another order. Not seen is a mirrored joint that weighs the same both ways.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -31,63 +33,112 @@ EVIDENCE = (
 )
 FEW = 20  # torques or rests that say nothing
 ENOUGH = 0.5  # mean share of the torque's square that must then be explained
+BETTER = 0.03  # so much more of it than as logged
 LOADED = 0.01  # of the torque limit: a joint that gravity loads less says nothing
 
 
+class _Guess(NamedTuple):
+    """A way in which the logs may be wrong, in words, at these joints; and gravity's torque (k, n) if they are so."""
+
+    words: str
+    joints: tuple[int, ...]
+    torque: Callable[[Array, Carried], Array]
+
+
 class _Best(NamedTuple):
-    """Evidence for a joint being wrong in this way, and the mean shares explained."""
+    """Evidence for the logs being wrong in this way, and the mean shares explained."""
 
     evidence: float
-    joint: str
-    how: tuple[int, float, int]
+    guess: _Guess | None
     as_logged: float
     otherwise: float
 
 
 def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
-    """Are zero and sign of each joint those of the model?"""
+    """Are zero, sign and order of the joints those of the model?"""
     found = [
-        _best(loads, robot, model) for loads in (_torques(surveys), _rests(surveys, robot))
+        _best(loads, robot, model, level)
+        for loads, level in ((_torques(surveys), False), (_rests(surveys, robot), True))
         if sum(len(qpos) for qpos, _ in loads.values()) >= FEW
     ]  # fmt: skip
     if not found:
         yield Finding("ok", "gravity", "too few torques and rests: zeros and signs cannot be told from gravity")
         return
     best = max(found, key=lambda b: b.evidence)
-    if best.evidence > EVIDENCE and best.otherwise > ENOUGH:
-        sign, turn, _ = best.how
-        what = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
-        what = "its angle mirrored" if sign < 0 else what
+    better = best.otherwise - best.as_logged
+    if best.guess is not None and best.evidence > EVIDENCE and best.otherwise > ENOUGH and better > BETTER:
+        names = tuple(robot.joint_names[j] for j in best.guess.joints)
         text = (
-            f"with {what} at {best.joint} the torques fit the weight of the arm better ({best.otherwise:.0%}) "
-            f"than as logged ({best.as_logged:.0%}): a sign or zero may be wrong in command and state alike; check "
+            f"with {best.guess.words} the torques fit the weight of the arm better ({best.otherwise:.0%}) "
+            f"than as logged ({best.as_logged:.0%}): wrong in command and state alike, where neither shows it; check "
             "it against the model"
         )
-        yield Finding("warning", "gravity", text, (best.joint,), {"evidence": best.evidence})
-    else:
-        shares = " and ".join(f"{b.as_logged:.0%}" for b in found)
-        yield Finding(
-            "ok", "gravity", f"no other zero or sign fits gravity better; it explains {shares} of the torques"
-        )
+        yield Finding("warning", "gravity", text, names, {"evidence": best.evidence})
+        return
+    shares = " and ".join(f"{b.as_logged:.0%}" for b in found)
+    text = f"no other zero, sign or order fits gravity better; it explains {shares} of the torques"
+    yield Finding("ok", "gravity", text)
 
 
-def _best(loads: Loads, robot: RobotSpec, model: Gravity) -> _Best:
-    """The joint and the way of being wrong that explain the torques best."""
+def _best(loads: Loads, robot: RobotSpec, model: Gravity, level: bool) -> _Best:
+    """The way of being wrong that explains the torques best; with `level`, but for a constant of each joint."""
     step = max(1, sum(len(qpos) for qpos, _ in loads.values()) // ROWS)
     loads = {key: (qpos[::step], torque[::step]) for key, (qpos, torque) in loads.items() if len(qpos)}
     as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
     weight = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
     loaded = np.flatnonzero(weight > LOADED * robot.effort_limit)
-    left = _unexplained(as_logged, loads, loaded)
-    best = _Best(0.0, "", (1, 0.0, 1), 1 - float(left.mean()) if len(left) else 0.0, 0.0)
-    for j in loaded.tolist():
-        for how in OTHERWISE:
-            other = {key: _as_if(model, qpos, key, j, *how) for key, (qpos, _) in loads.items()}
-            rest = _unexplained(other, loads, loaded)
-            evidence = float(np.log(left / rest).sum())
-            if evidence > best.evidence:
-                best = _Best(evidence, robot.joint_names[j], how, best.as_logged, 1 - float(rest.mean()))
+    left = _unexplained(as_logged, loads, loaded, level)
+    best = _Best(0.0, None, 1 - float(left.mean()) if len(left) else 0.0, 0.0)
+    for guess in [*_turned(robot, loaded, model), *_ordered(robot, model)]:
+        other = {key: guess.torque(qpos, key) for key, (qpos, _) in loads.items()}
+        rest = _unexplained(other, loads, loaded, level)
+        evidence = float(np.log(left / rest).sum())
+        if evidence > best.evidence:
+            best = _Best(evidence, guess, best.as_logged, 1 - float(rest.mean()))
     return best
+
+
+def _turned(robot: RobotSpec, loaded: Array, model: Gravity) -> Iterator[_Guess]:
+    """One joint mirrored, its zero elsewhere, or its torque negated."""
+    for j in loaded.tolist():
+        for sign, turn, torque_sign in OTHERWISE:
+            what = f"its zero turned by {turn:+.2f} rad" if turn else "its torque negated"
+            what = "its angle mirrored" if sign < 0 else what
+
+            def torque(
+                qpos: Array, key: Carried, j: int = j, how: tuple[int, float, int] = (sign, turn, torque_sign)
+            ) -> Array:
+                other = qpos.copy()
+                other[:, j] = how[0] * other[:, j] + how[1]
+                found = model(other, *key).copy()
+                found[:, j] *= how[2]
+                return found
+
+            yield _Guess(f"{what} at {robot.joint_names[j]}", (j,), torque)
+
+
+def _ordered(robot: RobotSpec, model: Gravity) -> Iterator[_Guess]:
+    """Two operated joints in each other's place, or all of them one on, one back, or backwards."""
+    op = robot.operated_index
+    orders = []
+    for a, b in combinations(op.tolist(), 2):
+        order = np.arange(len(robot.joint_names))
+        order[[a, b]] = b, a
+        words = f"{robot.joint_names[a]} and {robot.joint_names[b]} in each other's place"
+        orders.append((words, (a, b), order))
+    for way, words in ((np.roll(op, 1), "one place on"), (np.roll(op, -1), "one place back"), (op[::-1], "backwards")):
+        order = np.arange(len(robot.joint_names))
+        order[op] = way
+        orders.append((f"the order of joints {words}", tuple(op.tolist()), order))
+    for words, joints, order in orders:
+        yield _Guess(words, joints, partial(_as_if_ordered, model, order))
+
+
+def _as_if_ordered(model: Gravity, order: Array, qpos: Array, key: Carried) -> Array:
+    """Gravity torque in the log's own order, where column order[i] is of joint i."""
+    torque = np.empty_like(qpos)
+    torque[:, order] = model(qpos[:, order], *key)
+    return torque
 
 
 def _torques(surveys: list[Survey]) -> Loads:
@@ -113,18 +164,11 @@ def _joined(parts: Iterable[tuple[Survey, tuple[Array, Array]]]) -> Loads:
     }
 
 
-def _as_if(model: Gravity, qpos: Array, key: Carried, j: int, sign: int, turn: float, torque_sign: int) -> Array:
-    """Gravity torque in the log's own signs, were joint j mirrored, its zero elsewhere or its torque negated."""
-    other = qpos.copy()
-    other[:, j] = sign * other[:, j] + turn
-    torque = model(other, *key).copy()
-    torque[:, j] *= torque_sign
-    return torque
-
-
-def _unexplained(gravity: dict[Carried, Array], loads: Loads, loaded: Array) -> Array:
+def _unexplained(gravity: dict[Carried, Array], loads: Loads, loaded: Array, level: bool) -> Array:
     """Share of the torques' square that gravity, times a scale ≥ 0 for each joint, leaves, (loaded)."""
     x = np.concatenate([gravity[key][:, loaded] for key in loads])
     y = np.concatenate([torque[:, loaded] for _, torque in loads.values()])
+    if level:
+        x, y = x - x.mean(axis=0), y - y.mean(axis=0)
     power = (x**2).sum(axis=0) * (y**2).sum(axis=0)
     return 1 - np.maximum((x * y).sum(axis=0), 0) ** 2 / np.where(power > 0, power, np.inf) + 1e-4

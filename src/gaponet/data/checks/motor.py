@@ -14,6 +14,12 @@ from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
 
 SAG = 0.02  # static error worth a line, rad
+LONG, APART = 0.15, 0.05  # s: dead time worth a warning; of one joint beyond the others'
+DEAD_TIMES = (
+    (0.015, "as good as none"), (0.06, "usual for a bus and a servo's firmware"),
+    (LONG, "long; hobby servos and slow buses have it"),
+    (np.inf, "very long: look for a buffer, a filter, or clocks of command and state that are apart"),
+)  # fmt: skip
 
 
 def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -32,8 +38,31 @@ def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"state follows command after (median and range over motions at {FAST} rad/s or faster) {told}: "
         f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
     )
-    level = "note" if np.median(every) > period else "ok"
+    own = servo_lag(robot)
+    extra = {name: float(np.median(x)) - own[name] for name, x in found.items() if name in robot.operated}
+    usual = float(np.median(list(extra.values()))) if extra else 0.0
+    words = next(word for most, word in DEAD_TIMES if usual <= most)
+    text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {words}"
+    level = "warning" if usual > LONG else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(found), {name: lag_values(x) for name, x in found.items()})
+    for name, late in extra.items():
+        if len(extra) > 2 and late - usual > APART and late > 2 * own[name]:
+            text = (
+                f"{name} lags {(late - usual) * 1e3:.0f} ms longer than the other joints: its channel is read late, "
+                "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
+            )
+            yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
+
+
+def servo_lag(robot: RobotSpec) -> dict[str, float]:
+    """Lag of a slow motion that kp, kd and the MJCF's damping make, by joint, s."""
+    from gaponet.mjcf import compiled, read_mjcf
+
+    model = compiled(read_mjcf(robot.mjcf), robot.mjcf)
+    damping = np.array([model.dof_damping[model.joint(name).dofadr[0]] for name in robot.joint_names])
+    damping = np.where(np.isfinite(robot.damping), robot.damping, damping) + robot.kd
+    lags = np.divide(damping, robot.kp, out=np.zeros_like(damping), where=robot.kp > 0)
+    return dict(zip(robot.joint_names, lags.tolist(), strict=True))
 
 
 def sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:

@@ -8,8 +8,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.data.checks.finding import Finding, some
-from gaponet.data.survey import Survey
+from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
+
+COARSE = 3e-3  # rad
+ENOUGH = 20  # rows of torque cut off flat
 
 
 def rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -51,7 +54,7 @@ def jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
     found = []
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.jumps[i]]
+        hit = [s for s in surveys if s.jumps[i] > s.dropped]
         if hit:
             text = (
                 f"{name} jumps and comes back faster than any motor in {sum(int(s.jumps[i]) for s in hit)} rows of "
@@ -78,7 +81,8 @@ def blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             worst = max(hit, key=lambda s: s.blocked_s[i])
             text = (
                 f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, far from its command, "
-                f"in {some([s.motion for s in hit])}: a stop, an obstacle or too little torque; leave it out or cut it"
+                f"in {some([s.motion for s in hit])}: a stop, an obstacle, too little torque, or not read; leave it "
+                "out or cut it"
             )
             values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
             found.append(Finding("warning" if name in robot.operated else "note", "blocked", text, (name,), values))
@@ -90,7 +94,8 @@ def saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     told = [(s, s.torque) for s in surveys if s.torque is not None]
     over = [(s, t) for s, t in told if t.over_limit.any()]
     if not over:
-        yield Finding("ok", "saturation", "no torque beyond the limits of robot.toml" if told else "no torque recorded")
+        found = [*_flat(told, robot)]
+        yield from found or [Finding("ok", "saturation", "no torque at a limit" if told else "no torque recorded")]
         return
     worst = np.max([np.maximum(-t.low, t.high) for _, t in over], axis=0)  # (n,) N·m
     i = int((worst / robot.effort_limit).argmax())
@@ -101,6 +106,38 @@ def saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         "wrong limit"
     )
     yield Finding("warning", "saturation", text, (robot.joint_names[i],), {"rows": rows, "worst": float(worst[i])})
+
+
+def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Finding]:
+    """Torques cut off flat, above a hundredth of the limit."""
+    for i, name in enumerate(robot.joint_names):
+        top = max((max(-float(t.low[i]), float(t.high[i])) for _, t in told), default=0.0)
+        near = [(s, t) for s, t in told if max(-t.low[i], t.high[i]) > 0.999 * top]
+        rows = sum(int(t.flat[i]) for _, t in near)
+        if top > 0.01 * robot.effort_limit[i] and rows >= ENOUGH:
+            text = (
+                f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
+                f"{some([s.motion for s, _ in near])}: the motor or its driver gives no more. Write effort_limit = "
+                f"{top:.3g} in robot.toml, or leave these out"
+            )
+            yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
+
+
+def resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Are positions told finely enough?"""
+    step = np.max([s.step for s in surveys], axis=0)
+    coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > COARSE]
+    if not coarse:
+        yield Finding("ok", "resolution", f"positions are told in steps of at most {step.max() * 1e3:.2f} mrad")
+        return
+    worst, name = max(coarse)
+    text = (
+        f"positions of {some([name for _, name in coarse])} come in steps of up to {worst * 1e3:.1f} mrad ({name}): "
+        "rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be seen; log "
+        "more digits"
+    )
+    level = "warning" if worst > 2 * COARSE else "note"
+    yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})
 
 
 def stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -115,6 +152,16 @@ def stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "not read; leave these out"
             )
             found.append(Finding("error" if len(still) == len(asked) else "warning", "stuck", text, (name,)))
+        # At a stop an encoder's steps repeat one number too: `blocked` says that.
+        steps = any(s.step[i] for s in surveys)
+        stopped = [s for s in surveys if s.stopped_s[i] > 0.25 and s not in still and not (steps and s.blocked_s[i])]
+        if stopped and not any(s.frozen_s > 0.25 for s in stopped):
+            worst = max(stopped, key=lambda s: s.stopped_s[i])
+            text = (
+                f"{name} repeats one number for up to {worst.stopped_s[i]:.2f} s while its command moves on in "
+                f"{some([s.motion for s in stopped])}: it was not read; cut these logs there"
+            )
+            found.append(Finding("warning", "stuck", text, (name,)))
     frozen = [s for s in surveys if s.frozen_s > 0.25]
     if frozen:
         worst = max(frozen, key=lambda s: s.frozen_s)

@@ -7,11 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding, some
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
 SCALE = (0.5, 1.1)  # a loaded joint falls short of its commands; it does not overshoot them all
+OWN, OTHER, SEVERAL = 0.8, 0.95, 3  # correlations with the own joint and another's, and the motions to tell it
 MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
 
 
@@ -27,6 +29,7 @@ def order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             if others.size:
                 j = int(others[s.follows[i, others].argmax()])
                 guilty[int(i), j].append(float(s.follows[i, j]))
+    guilty |= _together(surveys, asked)
     swapped = {pair: found for pair, found in guilty.items() if 2 * len(found) >= asked[pair[0]]}
     for (own, other), found in swapped.items():
         a, b = robot.joint_names[own], robot.joint_names[other]
@@ -42,6 +45,19 @@ def order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding(level, "order", text, idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
+
+
+def _together(surveys: list[Survey], asked: Array) -> dict[tuple[int, int], list[float]]:
+    """Pairs in each other's place, told over several motions: in one, joints that move together look alike."""
+    follows = np.array([s.follows for s in surveys])  # (sequences, n, n)
+    own = np.median(np.diagonal(follows, axis1=1, axis2=2), axis=0)
+    cross = np.median(follows, axis=0)
+    found = {}
+    for i in np.flatnonzero((asked >= SEVERAL) & (own < OWN)):
+        j = int(cross[i].argmax())
+        if j != i and min(cross[i, j], cross[j, i]) > OTHER and own[j] < OWN:
+            found[int(i), j] = follows[follows[:, i, j] > OTHER, i, j].tolist()
+    return found
 
 
 def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -63,17 +79,13 @@ def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
-    found = []
+    found, copies = [], {}
     for i, name in enumerate(robot.joint_names):
         asked = [s for s in surveys if s.ctrl_range[i] > MOVED]
         same = [s for s in asked if s.copied[i]]
         first = [s for s in asked if np.isfinite(s.lead[i])]
         if same:
-            text = (
-                f"command and state of {name} are the same numbers in {some([s.motion for s in same])}: one was logged "
-                "as both; log the command that the servo was sent"
-            )
-            found.append(Finding("error", "copied", text, (name,)))
+            copies[name] = [s.motion for s in same]
         elif len(first) > 0.5 * len(asked):
             lead = float(np.median([s.lead[i] for s in first]))
             text = (
@@ -81,6 +93,13 @@ def copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "command and state swapped, or their clocks apart?"
             )
             found.append(Finding("error", "copied", text, (name,), {"lead_s": lead}))
+    if copies:
+        where = [motion for motions in copies.values() for motion in motions]
+        text = (
+            f"command and state of {some(list(copies))} are the same numbers in {some(where)}: one was logged as both; "
+            "log the command that the servo was sent"
+        )
+        found.append(Finding("error", "copied", text, tuple(copies)))
     yield from found or [Finding("ok", "copied", "commands come before states")]
 
 
@@ -104,7 +123,7 @@ def unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "turn), or a motor that does not reach its targets; check both at a right angle"
             )
             wrong.append(Finding("warning", "unit", text, (name,), {"slope": slope}))
-        gains = [s.qvel_gain[i] for s in surveys if np.isfinite(s.qvel_gain[i])]
+        gains = [s.qvel_gain[i] for s in surveys if np.isfinite(s.qvel_gain[i]) and s.qpos_range[i] > 20 * s.step[i]]
         gain = float(np.median(gains)) if gains else 1.0
         if not 0.5 < gain < 2:
             text = (

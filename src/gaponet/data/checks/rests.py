@@ -1,0 +1,208 @@
+"""What rests say against gravity and the stated gains: offsets, scales, gains, payload labels, robots taken for one.
+
+At rest a servo stands off its command by what it carries: qpos − ctrl = offset + (scale − 1)·ctrl − softness·G(qpos)/kp
+− stiction·approach, G the gravity of the nominal model with the payload of the label. These four numbers of a joint are
+fitted to all rests and, for their standard errors (jackknife) and to judge a sequence by the others, to all but some.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.checks.finding import Finding, some
+from gaponet.data.offsets import Gravity
+from gaponet.data.survey import Survey
+from gaponet.robot import RobotSpec
+
+FEW = 12  # rests of a joint that say nothing
+FOLDS = 20  # of the sequences, at most
+SURE = 4.0  # standard errors
+OFFSET, FAR = 0.015, 0.05  # rad: named, and a warning
+SCALE = 0.1
+SOFTNESS = (0.5, 1.8)
+LOAD = 0.01  # rad of nominal sag (rms), below which softness says nothing
+APART = 0.03  # rad between sequences of one robot
+MASS, SHARE = 0.25, 0.5  # of the heaviest label, or kg; of a sequence's misfit that another mass must explain
+PLAIN = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
+USUAL = np.array([0.5, 0.5, 1.0, 0.1])  # how far they may be from it, where rests do not say
+ODD = 10  # sequences that are told apart
+
+
+@dataclass(frozen=True)
+class Rests:
+    """Fresh rests (k): their sequence and joint, error (rad), columns of the four numbers, and G of 1 kg over kp."""
+
+    sequence: Array
+    joint: Array
+    error: Array
+    columns: Array
+    per_kg: Array
+
+    def only(self, keep: Array) -> Rests:
+        """Those of a mask (k)."""
+        return Rests(*(values[keep] for values in vars(self).values()))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Of a joint: the four numbers, their standard errors, scatter (rad), and the numbers without each fold."""
+
+    x: Array
+    deviation: Array
+    scatter: float
+    without: dict[int, Array]
+
+
+def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[Finding]:
+    """Do offsets, scales, gains and payload labels agree with where the joints rest?"""
+    found = _collect(surveys, robot, model)
+    judged = [j for j in robot.operated_index.tolist() if (found.joint == j).sum() >= FEW]
+    if not judged:
+        yield Finding("ok", "rests", "too few rests: offsets, scales, gains and payloads cannot be told; add holds")
+        return
+    wrong: list[Finding] = []
+    while len(wrong) < ODD and (odd := _odd_one(surveys, robot, found, judged)) is not None:
+        wrong.append(odd[1])
+        found = found.only(found.sequence != odd[0])
+    judged = [j for j in judged if (found.joint == j).sum() >= FEW]
+    soft = {}
+    for j in judged:
+        name, fit = robot.joint_names[j], _fit(found.only(found.joint == j))
+        wrong += _joint(name, fit)
+        sag = float(np.sqrt(np.mean(found.columns[found.joint == j, 2] ** 2)))
+        if sag > LOAD and _sure(fit)[2] and not SOFTNESS[0] < fit.x[2] < SOFTNESS[1]:
+            soft[name] = float(fit.x[2])
+    if soft:
+        softness = float(np.median(list(soft.values())))
+        text = (
+            f"{some(list(soft))} sag {softness:.2f} times as far as the stated kp says: were these logs recorded at "
+            "other gains, or with another payload than their label? Import again with --kp or --payload-mass"
+        )
+        wrong.append(Finding("warning", "gains", text, tuple(soft), {"softness": soft}))
+    yield from wrong or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
+
+
+def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Rests:
+    parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
+    for number, s in enumerate(surveys):
+        meta, holds = s.entry.meta, s.holds
+        if not len(holds):
+            continue
+        kp = np.where(robot.kp > 0, robot.with_gains(*meta.known_gains).kp, np.inf)
+        load = model(holds.qpos, meta.payload_mass, meta.payload_side) / kp
+        heavier = np.zeros_like(load)
+        if robot.payload_mounts:
+            heavier = model(holds.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
+        for j in robot.operated_index:
+            use = holds.fresh[:, j] & (holds.approach[:, j] != 0)
+            ctrl, k = holds.ctrl[use, j], int(use.sum())
+            columns = np.column_stack([np.ones(k), ctrl, -load[use, j], -holds.approach[use, j]])
+            error = holds.qpos[use, j] - ctrl
+            parts.append((np.full(k, number), np.full(k, j), error, columns, -heavier[use, j]))
+    return Rests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _fit(mine: Rests) -> Fit:
+    """The four numbers of the one joint of these rests."""
+    x, formal, scatter = _solve(mine.columns, mine.error)
+    numbers = sorted(set(mine.sequence.tolist()))
+    fold = np.array([numbers.index(s) % FOLDS for s in mine.sequence.tolist()])
+    folds = range(min(len(numbers), FOLDS))
+    without = {g: _solve(mine.columns[fold != g], mine.error[fold != g])[0] for g in folds}
+    every = np.array(list(without.values()))
+    jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
+    deviation = np.maximum(formal, jackknife) if len(every) > 2 else 3 * formal
+    return Fit(x, deviation, scatter, {s: without[i % FOLDS] for i, s in enumerate(numbers)})
+
+
+def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
+    """Least squares with far-off rests held back: numbers, formal standard errors, scatter."""
+    x, scatter, weight, prior = PLAIN, 0.01, np.ones(len(error)), np.diag(1 / USUAL)
+    a = prior
+    for _ in range(12):
+        a = np.concatenate([columns * (weight / scatter)[:, None], prior])
+        x = np.linalg.lstsq(a, np.concatenate([error * weight / scatter, prior @ PLAIN]), rcond=None)[0]
+        left = np.abs(error - columns @ x)
+        scatter = max(1.48 * float(np.median(left)), 5e-4) if len(left) else scatter
+        weight = np.sqrt(1 / np.maximum(1, left / (3 * scatter)))
+    return x, np.sqrt(np.diag(np.linalg.inv(a.T @ a))), scatter
+
+
+def _sure(fit: Fit) -> Array:
+    return np.abs(fit.x - PLAIN) > SURE * fit.deviation
+
+
+def _joint(name: str, fit: Fit) -> Iterator[Finding]:
+    offset, scale = float(fit.x[0]), float(1 + fit.x[1])
+    if _sure(fit)[1] and abs(scale - 1) > SCALE:
+        text = (
+            f"{name} goes {scale:.2f} rad where its command goes 1 rad, sag taken off: another gear ratio, range or "
+            "ticks a turn in one of them; import again with the right scale"
+        )
+        yield Finding("warning", "scale", text, (name,), {"scale": scale})
+    elif _sure(fit)[0] and abs(offset) > OFFSET:
+        far = abs(offset) > FAR
+        how = "more than assembly leaves: a wrong zero or a missed homing" if far else "as assembly leaves it"
+        text = (
+            f"{name} rests {offset * 1e3:+.0f} ± {fit.deviation[0] * 1e3:.0f} mrad off its command, sag and stiction "
+            f"taken off: a constant offset, {how}; gaponet identify finds it, or take it off at import"
+        )
+        yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
+
+
+def _odd_one(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: list[int]) -> tuple[int, Finding] | None:
+    """The sequence that rests furthest from where the others say, if any is far."""
+    by_joint = {j: found.only(found.joint == j) for j in judged}
+    fits = {j: _fit(mine) for j, mine in by_joint.items() if len(mine.error) >= FEW}
+    heaviest = max(s.entry.meta.payload_mass for s in surveys) or 1.0
+    odd: tuple[float, int, Finding] | None = None
+    for number in sorted(set(found.sequence.tolist())):
+        left, per_kg, apart = [], [], {}
+        for j, fit in fits.items():
+            own = by_joint[j].only(by_joint[j].sequence == number)
+            if len(own.error) < 3 or len(by_joint[j].error) - len(own.error) < FEW:
+                continue
+            x = fit.without[number]
+            rest = own.error - own.columns @ x
+            left.append(rest / fit.scatter)
+            per_kg.append(x[2] * own.per_kg / fit.scatter)
+            middle = float(np.median(rest))
+            spread = max(fit.scatter, 1.48 * float(np.median(np.abs(rest - middle))))
+            if abs(middle) > max(APART, SURE * spread / np.sqrt(len(rest))):
+                apart[robot.joint_names[j]] = middle
+        told = _told(surveys[number], heaviest, left, per_kg, apart)
+        if told is not None and (odd is None or told[0] > odd[0]):
+            odd = (told[0], number, told[1])
+    return odd and odd[1:]
+
+
+def _told(
+    s: Survey, heaviest: float, left: list[Array], per_kg: list[Array], apart: dict[str, float]
+) -> tuple[float, Finding] | None:
+    """How far a sequence's rests are off, in scatters, and what that is."""
+    if not left:
+        return None
+    r, slope, meta = np.concatenate(left), np.concatenate(per_kg), s.entry.meta
+    far = float(r @ r) / len(r)
+    power = float(slope @ slope)
+    more = float(slope @ r) / power if power > 0 else 0.0
+    sure = more**2 * power > max(SHARE * float(r @ r), SURE**2 * max(1.0, far - more**2 * power / len(r)))
+    if sure and abs(more) > MASS * heaviest:
+        text = (
+            f"{meta.motion} rests as with {max(meta.payload_mass + more, 0.0):.2g} kg, its label says "
+            f"{meta.payload_mass:g} kg: a wrong payload label? Import it again with --payload-mass"
+        )
+        return far, Finding("warning", "payload", text, (), {"motion": meta.motion, "mass": meta.payload_mass + more})
+    if apart:
+        worst = max(apart, key=lambda name: abs(apart[name]))
+        text = (
+            f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
+            f"{meta.unit_id} say ({some(list(apart))}): another robot, or zeros set in between? Import it with another "
+            "--unit-id"
+        )
+        return far, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})
+    return None

@@ -1,0 +1,84 @@
+"""Each of thirty faults, put into good logs of a virtual arm, is found and named, or refused; the logs are good."""
+
+import numpy as np
+import pytest
+from faulty import FAULTS, all_of, examine, recordings
+
+from gaponet.errors import GAPONetError
+from gaponet.robot import load_robot
+
+# Check, level and words of the finding that names it; no level: the import refuses with these words.
+NAMED = {
+    "sign of a state": ("sign", "error", "elbow_flex moves against its command"),
+    "sign of command and state": ("gravity", "warning", "with its angle mirrored at elbow_flex"),
+    "swap of two states": ("order", "error", "the command of shoulder_lift moves elbow_flex"),
+    "degrees of all": ("", "", "these look like degrees"),
+    "offset of 20 mrad": ("offset", "note", "elbow_flex rests +2"),
+    "offset of 150 mrad": ("offset", "warning", "more than assembly leaves"),
+    "lag of 100 ms more": ("lag", "warning", "of dead time: very long"),
+    "lag of one joint": ("lag", "warning", "elbow_flex lags 1"),
+    "scale of 1.2": ("unit", "warning", "elbow_flex goes 1.2"),
+    "scale of 0.8": ("scale", "warning", "elbow_flex goes 0.8"),
+    "gear of 2": ("unit", "warning", "elbow_flex goes 2.0"),
+    "spike of a state": ("jumps", "warning", "elbow_flex jumps and comes back"),
+    "spike of a torque": ("torque", "warning", "torque spikes: 1 samples in m2"),
+    "dropout of rows": ("gaps", "warning", "miss samples, at worst 620 ms (m2)"),
+    "dropout as zeros": ("jumps", "warning", "all joints are exactly 0 for 4 rows of m2"),
+    "frozen channel": ("stuck", "warning", "elbow_flex repeats one number"),
+    "command is the state": ("copied", "error", "are the same numbers"),
+    "clock jumps on": ("", "", "s after the row before it"),
+    "clock jumps back": ("", "", "time does not increase"),
+    "mixed rates": ("rate", "warning", "1 at 100.00 Hz"),
+    "two units of measure": ("", "", "these look like degrees"),
+    "two robots in one": ("unit_id", "warning", "m2 rests +10"),
+    "wrong gains": ("gains", "warning", "times as far as the stated kp says"),
+    "wrong payload label": ("payload", "warning", "m2 rests as with 0"),
+    "joint order": ("gravity", "warning", "the order of joints one place back"),
+    "torque unsigned": ("torque", "warning", "torque is unsigned"),
+    "torque of the other sign": ("gravity", "warning", "with its torque negated at elbow_flex"),
+    "quantised": ("resolution", "warning", "come in steps of up to 10.0 mrad"),
+    "saturated torque": ("saturation", "warning", "torque of elbow_flex is cut off flat at"),
+    "saturated command": ("unit", "warning", "elbow_flex goes 1."),
+    "truncated file": ("", "", "the file may be cut short"),
+}
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("so101")
+
+
+@pytest.fixture(scope="module")
+def logs(robot):
+    return recordings(robot)
+
+
+@pytest.mark.parametrize("kp", [0.7, 0.9, 1.2])
+def test_good_logs_of_soft_and_stiff_motors_are_good(robot, tmp_path, kp):
+    diagnosis = examine(robot, recordings(robot, kp), tmp_path)
+    assert diagnosis.verdict == "Good: nothing found that training should not see."
+    assert not {f.check for f in diagnosis.findings} & {"offset", "scale", "gains", "payload", "unit_id"}
+
+
+def test_encoder_steps_of_12_bits_are_no_fault(robot, logs, tmp_path):
+    step = 2 * np.pi / 4096
+    coarse = all_of(logs, lambda log: log.change(slice(None), qpos=lambda x: np.round(x / step) * step))
+    assert examine(robot, coarse, tmp_path).verdict.startswith("Good")
+
+
+def test_every_fault_has_its_name():
+    assert NAMED.keys() == FAULTS.keys()
+
+
+@pytest.mark.parametrize("fault", NAMED)
+def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
+    change, how = FAULTS[fault]
+    check, level, words = NAMED[fault]
+    answer = examine(robot, change(logs), tmp_path, **how)
+    if not check:
+        assert isinstance(answer, GAPONetError)
+        assert words in str(answer)
+        return
+    assert [f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message]
+    others = {f.check for f in answer.findings if f.level in ("warning", "error")} - {check}
+    assert others <= {"jitter", "blocked", "jumps", "unit", "stuck"}  # what follows from it

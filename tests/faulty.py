@@ -1,0 +1,210 @@
+"""Good logs of a virtual arm, and twenty-odd faults to put into them, one at a time, before they are imported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from logs import write_sage
+
+from gaponet.data.doctor import Diagnosis, diagnose
+from gaponet.data.importer import import_logs
+from gaponet.errors import GAPONetError
+from gaponet.robot import RobotSpec
+from gaponet.sim.dynamics import gravity_of
+from gaponet.sim.model import build_model
+
+SECONDS, DELAY = 24.0, 2  # of a motion; periods until a command arrives
+MASSES = (0.0, 0.0, 0.0, 0.2, 0.2, 0.2)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One log before it is written; arrays (T, n)."""
+
+    motion: str
+    payload: float
+    time: np.ndarray
+    ctrl: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    tau: np.ndarray
+
+    def change(self, j: int | slice, **how: Callable[[np.ndarray], np.ndarray]) -> Recording:
+        """With columns j of some channels changed."""
+        changed = {}
+        for name, function in how.items():
+            values = getattr(self, name).copy()
+            values[:, j] = function(values[:, j])
+            changed[name] = values
+        return replace(self, **changed)
+
+    def rows(self, keep: np.ndarray | slice) -> Recording:
+        """Only these."""
+        return replace(self, **{f: getattr(self, f)[keep] for f in ("time", "ctrl", "qpos", "qvel", "tau")})
+
+
+def commands(robot: RobotSpec, seed: int) -> np.ndarray:
+    """From posture to posture with rests of a second, and a faster sine at the end, (T, n) rad."""
+    rng, dt = np.random.default_rng(seed), robot.dt
+    low, high = np.clip(robot.qpos_range.T, -1.2, 1.2) * 0.8
+    at, parts = robot.qpos_home.copy(), []
+    while sum(map(len, parts)) * dt < SECONDS - 6:
+        goal = np.where(np.isin(robot.joint_names, robot.operated), rng.uniform(low, high), robot.qpos_home)
+        s = np.linspace(0, 1, round(rng.uniform(1.0, 2.0) / dt))[:, None]
+        parts += [at + (goal - at) * (10 * s**3 - 15 * s**4 + 6 * s**5), np.repeat(goal[None], round(1 / dt), axis=0)]
+        at = goal
+    t = np.arange(round(6 / dt))[:, None] * dt
+    wave = (
+        0.2
+        * np.sin(2 * np.pi * (0.5 + 0.1 * (np.arange(len(at)) % 5)) * t)
+        * np.isin(robot.joint_names, robot.operated)
+    )
+    return np.concatenate([*parts, np.clip(at + wave, *robot.qpos_range.T)])
+
+
+def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
+    """What an arm with softer motors, more friction, a delay and noise does under some motions."""
+    found = []
+    for seed, mass in enumerate(MASSES):
+        model = build_model(robot, mass)
+        model.actuator_gainprm[:, 0] *= kp
+        model.actuator_biasprm[:, 1] *= kp
+        model.dof_frictionloss *= 1.3
+        data, rng = mujoco.MjData(model), np.random.default_rng(seed + 100)
+        ctrl = commands(robot, seed)
+        data.qpos[:] = ctrl[0]
+        state = []
+        for t in range(len(ctrl)):
+            mujoco.mj_forward(model, data)
+            state.append((data.qpos.copy(), data.qvel.copy(), data.actuator_force.copy()))
+            data.ctrl[:] = ctrl[max(t - DELAY, 0)]
+            mujoco.mj_step(model, data, robot.decimation)
+        qpos, qvel, tau = (np.array(x) for x in zip(*state, strict=True))
+        read = [x + size * rng.standard_normal(x.shape) for x, size in ((qpos, 3e-4), (qvel, 5e-3), (tau, 5e-3))]
+        found.append(Recording(f"m{seed}", mass, 0.5 + robot.dt * np.arange(len(ctrl)), ctrl, *read))
+    return found
+
+
+def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Callable[[Path], None] | None = None,
+            gain: float | None = None) -> Diagnosis | GAPONetError:  # fmt: skip
+    """Write the logs, import them and call the doctor; an import that refuses is an answer as well."""
+    for log in logs:
+        place = folder / f"{log.payload:g}" / "real" / robot.name / "tests" / log.motion
+        write_sage(place, log.ctrl, log.qpos, log.tau, robot.joint_names, 1e6 * log.time, log.qvel)
+    if damage is not None:
+        damage(folder)
+    try:
+        for mass in dict.fromkeys(log.payload for log in logs):
+            kp = (
+                ()
+                if gain is None
+                else tuple(f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True))
+            )
+            report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
+        return diagnose(report.dataset, robot, model=gravity_of(robot))
+    except GAPONetError as error:
+        return error
+
+
+def all_of(logs: list[Recording], change: Callable[[Recording], Recording]) -> list[Recording]:
+    """The same fault in every log."""
+    return [change(log) for log in logs]
+
+
+def one_of(logs: list[Recording], change: Callable[[Recording], Recording], which: int = 2) -> list[Recording]:
+    """A fault in one log."""
+    return [change(log) if i == which else log for i, log in enumerate(logs)]
+
+
+def cut_file(folder: Path) -> None:
+    """The logger was killed in the middle of a row."""
+    file = sorted(folder.rglob("state_motor.csv"))[2]
+    text = file.read_text()
+    file.write_text(text[: len(text) * 2 // 3])
+
+
+def swapped(values: np.ndarray) -> np.ndarray:
+    """The columns of J and of the joint before it in each other's place."""
+    other = values.copy()
+    other[:, [J - 1, J]] = values[:, [J, J - 1]]
+    return other
+
+
+def rotated(log: Recording) -> Recording:
+    """All channels with the arm's joints in another order than the list says."""
+    turned = {f: getattr(log, f).copy() for f in ("ctrl", "qpos", "qvel", "tau")}
+    for values in turned.values():
+        values[:, ARM] = np.roll(values[:, ARM], 1, axis=1)
+    return replace(log, **turned)
+
+
+def peak(x: np.ndarray) -> float:
+    """Largest size."""
+    return float(np.abs(x).max())
+
+
+def delayed(x: np.ndarray, rows: int = 5) -> np.ndarray:
+    """The same some rows later."""
+    return np.concatenate([np.repeat(x[:1], rows, axis=0), x[:-rows]])
+
+
+def at(rows: slice, values: Callable[[np.ndarray], np.ndarray] | float) -> Callable[[np.ndarray], np.ndarray]:
+    """Other values in some rows."""
+
+    def change(x: np.ndarray) -> np.ndarray:
+        x = x.copy()
+        x[rows] = values(x[rows]) if callable(values) else values
+        return x
+
+    return change
+
+
+ARM, J = [0, 1, 2, 3, 4], 2  # of an SO-101; a joint that carries weight
+EVERY = slice(None)
+FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, object]]] = {
+    "sign of a state": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: -x, qvel=lambda x: -x)), {}),
+    "sign of command and state": (
+        lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: -x, qpos=lambda x: -x, qvel=lambda x: -x)), {}),
+    "swap of two states": (lambda logs: all_of(logs, lambda g: replace(g, qpos=swapped(g.qpos))), {}),
+    "degrees of all": (
+        lambda logs: all_of(logs, lambda g: g.change(EVERY, ctrl=np.degrees, qpos=np.degrees, qvel=np.degrees)), {}),
+    "offset of 20 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.02)), {}),
+    "offset of 150 mrad": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.15)), {}),
+    "lag of 100 ms more": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=delayed, qvel=delayed)), {}),
+    "lag of one joint": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=delayed, qvel=delayed)), {}),
+    "scale of 1.2": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 1.2 * x)), {}),
+    "scale of 0.8": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 0.8 * x)), {}),
+    "gear of 2": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: 2 * x)), {}),
+    "spike of a state": (
+        lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(400, 401), lambda x: x + 0.5))), {}),
+    "spike of a torque": (
+        lambda logs: one_of(logs, lambda g: g.change(J, tau=at(slice(400, 401), 4 * peak(g.tau[:, J])))), {}),
+    "dropout of rows": (lambda logs: one_of(logs, lambda g: g.rows(np.r_[0:400, 430 : len(g.time)])), {}),
+    "dropout as zeros": (
+        lambda logs: one_of(logs, lambda g: g.change(EVERY, qpos=at(slice(400, 404), 0.0))), {}),
+    "frozen channel": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(0, 400), lambda x: x[:1]))), {}),
+    "command is the state": (lambda logs: all_of(logs, lambda g: replace(g, ctrl=g.qpos)), {}),
+    "clock jumps on": (
+        lambda logs: one_of(logs, lambda g: replace(g, time=g.time + 5 * (np.arange(len(g.time)) > 500))), {}),
+    "clock jumps back": (
+        lambda logs: one_of(logs, lambda g: replace(g, time=g.time - 5 * (np.arange(len(g.time)) > 500))), {}),
+    "mixed rates": (
+        lambda logs: one_of(logs, lambda g: replace(g, time=g.time[0] + (g.time - g.time[0]) / 2)), {}),
+    "two units of measure": (
+        lambda logs: one_of(logs, lambda g: g.change(J, ctrl=np.degrees, qpos=np.degrees, qvel=np.degrees)), {}),
+    "two robots in one": (lambda logs: one_of(logs, lambda g: g.change(J, qpos=lambda x: x + 0.1)), {}),
+    "wrong gains": (list, {"gain": 2.0}),
+    "wrong payload label": (lambda logs: one_of(logs, lambda g: replace(g, payload=0.2)), {}),
+    "joint order": (lambda logs: all_of(logs, rotated), {}),
+    "torque unsigned": (lambda logs: all_of(logs, lambda g: g.change(EVERY, tau=np.abs)), {}),
+    "torque of the other sign": (lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: -x)), {}),
+    "quantised": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=lambda x: np.round(x, 2))), {}),
+    "saturated torque": (
+        lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: np.clip(x, -peak(x) / 2, peak(x) / 2))), {}),
+    "saturated command": (lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: np.clip(x, -0.4, 0.4))), {}),
+    "truncated file": (list, {"damage": cut_file}),
+}  # fmt: skip
