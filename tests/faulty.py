@@ -182,7 +182,7 @@ FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, 
     "spike of a state": (
         lambda logs: one_of(logs, lambda g: g.change(J, qpos=at(slice(400, 401), lambda x: x + 0.5))), {}),
     "spike of a torque": (
-        lambda logs: one_of(logs, lambda g: g.change(J, tau=at(slice(400, 401), 4 * peak(g.tau[:, J])))), {}),
+        lambda logs: one_of(logs, lambda g: g.change(J, tau=at(slice(400, 401), 3.2))), {}),
     "dropout of rows": (lambda logs: one_of(logs, lambda g: g.rows(np.r_[0:400, 430 : len(g.time)])), {}),
     "dropout as zeros": (
         lambda logs: one_of(logs, lambda g: g.change(EVERY, qpos=at(slice(400, 404), 0.0))), {}),
