@@ -112,7 +112,7 @@ def test_servos_that_are_late_like_the_reference_and_those_that_are_later(robot)
     assert np.abs(same - there).mean() < 0.2 * np.abs(follow(AlignedSim(robot, None)) - there).mean()
     later = replace(robot, delay=np.array([0.03, 0.06]))
     for how in ("closed", "probes"):
-        with pytest.raises(ModelError, match="[24]0 ms later than the reference's, and cannot follow it"):
+        with pytest.raises(ModelError, match=r"[24]0 ms later than the reference's, and cannot follow it"):
             AlignedSim(later, reference, inverse=how)
     late = replace(robot, delay=np.array([0.06, 0.06]))  # whoever wants it so all the same is not made worse
     sims = (AlignedSim(late, given, extrapolate=True) for given in (reference, None))

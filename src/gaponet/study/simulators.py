@@ -168,11 +168,11 @@ class Runs:
 
     def cost(self) -> Table:
         """µs per period."""
-        at, rows = self.simulators[0], []
-        alone = microseconds(self.sequences[-1], at, None, "closed")
-        for word, references in self.references.items():
-            took = [microseconds(self.sequences[-1], at, references[0], how) - alone for how in WAYS]
-            rows.append((_name(word), *took))
+        known = {word: references[0] for word, references in self.references.items()}
+        ways: list[tuple[Reference | None, Inverse]] = [(like, how) for like in known.values() for how in WAYS]
+        alone, *took = microseconds(self.sequences[-1], self.simulators[0], [(None, "closed"), *ways])
+        pairs = zip(known, np.reshape(took, (-1, len(WAYS))) - alone, strict=True)
+        rows = [(_name(word), *pair.tolist()) for word, pair in pairs]
         columns = ("reference", *(f"{name}, µs" for name in WAYS.values()))
         note = "Per period of one robot on one thread, beyond the simulator's own step: operator, reference, inverse."
         return Table("cost", columns, tuple(rows), note, digits=0)

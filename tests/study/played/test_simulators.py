@@ -5,7 +5,17 @@ import pytest
 from arm import recordings, write_arm
 
 from gaponet.sim.model import build_model, model_hash
-from gaponet.study.played.simulators import CHANGES, EULER, FAR, Simulator, errors, free_run, recorded, simulators_of
+from gaponet.study.played.simulators import (
+    CHANGES,
+    EULER,
+    FAR,
+    Simulator,
+    errors,
+    free_run,
+    microseconds,
+    recorded,
+    simulators_of,
+)
 from gaponet.study.simulators import share
 
 
@@ -37,6 +47,13 @@ def test_planes_and_pushes_make_a_difference(robot, disturbed):
     motions = recordings(robot, 1, rows=130)
     free, other = (free_run(motions, Simulator("", robot), disturbed=what) for what in ("", disturbed))
     assert errors(motions, other, free)[0] > 1.0
+
+
+def test_every_way_is_timed(robot):
+    motion = next(s for s in recordings(robot, 1, rows=30) if not s.meta.payload_mass)
+    took = microseconds(motion, Simulator("", robot), [(None, "closed"), (robot, "closed"), (robot, "probes")])
+    assert len(took) == 3
+    assert min(took) > 0.0
 
 
 def test_a_share_is_of_means_and_its_error_paired():

@@ -161,18 +161,23 @@ def on_plane(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
     return replace(robot, tips=tips, table=Plane(float(np.quantile(lowest, TOUCHING)), FRICTION, STIFFNESS))
 
 
-def microseconds(sequence: Sequence, at: Simulator, reference: Reference | None, how: Inverse) -> float:
-    """Median time of a control period of one robot on one thread, simulation and all."""
-    sim = AlignedSim(at.robot, reference, sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt,
-                     nthread=1, locked=idle_limbs([sequence], at.robot), inverse=how)  # fmt: skip
-    free = at.robot.index(sim.joint_names)
-    sim.reset(sequence.qpos[0, free], 0.0, sequence.ctrl[0, free])
-    took = []
-    for target in sequence.ctrl[:TIMED, free]:
-        began = time.perf_counter()
-        sim.step(target)
-        took.append(time.perf_counter() - began)
-    return 1e6 * float(np.median(took))
+def microseconds(sequence: Sequence, at: Simulator, ways: ListOf[tuple[Reference | None, Inverse]]) -> list[float]:
+    """Median times of a control period of one robot on one thread, simulation and all, of each way in turns."""
+    meta, locked = sequence.meta, idle_limbs([sequence], at.robot)
+    sims = [
+        AlignedSim(at.robot, like, meta.payload_mass, meta.payload_side, sequence.dt, None, 1, locked, inverse=how)
+        for like, how in ways
+    ]
+    free = at.robot.index(sims[0].joint_names)
+    for sim in sims:
+        sim.reset(sequence.qpos[0, free], 0.0, sequence.ctrl[0, free])
+    took = np.empty((min(TIMED, len(sequence)), len(sims)))
+    for row, target in zip(took, sequence.ctrl[:, free], strict=False):
+        for i, sim in enumerate(sims):
+            began = time.perf_counter()
+            sim.step(target)
+            row[i] = time.perf_counter() - began
+    return [1e6 * float(x) for x in np.median(took, axis=0)]
 
 
 def _push(t: float) -> float:
