@@ -12,8 +12,8 @@ from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model, model_hash
 
 
-def test_the_package_holds_h1_2_and_so101():
-    assert available() == ["h1_2", "so101", "xl330_bench"]
+def test_the_package_holds_its_robots():
+    assert available() == ["fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"]
 
 
 def test_h1_2_operates_the_ten_arm_joints_of_27():
@@ -60,7 +60,8 @@ def test_an_unknown_joint_names_the_file_the_valid_names_and_the_likely_one(so10
 
 def test_an_unknown_robot_names_those_of_the_package():
     with pytest.raises(
-        RobotError, match="no robot 'nope': in the package are h1_2, so101, xl330_bench; or give a folder"
+        RobotError,
+        match="no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench; or give a folder",
     ):
         load_robot("nope")
 
@@ -123,7 +124,7 @@ def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
         write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")
 
 
-@pytest.mark.parametrize("name", ["so101", "h1_2"])
+@pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
 def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
     save_robot(load_robot(name), tmp_path / "here")
     (tmp_path / "here").rename(tmp_path / "there")
@@ -140,7 +141,7 @@ def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
 def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
-    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are h1_2, so101, xl330_bench; for the folder "
+    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, g1_23, .*, xl330_bench; for the folder "
                        r"here write \./arm"):  # fmt: skip
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):

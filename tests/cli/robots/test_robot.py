@@ -11,10 +11,18 @@ from gaponet.cli.main import main
 
 def test_list_names_the_packages_robots(capsys):
     assert main(["robot", "list", "--json"]) == 0
-    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == ["h1_2", "so101", "xl330_bench"]
+    assert [r["name"] for r in json.loads(capsys.readouterr().out)["robots"]] == [
+        "fr3",
+        "g1_23",
+        "g1_29",
+        "h1_2",
+        "so101",
+        "ur10e",
+        "xl330_bench",
+    ]
 
 
-@pytest.mark.parametrize("name", ["so101", "h1_2"])
+@pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
 def test_the_packages_robots_are_right(name, capsys):
     assert main(["robot", "check", name, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -68,7 +76,9 @@ def test_a_broken_folder_is_one_line_and_exit_code_2(tmp_path, capsys, toml, mes
 
 def test_check_without_a_name_says_which_there_are(capsys):
     assert main(["robot", "check"]) == 2
-    assert "needs a robot name (h1_2, so101, xl330_bench) or a folder" in capsys.readouterr().err
+    assert (
+        "needs a robot name (fr3, g1_23, g1_29, h1_2, so101, ur10e, xl330_bench) or a folder" in capsys.readouterr().err
+    )
 
 
 def test_new_makes_checks_and_shows_a_robot_from_a_vendor_s_model(tmp_path, capsys):
