@@ -61,7 +61,7 @@ def test_an_unknown_joint_names_the_file_the_valid_names_and_the_likely_one(so10
 def test_an_unknown_robot_names_those_of_the_package():
     with pytest.raises(
         RobotError,
-        match="no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench; or give a folder",
+        match=r"no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench; or give a folder",
     ):
         load_robot("nope")
 
@@ -141,7 +141,7 @@ def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
 def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(tmp_path / "arm")
-    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, g1_23, .*, xl330_bench; for the folder "
+    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, .*, xl330_bench; for the folder "
                        r"here write \./arm"):  # fmt: skip
         load_robot("arm")
     for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
