@@ -26,6 +26,7 @@ TASKS = {
         "formats": "gaponet.cli.logs:formats",
         "doctor": "gaponet.cli.logs:doctor",
         "data": "gaponet.cli.data:data",
+        "excite": "gaponet.cli.robots.excite:excite",
         "collect": "gaponet.cli.collect:collect",
         "robot": "gaponet.cli.robots.robot:robot",
     },

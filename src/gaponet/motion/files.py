@@ -1,4 +1,4 @@
-"""Motion files: SAGE motion txt, csv and npz, read into a Motion.
+"""Motion files: SAGE motion txt, csv and npz, read into a Motion, or written from one.
 
 SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample in
 rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: joint_names, ctrl (T, k) rad and dt s.
@@ -15,7 +15,8 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.describe.limits import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
-from gaponet.errors import LogError
+from gaponet.errors import LogError, UsageError
+from gaponet.files import whole, write_text
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
 
@@ -54,6 +55,26 @@ def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
     ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
     ctrl[:, columns] = rows
     return Motion(path.stem, level_of(ctrl, robot), period, ctrl)
+
+
+def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> None:
+    """The motion at a control rate, Hz, as a file that read_motion reads.
+
+    Raises:
+        UsageError: A .txt, which has no time column, at another rate than 50 Hz.
+    """
+    rows = motion.sample(1 / rate)
+    if path.suffix == ".npz":
+        with whole(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, joint_names=np.array(robot.joint_names), ctrl=rows, dt=1 / rate)
+        return
+    if path.suffix == ".txt" and abs(rate * SAGE_DT - 1) > 1e-9:
+        raise UsageError(f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz")
+    names = list(robot.joint_names)
+    if path.suffix == ".csv":
+        rows, names = np.column_stack([np.arange(len(rows)) / rate, rows]), ["time", *names]
+    text = "\n".join([", ".join(names), *(", ".join(f"{x:.6f}" for x in row) for row in rows)])
+    write_text(path, text + "\n")
 
 
 def level_of(ctrl: Array, robot: RobotSpec) -> str:
