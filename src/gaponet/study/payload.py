@@ -11,7 +11,7 @@ from gaponet.plot.charts import lines
 from gaponet.plot.methods import colour, shade, title
 from gaponet.plot.table import Spread, Table, compared
 from gaponet.study.found import Found
-from gaponet.study.played.unladen import HELD, Beside, beside
+from gaponet.study.played.unladen import EMPTY, HELD, LADEN, LADEN_FULL, Beside, beside
 from gaponet.study.pool import Cell
 from gaponet.study.result import Result
 from gaponet.study.study import Study
@@ -107,14 +107,17 @@ class Payload:
                      q.words[1]: ("trained without it, mass not told", shade(base, 0.5))}  # fmt: skip
             drawn = {name: (c, masses, error[w]) for w, (name, c) in looks.items() if w in error}
             panels.append((f"{q.payload:g} kg left out, {q.name} the others\n{study.who}", drawn))
-        figure = lines(panels, ("payload per hand, kg", "MPJAE, mrad"), [(m, f"{m:g}") for m in masses],
-                       marked=[q.payload for q in asked])  # fmt: skip
         said, tables, name = [s for q in asked if (s := _sentence(q, found))], [table], "Payloads never trained on"
         if self.simulator_payload == "none":
             told = {w: titles[w] for w in (ALL, asked[0].words[0]) if w in error}
-            more, moving, best = _unladen(beside(study, found, told, ALL + BLIND), masses)
+            also = beside(study, found, told, ALL + BLIND)
+            more, moving = _unladen(also, masses)
+            shown = {name: (c, masses, [by[m] for m in masses]) for (name, c), by in _looks(also)}
+            panels.append((f"the simulator carries nothing\n{study.who}", panels[0][1] | shown))
             tables = [replace(table, rows=table.rows + more), moving]
-            said, name = [best, *said], "Payloads that the simulator does not have"
+            said, name = [_best(tables[0]), *said], "Payloads that the simulator does not have"
+        marked: list[float | None] = [q.payload for q in asked]
+        figure = lines(panels, ("payload per hand, kg", "MPJAE, mrad"), [(m, f"{m:g}") for m in masses], marked=marked)
         return found.result(study, "payload", name, tables, {"payload": figure}, said)
 
 
@@ -124,8 +127,8 @@ def _at(found: Found, method: str, mass: float) -> Spread:
     return found.base(method, *path) if method in BASELINES else found.spread(method, *path)
 
 
-def _unladen(found: Beside, masses: list[float]) -> tuple[tuple[tuple[Any, ...], ...], Table, str]:
-    """More rows of the table of payloads, a table of payloads that come and go, and what is best."""
+def _unladen(found: Beside, masses: list[float]) -> tuple[tuple[tuple[Any, ...], ...], Table]:
+    """More rows of the table of payloads, and a table of payloads that come and go."""
     rows = tuple((name, *(by[m] for m in masses)) for name, by in found.rows.items() if by)
     heading = f"{HELD:g} kg picked up and put down: MPJAE, mrad"
     moving = tuple((name, _over_motions(errors)) for name, errors in found.moving.items())
@@ -133,12 +136,26 @@ def _unladen(found: Beside, masses: list[float]) -> tuple[tuple[tuple[Any, ...],
         "VIRTUAL units play the test motions; hands are filled after a third and emptied after two, or reversed. Mean "
         "± standard error over motions and units, first seed. Told is the mass of the moment."
     )
-    means = {name: sum(s.mean for s in by.values()) / len(by) for name, by in found.rows.items() if by}
-    best = min(means, key=lambda name: means[name])
-    said = (
-        f"Where nobody tells a mass at run time, or no model is trained, {best} leaves least: {means[best]:.2f} mrad."
-    )
-    return rows, Table("moving", ("method", heading), moving, note), said
+    return rows, Table("moving", ("method", heading), moving, note)
+
+
+def _looks(found: Beside) -> list[tuple[tuple[str, str], dict[float, Spread]]]:
+    """Label and colour of the rows beside, as far as a figure shows them."""
+    looks = {
+        "GAPONet trained on all payloads, mass estimated": ("mass estimated", shade(colour(ALL), 0.75)),
+        EMPTY: ("identified, carrying nothing", colour("identified")),
+        LADEN: ("transfer, laden nominal", shade(colour("transfer"), 0.5)),
+        LADEN_FULL: ("transfer, laden identified", colour("transfer")),
+    }
+    return [(looks[name], by) for name, by in found.rows.items() if name in looks and by]
+
+
+def _best(table: Table) -> str:
+    """What leaves least over all payloads, and the others."""
+    means = {row[0]: sum(x.mean for x in row[1:]) / (len(row) - 1) for row in table.rows}
+    first, *others = sorted(means, key=lambda name: means[name])
+    rest = "; ".join(f"{name} {means[name]:.2f}" for name in others)
+    return f"Over all payloads {first} leaves least, {means[first]:.2f} mrad; {rest}."
 
 
 def _over_motions(errors: list[float]) -> Spread:

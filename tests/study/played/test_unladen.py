@@ -7,7 +7,7 @@ import pytest
 from arm import commands, record, write_arm
 from runs import corrects_by
 
-from gaponet.study.played.unladen import by_payload, estimated, follow
+from gaponet.study.played.unladen import _play, by_payload, estimated, follow
 
 
 @pytest.fixture
@@ -49,3 +49,12 @@ def test_what_a_model_is_told_reaches_it(arm, tmp_path):
     told = np.full((200, 2), 0.2)
     corrected, alone = (follow(sequences, empty, m, told, told[0]) for m in (model, None))
     assert np.abs((corrected - alone)[100:]).mean() == pytest.approx(0.1, rel=0.2)
+
+
+def test_a_virtual_robot_feels_a_payload_come_and_go(make_study):
+    study = make_study(payloads=(0.0, 0.2), units=("virtual-1",))
+    twice = [s for s in study.data.sequences(study.data.entries) if s.meta.motion == "motion0"]
+    runs = [_play(study, study.robot, twice, np.array([0.0, 0.2]), switched)[0] for switched in ([], [20])]
+    still, moved = (np.stack(qpos) for qpos in runs)
+    np.testing.assert_array_equal(still[:, :21], moved[:, :21])
+    assert (np.abs(still[:, 35] - moved[:, 35]).max(axis=1) > 1e-3).all()

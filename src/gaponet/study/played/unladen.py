@@ -33,6 +33,8 @@ from gaponet.virtual.unit import VirtualRobot
 
 SWITCHES = (1 / 3, 2 / 3)  # of a motion: when hands that are empty are filled, and full ones emptied
 HELD = 2.0  # kg
+EMPTY = "identification of the simulator without payload"
+LADEN, LADEN_FULL = "transfer of the laden nominal simulator", "transfer of the laden identified simulator"
 
 
 def estimated(sequences: ListOf[Sequence], laden: RobotSpec, heaviest: float) -> Array:
@@ -142,8 +144,8 @@ def _play(
     side, ctrl = sequences[0].meta.payload_side, _padded(sequences, "ctrl")
     robots = VirtualRobot(robot, units, [(float(m), side) for m in held], sequences[0].dt, locked=locked)
     robots.reset(ctrl[0], list(range(len(units))), np.full(len(units), WARMTH))
-    expanded = (robots.batch.expanded(name) for name in sorted(MODEL_FIELDS) if name.startswith("body_"))
-    bodies = [x for x in expanded if x is not None]
+    batch, names = robots.batch, [name for name in sorted(MODEL_FIELDS) if name.startswith("body_")]
+    bodies = [batch.expand(name) for name in names if batch.expanded(name) is not None]
     qpos, qvel = np.empty((2, *ctrl.shape))
     for t, target in enumerate(ctrl):
         if t in switched:
@@ -200,13 +202,13 @@ def beside(study: Study, found: Found, told: Mapping[str, str], blind: str) -> B
     full = identified(replace(study, robot=laden, out=study.out / "laden"), quiet).identified
     assert empty is not None
     assert full is not None
-    references = {"transfer of the laden nominal simulator": laden, "transfer of the laden identified simulator": full}
+    references = {LADEN: laden, LADEN_FULL: full}
     guess = estimated(sequences, laden, max(s.meta.payload_mass for s in sequences))
     rows = {
         f"{name}, mass estimated": _over_seeds([by_payload(sequences, study.robot, m, guess) for m in models[w]])
         for w, name in told.items()
     }
-    rows["identification of the simulator without payload"] = _over_seeds([by_payload(sequences, empty, None)])
+    rows[EMPTY] = _over_seeds([by_payload(sequences, empty, None)])
     rows |= {n: _over_seeds([by_payload(sequences, study.robot, r)]) for n, r in references.items()}
     if not all(s.meta.virtual for s in sequences):
         return Beside(rows, {})
