@@ -1,6 +1,6 @@
 """PPO over 2 M control steps: error against steps, from the warm start and from nothing, real SO-101 and virtual H1-2.
 
-    python benchmarks/ppo.py WORK --logs LOGS [--seeds 3] [--steps 2000000] [--arms real-warm real-identified …]
+    python benchmarks/ppo.py WORK --logs LOGS [--seeds 3] [--steps 2000000] [--arms real-warm virtual-identified:1 …]
 
 An arm trains three seeds: warm, in the nominal simulator from six rounds of the supervised start on; identified, in
 the identified simulator from the untrained operator on. Virtual: the fleet `hard` of virtual_h1_2.py, tested on a unit
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from publish import publish, say
-from virtual_h1_2 import RECIPE, START, UNIT, Bench, run
+from virtual_h1_2 import CONFIG, RECIPE, UNIT, WORD, Bench, run
 
 from gaponet.data.json_file import read_kept, write_json
 from gaponet.data.store import Dataset
@@ -41,8 +41,8 @@ from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.kept import PROGRESS
 
 ARMS = ("real-warm", "real-identified", "virtual-warm", "virtual-identified")
-WARM, FURTHER = "gaponet", "identified+gaponet:warm_start.rounds=0"
-VALIDATE = 20  # updates between validations
+WARM, FURTHER = "gaponet", WORD
+VALIDATE = CONFIG.validate_every  # updates between validations
 
 
 @dataclass(frozen=True)
@@ -163,11 +163,14 @@ CAPTION = (
 def arms(args: argparse.Namespace) -> list[Arm]:
     """Those asked for, with their data."""
     out, known = [], {}
-    for name in args.arms:
+    for word in args.arms:
+        name, _, seeds = word.partition(":")
+        if name not in ARMS:
+            raise SystemExit(f"--arms {word}: one of {', '.join(ARMS)}, with :SEEDS behind it if not {args.seeds}")
         kind = name.split("-")[0]
         if kind not in known:
             known[kind] = real(args) if kind == "real" else virtual(args)
-        out.append(Arm(name, known[kind], args.steps))
+        out.append(Arm(name, replace(known[kind], seeds=int(seeds or args.seeds)), args.steps))
     return out
 
 
@@ -184,8 +187,7 @@ def real(args: argparse.Namespace) -> Study:
 def virtual(args: argparse.Namespace) -> Study:
     """The hard fleet's recordings."""
     bench = Bench.of("hard", RECIPE, args.work)
-    config = TrainConfig(warm_start=START, validate_every=VALIDATE)
-    study = Study(bench.data, bench.nominal, args.work / "virtual", config, "0", args.seeds, (UNIT,), args.workers)
+    study = Study(bench.data, bench.nominal, args.work / "virtual", CONFIG, "0", args.seeds, (UNIT,), args.workers)
     return replace(study, identified=bench.identified(DEFAULT_TERMS))
 
 
@@ -193,9 +195,8 @@ def result(found: ListOf[Arm], failed: ListOf[str]) -> Result:
     """A row and a panel per arm."""
     table = Table("ppo", HEAD, tuple(a.row() for a in found), CAPTION)
     figure = lines([a.panel() for a in found], ("million control steps of PPO", "validation MPJAE, mrad"))
-    study = found[0].study
-    others = [f"{a.study.data.path.name} ({a.name})" for a in found]
-    repeat = facts(study.data, range(study.seeds), steps=found[0].steps, arms=others)
+    said = [f"{a.name}: {a.study.data.path.name}, {a.study.seeds} seeds" for a in found]
+    repeat = facts(found[0].study.data, steps=found[0].steps, arms=said)
     whose = "SO-101: recordings of a real robot. H1-2: VIRTUAL, which says nothing about real hardware."
     return Result("ppo", "PPO by joint: error against steps", whose, repeat, (table,), {"ppo": figure}, tuple(failed))
 
@@ -208,7 +209,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=2_000_000)
     parser.add_argument("--workers", type=int, default=0)
-    parser.add_argument("--arms", nargs="+", default=ARMS, choices=ARMS)
+    parser.add_argument("--arms", nargs="+", default=ARMS, help="ARM or ARM:SEEDS")
     args = parser.parse_args()
     found = arms(args)
     failed = [sentence for arm in found for sentence in arm.train()]
