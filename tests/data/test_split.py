@@ -4,13 +4,16 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from arm import commands, record
 from logs import arm_sequence, late, wave
 
+from gaponet.data.commands import alike, sketch
 from gaponet.data.split import (
     PARTS,
     make_split,
+    one_motion,
     read_split,
     require_distinct_samples,
     split_by_motion,
@@ -30,7 +33,7 @@ def dataset(arm, tmp_path):
         for unit in ("one", "two", "three"):
             for payload in (0.0, 0.2):
                 lag += 1
-                ctrl = wave(60, 2, hertz=0.3 + 0.01 * lag)
+                ctrl = wave(60, 2, hertz=0.3 * 1.0171**lag)
                 data.append(arm_sequence(arm, ctrl, late(ctrl, 2), motion, payload, unit=unit))
     return data
 
@@ -204,3 +207,60 @@ def test_a_rate_keeps_the_split_by_motion_and_a_smaller_share_lies_in_a_larger(a
         split_entries(data, rates=(200,))
     with pytest.raises(UsageError, match="train_share is 0"):
         split_entries(data, train_share=0)
+
+
+def walk(rows, seed, dt=0.02, shift=0.0):
+    """Smooth commands of two joints, as a function of time."""
+    t = dt * np.arange(rows)[:, None] + shift
+    rng = np.random.default_rng(seed)
+    a, f, p = rng.uniform(0.2, 0.5, (3, 2)), rng.uniform(0.1, 0.6, (3, 2)), rng.uniform(0, 6, (3, 2))
+    return sum(a[k] * np.sin(2 * np.pi * f[k] * t + p[k]) for k in range(3))
+
+
+@pytest.mark.parametrize(
+    "again",
+    [
+        lambda c: c,
+        lambda c: c[: len(c) // 2],  # cut short
+        lambda c: np.concatenate([np.repeat(c[:1], 70, axis=0), c, np.repeat(c[-1:], 9, axis=0)]),  # a wait around it
+        lambda c: np.repeat(c, 2, axis=0),  # logged at twice the rate
+        lambda c: walk(400, 3, shift=0.013),  # computed anew, at other moments
+    ],
+)
+def test_a_command_is_known_again_and_others_are_not_taken_for_it(again):
+    first = walk(400, 3)
+    dt = 0.01 if len(again(first)) == 800 else 0.02
+    assert alike([sketch(first, 0.02), sketch(again(first), dt)]) == [(0, 1)]
+    assert alike([sketch(again(first), dt), *(sketch(walk(400, seed), 0.02) for seed in range(4, 60))]) == []
+
+
+def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
+    """lift_0kg and lift_1kg are told the same: one in training would show the other's test commands."""
+    data = Dataset.create(tmp_path / "data", arm)
+    for k in range(12):
+        ctrl = walk(200, k)
+        for name, payload, lag in ((f"lift{k}_0kg", 0.0, 2), (f"lift{k}_1kg", 1.0, 5)):
+            data.append(arm_sequence(arm, ctrl, late(ctrl, lag), name, payload))
+    journal = data.path / "sequences.jsonl"
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    old = [line | {"command": None} if i % 3 else line for i, line in enumerate(lines)]  # before sketches were kept
+    journal.write_text("".join(json.dumps(line) + "\n" for line in old))
+    data = Dataset(data.path)
+    assert len(set(one_motion(data).values())) == 12
+    for parts in (split_entries(data), make_split(data, "motion"), make_split(data, "motion", ("lift3_1kg",)),
+                  make_split(data, "payload", ("1",))):  # fmt: skip
+        sides = {part: {re.sub("_.*", "", e.meta.motion) for e in entries} for part, entries in parts.items()}
+        if {e.meta.payload_mass for e in parts["test"]} == {0.0, 1.0}:
+            assert not sides["test"] & (sides["train"] | sides["val"])
+        assert not sides["train"] & sides["val"]
+    assert values(make_split(data, "motion", ("lift3_1kg",))["test"], "motion") == {"lift3_0kg", "lift3_1kg"}
+
+
+def test_motions_that_are_all_one_cannot_be_split(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    for lag in range(4):
+        data.append(arm_sequence(arm, walk(100, 1), late(walk(100, 1), lag), f"m{lag}"))
+    with pytest.raises(UsageError, match="motions with equal commands count once"):
+        split_entries(data)
+    with pytest.raises(UsageError, match="all 4 motions have equal commands, so they are one"):
+        make_split(data, "motion")

@@ -1,6 +1,7 @@
 """Split files: which sequences are for training, validation (choosing) and test (reporting), by content hash.
 
-By motion, a fixed rule puts every repetition, payload and unit of a motion into one part. By unit or payload, the test
+By motion, a fixed rule puts every repetition, payload and unit of a motion into one part; motions with equal commands
+are one motion, whatever they are called (data.commands). By unit or payload, the test
 part is what is held out, and validation is a part of the motions of the rest. Parts share no recording: neither one
 listed twice nor the same samples under another name, unit or payload.
 """
@@ -18,6 +19,7 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
+from gaponet.data.commands import Sketch, alike, sketch
 from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError, UsageError
@@ -84,11 +86,12 @@ def split_entries(
     if not 0 < train_share <= 1:
         raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
     away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
-    motions = split_by_motion(e.meta.motion for e in dataset.entries)
+    lead = one_motion(dataset)
+    motions = split_by_motion(lead.values())
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
     entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
     parts = {
-        part: [e for e in entries_at if e.meta.motion in motions[part] and (part == "test" or not away(e.meta))]
+        part: [e for e in entries_at if lead[e.meta.motion] in motions[part] and (part == "test" or not away(e.meta))]
         for part in PARTS
     }
     for part, entries in parts.items():
@@ -112,13 +115,39 @@ def spread(entries: ListOf[Entry], most: int) -> list[Entry]:
     return [e for e in entries if e.id in found]
 
 
+def one_motion(dataset: Dataset) -> dict[str, str]:
+    """Motion → the name under which it is split: of motions with equal commands, the first in hash_order."""
+    sketches: dict[str, list[Sketch]] = {}
+    for entry in dataset.entries:
+        known = sketches.setdefault(entry.meta.motion, [])
+        told = entry.command
+        if told is None and not known:  # imported before sketches were kept: one recording speaks for the motion
+            told = sketch(dataset.channels(entry, ("ctrl",))["ctrl"], entry.dt)
+        if told is not None and told not in known:
+            known.append(told)
+    names = hash_order(sketches)
+    whose = [name for name in names for _ in sketches[name]]
+    leads = {name: name for name in names}
+    for i, j in alike([one for name in names for one in sketches[name]]):
+        first, second = leads[whose[i]], leads[whose[j]]
+        if first != second:
+            leads = {name: first if lead == second else lead for name, lead in leads.items()}
+    heads: dict[str, str] = {}
+    for name in names:
+        heads.setdefault(leads[name], name)
+    return {name: heads[lead] for name, lead in leads.items()}
+
+
 def split_by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
     """The motions of each part by a fixed rule without a seed: in the order of the SHA-256 of their names, test first,
     then validation. Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
     """
     names = hash_order(motions)
     if len(names) < 3:
-        raise UsageError(f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more")
+        raise UsageError(
+            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more; motions with equal "
+            "commands count once"
+        )
     test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
     return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
 
@@ -141,14 +170,15 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Part
     Raises:
         UsageError: Something held out is not there, or nothing is left for a part.
     """
-    key = BY[by]
-    held = _held_out(dataset, by, holdout)
+    lead = one_motion(dataset)
+    key = (lambda e: lead[e.meta.motion]) if by == "motion" else BY[by]
+    held = _held_out(dataset, by, holdout, key)
     rest = [e for e in dataset.entries if key(e) not in held]
-    motions = hash_order(e.meta.motion for e in rest)
-    chosen = set(motions[: max(1, round(len({e.meta.motion for e in dataset.entries}) * VAL_SHARE))])
+    motions = hash_order(lead[e.meta.motion] for e in rest)
+    chosen = set(motions[: max(1, round(len(set(lead.values())) * VAL_SHARE))])
     parts = {
-        "train": [e for e in rest if e.meta.motion not in chosen],
-        "val": [e for e in rest if e.meta.motion in chosen],
+        "train": [e for e in rest if lead[e.meta.motion] not in chosen],
+        "val": [e for e in rest if lead[e.meta.motion] in chosen],
         "test": [e for e in dataset.entries if key(e) in held],
     }
     for part in PARTS:
@@ -160,7 +190,8 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Part
     return parts
 
 
-def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...]) -> set[str]:
+def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...], key: Callable[[Entry], str]) -> set[str]:
+    """Keys of what is held out; a motion takes those with equal commands with it."""
     values = hash_order(map(BY[by], dataset.entries))
     if by == "payload":
         holdout = tuple(_kilograms(text) for text in holdout)
@@ -169,7 +200,14 @@ def _held_out(dataset: Dataset, by: str, holdout: tuple[str, ...]) -> set[str]:
             raise UsageError(f"{dataset.path}: no {by} '{value}' to hold out; it holds {', '.join(sorted(values))}")
     if len(values) < 2:
         raise UsageError(f"{dataset.path}: one {by} only ({', '.join(values)}); split it by another property")
-    return set(holdout or values[: max(1, round(len(values) * TEST_SHARE))])
+    keys = hash_order(map(key, dataset.entries))
+    if len(keys) < 2:
+        raise UsageError(
+            f"{dataset.path}: all {len(values)} {by}s have equal commands, so they are one: nothing to split"
+        )
+    if holdout:
+        return {key(e) for e in dataset.entries if BY[by](e) in holdout}
+    return set(keys[: max(1, round(len(keys) * TEST_SHARE))])
 
 
 def _kilograms(text: str) -> str:

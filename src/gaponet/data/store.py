@@ -31,6 +31,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.data.commands import Sketch, sketch
 from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
@@ -66,6 +67,7 @@ class Entry:
     channels: tuple[str, ...]
     meta: SequenceMeta
     findings: dict[str, dict[str, float | None]]
+    command: Sketch | None = None  # in journals from before it was kept
 
     def __post_init__(self) -> None:
         if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
@@ -195,6 +197,7 @@ class Dataset:
             channels=tuple(c for c in ARRAYS if getattr(sequence, c) is not None),
             meta=m,
             findings=findings,
+            command=sketch(sequence.ctrl, sequence.dt),
         )
         columns = {c: getattr(sequence, c) for c in entry.channels}
         self._file(entry).parent.mkdir(exist_ok=True)
