@@ -19,7 +19,7 @@ from fuzzing.harness import AbsurdError, Target
 from fuzzing.mutate import Files
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
-from gaponet.data.writers.lerobot import export_lerobot
+from gaponet.data.writers import export
 from gaponet.motion.files import read_motion
 from gaponet.motion.motion import Motion
 from gaponet.motion.recipe import load_recipe, takes
@@ -136,7 +136,7 @@ def _export(folder: Path) -> None:
             ctrl = wave(ROWS, 2, hertz=0.4 + 0.1 * i)
             data.append(arm_sequence(arm(), ctrl, late(ctrl, 2), f"m{i}", 0.1, tau=ctrl, tau_eq=ctrl, qacc=ctrl))
         data.state(licence="CC0-1.0")
-        export_lerobot(data, Path(place) / "out")
+        export(data, arm(), Path(place) / "out", "lerobot")
         for file in sorted((Path(place) / "out").rglob("*")):
             if file.is_file():
                 to = folder / file.relative_to(Path(place) / "out")

@@ -102,22 +102,30 @@ def figures(
 def export(
     dataset: Data,
     out: Path,
+    to: Literal["lerobot", "sage", "npz", "asap", "mcap"] = "lerobot",
+    robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Write a dataset as LeRobotDataset v3.0, one set for each rate; gaponet import reads it back without loss.
+    """Write a dataset in a format of others; gaponet import reads back all that the format can hold.
 
     Args:
         out: New folder.
+        to: LeRobotDataset v3.0 (one set for each rate), SAGE folder, NumPy, ASAP's motion with action, or ROS 2 bags.
     """
-    from gaponet.data.writers.lerobot import export_lerobot
+    from gaponet.data.writers import WRITERS, export
 
-    screen, data = Out(json), Dataset(dataset)
+    screen = Out(json)
+    data, spec = open_dataset(dataset, robot)
     with bar("exporting") as update:
-        sets = export_lerobot(data, out, update)
-    screen.table(f"{out!s}: LeRobotDataset v3.0", ["set", "episodes", "frames", "fps"], [
-        [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in sets
+        sets = export(data, spec, out, to, update)
+    shown = sets[:20]
+    screen.table(f"{out!s}: {WRITERS[to]}", ["set", "episodes", "frames", "fps"], [
+        [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in shown
     ])  # fmt: skip
-    screen.say(f"Back: gaponet import {out!s} --format lerobot --robot {data.robot_name} --out NEW")
+    if len(shown) < len(sets):
+        screen.say(f"… and {len(sets) - len(shown)} more")
+    pickled = " --allow-pickle" if to == "asap" else ""
+    screen.say(f"Back: gaponet import {out!s} --robot {data.robot_name}{pickled} --out NEW")
     screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
 
 

@@ -207,9 +207,10 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     median = _median_period(log)
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
     even = shared and dt is None and bool((np.abs(period - median) <= 0.1 * median).all())
-    kept = _row_period(
-        time, (float(log.meta.get("dt", round(median, 5))), round(float(period.mean()), 7)) if even else ()
-    )
+    mean = round(float(period.mean()), 7)
+    exact = (mean,) if np.abs(period - mean).max() < 2e-6 else ()  # a clock that does not waver
+    periods = (log.meta["dt"],) if "dt" in log.meta else (*exact, round(median, 5), mean)
+    kept = _row_period(time, periods) if even else None
     regular = kept is not None
     if kept is not None:
         dt = kept

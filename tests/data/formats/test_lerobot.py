@@ -12,9 +12,14 @@ from logs import SO101, arm_sequence, late, stock, wave
 from gaponet.data.formats import detect
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
+from gaponet.data.writers import export
 from gaponet.data.writers import lerobot as lerobot_export
-from gaponet.data.writers.lerobot import export_lerobot
 from gaponet.errors import DatasetError, JointMismatchError, LogError, UsageError
+from gaponet.progress import silent
+
+
+def export_lerobot(dataset, out, progress=silent):
+    return export(dataset, None, out, "lerobot", progress)  # the robot is not asked
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 format = "table"                          # where it cannot be seen
 motion = "{motion}_{payload:g}kg_{rep}"   # what the name of a recording says; with a slash: of its path
-manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, side, rep, kp, kd, kp.<joint>
+manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, rep, kp, kp.<joint>, …
 unit = "lab-1"                            # of all recordings; payload = 0.0, side = "both" likewise
 time = "t"                                # column of the clock; or rate = 50.0 (Hz) where the log has none
 time_unit = "ms"                          # s, ms, us, ns
@@ -51,6 +51,7 @@ Offset = Annotated[float, Interval(ge=-10, le=10)]
 FIELDS = {
     "motion": ("motion", r".+"), "unit": ("unit_id", r".+"), "side": ("payload_side", r"[^_/]+"),
     "payload": ("payload_mass", r"\d+(?:[.p]\d+)?"), "rep": ("repetition", r"\d+"),
+    "level": ("level", r"[a-z_]+"), "virtual": ("virtual", r"yes|no"),
     "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "": ("", r".+?"),
 }  # fmt: skip
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
@@ -175,11 +176,19 @@ def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
             except ValueError:
                 raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
             value = int(value) if field == "repetition" else value
+        if field == "virtual":
+            value = _yes(text, where)
         if joint:
             gains = found.get(field, {})
             value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
         found[field] = value
     return found
+
+
+def _yes(text: str, where: str) -> bool:
+    if text.strip() not in ("yes", "no"):
+        raise LogError(f"{where}: virtual is '{text}'; write yes or no")
+    return text.strip() == "yes"
 
 
 def _stem(file: str) -> str:

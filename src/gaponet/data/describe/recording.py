@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,9 +15,11 @@ from gaponet.arrays import Array
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.limits import to_radians
 from gaponet.data.describe.logs_file import HINT, LogsFile
-from gaponet.data.log import CHANNELS, REQUIRED, Channel, Log
+from gaponet.data.log import CHANNELS, DERIVED, REQUIRED, Channel, Log
+from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import LOG_UNITS, RobotSpec
+from gaponet.structure import validated
 
 WIDEST = 500  # columns of an array that may be joints
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -119,6 +121,14 @@ def from_arrays(
     return Recording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
 
+def restated(told: Any, where: str) -> dict[str, Any]:
+    """What an export of ours says of a recording (fields of SequenceMeta), checked."""
+    fields = told if isinstance(told, dict) else {}
+    again = "export it again"
+    meta = asdict(validated(SequenceMeta, fields | {"robot": "?"}, where, LogError, again))
+    return {name: meta[name] for name in fields if name != "robot"}
+
+
 @contextmanager
 def reading(file: Path, what: str) -> Iterator[None]:
     """Whatever a damaged file makes a library do becomes one error: they raise a dozen kinds, and name none."""
@@ -184,7 +194,7 @@ def _choose(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: d
         if theirs not in columns:
             raise LogError(f"{where}: column '{theirs}' (for {ours}) is missing; there are: {recording.shown()}")
     found: Chosen = {}
-    for channel in CHANNELS:
+    for channel in (*CHANNELS, *DERIVED):
         named = _matching(recording, told, channel, set(single.values()))
         named += [(ours.partition(".")[2], theirs) for ours, theirs in single.items() if ours.startswith(f"{channel}.")]
         named = [(joint, column) for joint, column in named if not ignored(joint, told.get("ignore", ()))]

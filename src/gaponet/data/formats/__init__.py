@@ -141,8 +141,7 @@ def look(
     kind = _require_allowed(reader, path, allow_pickle)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
-    full = cast("LogsFile", reader.DEFAULT | told)
-    return kind, full, list(reader.recordings(path, full))
+    return kind, told, list(_recordings(reader, path, told))
 
 
 def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
@@ -175,13 +174,19 @@ def _loaders(
     if not hasattr(reader, "recordings"):
         yield from reader.read(path, robot, names or None, **{k: v for k, v in told.items() if k in reader.OPTIONS})
         return
-    full = cast("LogsFile", reader.DEFAULT | told)
-    found: Iterable[Recording] = reader.recordings(path, full)
-    if "command_file" in full:
-        found = _with_commands(list(found), full["command_file"])
-        full = cast("LogsFile", full | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
+    found = _recordings(reader, path, told)
+    if "command_file" in told:
+        full = cast("LogsFile", reader.DEFAULT | told)
+        told = cast("LogsFile", told | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
+        found = _with_commands(list(found), told["command_file"])
     for recording in found:
-        yield recording.name, partial(to_log, recording, robot, full, names or None)
+        yield recording.name, partial(to_log, recording, robot, told, names or None)
+
+
+def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[Recording]:
+    """What the reader finds, with what the format itself says unless the recording, or `told`, says something else."""
+    for recording in reader.recordings(path, reader.DEFAULT | told):
+        yield replace(recording, default=cast("LogsFile", reader.DEFAULT | recording.default))
 
 
 def _with_commands(found: list[Recording], pattern: str) -> Iterator[Recording]:

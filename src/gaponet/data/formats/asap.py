@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays
+from gaponet.data.describe.recording import Recording, from_arrays, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.sequence import OPTIONAL
 from gaponet.errors import LogError
-from gaponet.structure import LARGEST_ARRAYS
+from gaponet.structure import LARGEST_ARRAYS, parse_json
 
 OPTIONS = DESCRIBED
 EXTRA = ""
@@ -67,5 +68,9 @@ def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:
         default["ctrl"] = TARGETS
     names = motion.get("joint_names")
     labels = tuple(map(str, names)) if isinstance(names, (list, np.ndarray)) else ()
-    meta = {"stated": motion["stated"]} if isinstance(motion.get("stated"), dict) else {}
-    return from_arrays(file, arrays, labels, name, part=name, meta=meta, default=default)
+    meta: dict[str, Any] = {}
+    if isinstance(motion.get("stated"), str):  # a file of ours
+        meta["stated"] = restated(parse_json(dict[str, Any], motion["stated"], where, LogError), where)
+        default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
+    motion_name = str(meta["stated"]["motion"]) if meta else name
+    return from_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)

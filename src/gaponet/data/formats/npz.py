@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays, reading
+from gaponet.data.describe.recording import Recording, from_arrays, reading, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 from gaponet.errors import LogError
@@ -60,11 +60,11 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recording:
     """What data.writers.npz wrote: SI, and all that we know of it."""
     told = parse_json(dict[str, Any], str(arrays[OURS].ravel()[0]), f"{file}: {OURS}", LogError, "export it again")
-    stated = told.get("stated") if isinstance(told.get("stated"), dict) else {}
+    stated = restated(told.get("stated"), f"{file}: {OURS}")
     default = LogsFile(time_unit="s", position_unit="rad")
     default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
     meta = {"stated": stated} | ({"dt": told["dt"]} if isinstance(told.get("dt"), float) else {})
-    return from_arrays(file, arrays, names, meta=meta, default=default)
+    return from_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
 
 
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[Recording]:

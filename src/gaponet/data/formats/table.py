@@ -63,11 +63,11 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
 
 
 def _is_table(file: Path) -> bool:
-    """A text file counts when its second line is made of numbers."""
-    if file.suffix.lower() not in (".txt", ".dat"):
-        return True
+    """A manifest is none, and a text file counts when its second line is made of numbers."""
     with file.open("rb") as stream:
         lines = stream.read(1 << 16).decode("utf-8", "replace").splitlines()
+    if file.suffix.lower() not in (".txt", ".dat"):
+        return not (lines and lines[0].lstrip("\ufeff").startswith("file,"))
     return len(lines) > 1 and _numeric(_cells(lines[1], _delimiter(lines[1])))
 
 

@@ -1,1 +1,121 @@
-"""Datasets out again: one file per format that others read. A writer loses nothing that its format can hold."""
+"""Datasets out again, one file per format that others read. A writer loses nothing that its format can hold.
+
+A writer is a module with `write(dataset, robot, folder, tell)`, which writes below an empty folder and calls tell with
+the motion of each recording. Formats that cannot hold unit, payload, gains and the like get a logs.toml and a sheet
+beside them that do (SHEET), by which gaponet import reads them back without a word.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from gaponet.data.store import Dataset, Entry
+from gaponet.errors import DatasetError, UsageError
+from gaponet.files import MARK, sync, write_text, writing
+from gaponet.progress import Progress, silent
+from gaponet.robot import RobotSpec
+
+WRITERS = {
+    "lerobot": "LeRobotDataset v3.0, one set for each rate and choice of channels",
+    "sage": "SAGE folder: control.csv, state_motor.csv",
+    "npz": "NumPy, one file per recording",
+    "asap": "ASAP's motion pickle with action, one file per recording",
+    "mcap": "ROS 2 bags (MCAP): /joint_states and /joint_commands",
+}
+SHEET = ("sage", "mcap")
+
+
+@dataclass(frozen=True)
+class Written:
+    """One set or file of an export."""
+
+    path: Path
+    episodes: int
+    frames: int
+    fps: float
+
+
+def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = silent) -> list[Written]:
+    """Write a dataset in a format of others.
+
+    Args:
+        robot: Whose units and home the format may need.
+        out: New or empty folder; appears when the export is complete.
+        to: One of WRITERS.
+
+    Raises:
+        DatasetError, UsageError: Nothing to write, a folder that holds something, or no such format.
+    """
+    out = Path(out)
+    if to not in WRITERS:
+        raise UsageError(f"no writer '{to}'; use one of {', '.join(WRITERS)}")
+    if not dataset.entries:
+        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DatasetError(f"{out}: exists and is not an empty folder; choose a new one")
+    done = 0
+
+    def tell(motion: str) -> None:
+        nonlocal done
+        done += 1
+        progress(done, len(dataset), motion)
+
+    temporary = out.with_name(f"{MARK}-{out.name}")
+    with writing(temporary, "export"):
+        _empty(temporary)  # of an export that was killed
+        try:
+            written = import_module(f"gaponet.data.writers.{to}").write(dataset, robot, temporary, tell)
+            if to in SHEET:
+                _describe(dataset, temporary)
+            for path in temporary.rglob("*"):
+                sync(path)
+            if out.exists():
+                out.rmdir()
+            temporary.rename(out)
+        except BaseException:
+            _empty(temporary)
+            raise
+        (out / MARK).unlink()
+    return [replace(w, path=out / w.path) for w in written]
+
+
+def _describe(dataset: Dataset, folder: Path) -> None:
+    """logs.toml and sheet.csv: what the format cannot say of each recording."""
+    joints = dataset.joint_names
+    gains = [f"{name}.{joint}" for name in ("kp", "kd") for joint in joints]
+    text = io.StringIO()
+    rows = csv.DictWriter(text, ["file", "motion", "unit", "payload", "side", "rep", "level", "virtual", *gains])
+    rows.writeheader()
+    for entry in dataset.entries:
+        m = entry.meta
+        known = {f"{n}.{j}": repr(g) for n in ("kp", "kd") for j, g in zip(joints, getattr(m, n) or (), strict=False)}
+        rows.writerow(
+            {"file": entry.id, "motion": m.motion, "unit": m.unit_id, "payload": repr(m.payload_mass),
+             "side": m.payload_side, "rep": m.repetition, "level": m.level, "virtual": "yes" if m.virtual else "no"}
+            | known
+        )  # fmt: skip
+    write_text(folder / "sheet.csv", text.getvalue())
+    write_text(folder / "logs.toml", 'manifest = "sheet.csv"\n')
+
+
+def stated(entry: Entry) -> str:
+    """All of a recording's metadata but the robot, as JSON."""
+    told: dict[str, Any] = asdict(entry.meta)
+    return json.dumps({k: v for k, v in told.items() if k != "robot" and v is not None}, ensure_ascii=False)
+
+
+def _empty(folder: Path) -> None:
+    for child in folder.iterdir():
+        if child.name != MARK:
+            shutil.rmtree(child) if child.is_dir() else child.unlink()
+
+
+Tell = Callable[[str], None]

@@ -14,9 +14,7 @@ A reader that knows none of these finds an ordinary set. Not in it: twins and fi
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +25,9 @@ from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERS
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry, dataset_hash
+from gaponet.data.writers import Tell, Written
 from gaponet.data.writers.lerobot_stats import EpisodeStats, episode_stats, pool
-from gaponet.errors import DatasetError
-from gaponet.files import MARK, sync, writing
-from gaponet.progress import Progress, silent
+from gaponet.robot import RobotSpec
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -45,68 +42,17 @@ INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
-@dataclass(frozen=True)
-class Written:
-    path: Path
-    episodes: int
-    frames: int
-    fps: float
-
-
-def export_lerobot(dataset: Dataset, out: str | Path, progress: Progress = silent) -> list[Written]:
-    """Write a dataset as LeRobot sets: into `out` itself where one will do, else into folders named after rate.
-
-    Args:
-        out: New or empty folder; appears when the export is complete.
-    """
-    out = Path(out)
-    if not dataset.entries:
-        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DatasetError(f"{out}: exists and is not an empty folder; choose a new one")
+def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
+    """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate."""
     groups: dict[Group, list[Entry]] = {}
     for entry in dataset.entries:
         groups.setdefault((entry.dt, entry.channels), []).append(entry)
-    done = 0
-
-    def tell(motion: str) -> None:
-        nonlocal done
-        done += 1
-        progress(done, len(dataset), motion)
-
-    temporary = out.with_name(f"{MARK}-{out.name}")
-    with writing(temporary, "export"):
-        _empty(temporary)  # of an export that was killed
-        try:
-            written = _write_sets(dataset, groups, temporary, tell)
-            if out.exists():
-                out.rmdir()
-            temporary.rename(out)
-        except BaseException:
-            _empty(temporary)
-            raise
-        (out / MARK).unlink()
-    return [replace(w, path=out / w.path) for w in written]
-
-
-def _write_sets(
-    dataset: Dataset, groups: dict[Group, list[Entry]], folder: Path, tell: Callable[[str], None]
-) -> list[Written]:
-    """Write each group's set into folder, onto the disk; paths returned are relative to it."""
     written = []
     for (dt, channels), entries in groups.items():
         part = "" if len(groups) == 1 else _folder(dt, channels, list(groups))
         frames = _Set(dataset, folder / part, dt, channels).write(entries, tell)
         written.append(Written(Path(part), len(entries), frames, _fps(dt)))
-    for path in folder.rglob("*"):
-        sync(path)
     return written
-
-
-def _empty(folder: Path) -> None:
-    for child in folder.iterdir():
-        if child.name != MARK:
-            shutil.rmtree(child)
 
 
 def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
@@ -132,7 +78,7 @@ class _Set:
         self.stats: EpisodeStats = {}
         self.episodes = self.frames = self.chunk = self.file = 0
 
-    def write(self, entries: list[Entry], tell: Callable[[str], None]) -> int:
+    def write(self, entries: list[Entry], tell: Tell) -> int:
         """Write all episodes and the metadata; returns the number of frames."""
         writer, size = None, 0
         try:
