@@ -25,11 +25,10 @@ def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[
         sequence = dataset.read(entry)
         place = Path("real") / dataset.robot_name / "gaponet" / entry.id
         (folder / place).mkdir(parents=True)
-        zero = np.zeros_like(sequence.qpos)
         state = {"positions": sequence.qpos, "velocities": sequence.qvel}
         state |= {"torques": sequence.tau} if sequence.tau is not None else {}
         for name, columns in (("control", {"positions": sequence.ctrl}), ("state_motor", state)):
-            values = [_in_log_units(kind, x, robot) + zero for kind, x in columns.items()]
+            values = [_in_log_units(kind, x, robot) for kind, x in columns.items()]
             write_text(folder / place / f"{name}.csv", _text(name.upper(), sequence, list(columns), values))
         write_text(folder / place / "joint_list.txt", "\n".join(sequence.joint_names) + "\n")
         written.append(Written(place, 1, len(sequence), sequence.rate))
