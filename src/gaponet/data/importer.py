@@ -24,7 +24,7 @@ from gaponet.files import writing
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 
-HOLD = 1 << 29  # bytes of samples kept between checking and writing; a larger source is read twice
+HOLD = 1 << 26  # bytes of samples kept between checking and writing; a larger source is read twice
 UNSTATED = -1  # repetition that the format does not state, until it is counted
 
 

@@ -2,11 +2,13 @@
 
 import pickle
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 import strange_logs
-from strange_logs import motion
+from logs import arm_columns, table_text
+from strange_logs import motion, write_bag
 
 from gaponet.cli.main import main
 from gaponet.data.formats import detect, pickles, read_logs
@@ -29,6 +31,36 @@ def test_the_same_motion_comes_out_of_each(tmp_path, arm, fmt):
     assert np.allclose(log.channels["ctrl"].values, ctrl)
     assert np.allclose(log.channels["qpos"].values, qpos)
     assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
+
+
+PAGE = (Path(__file__).parents[3] / "docs" / "logs.md").read_text(encoding="utf-8")
+HEADINGS = {"hdf5": "### HDF5", "npz": "### NumPy", "mat": "### MATLAB", "pace": "### PACE", "asap": "### ASAP"}
+
+
+def documented(heading):
+    """The logs.toml below a heading of docs/logs.md."""
+    return PAGE.split(heading)[1].split("```toml\n")[1].split("```")[0]
+
+
+@pytest.mark.parametrize("fmt", WRITERS)
+def test_the_lines_that_the_docs_give_for_a_format_work(tmp_path, arm, fmt):
+    WRITERS[fmt](tmp_path)
+    (tmp_path / "logs.toml").write_text(documented(HEADINGS[fmt]))
+    ((_, log),) = read_logs(tmp_path, arm, allow_pickle=True)
+    assert np.allclose(log.channels["ctrl"].values, motion()[0])
+
+
+def test_the_lines_that_the_docs_give_for_tables_and_bags_work(tmp_path, arm):
+    columns = dict(
+        zip(["t", "shoulder_des", "elbow_des", "shoulder_pos", "elbow_pos"], arm_columns().values(), strict=True)
+    )
+    write_bag(tmp_path / "bag" / "wave", command="array")
+    (tmp_path / "table").mkdir()
+    (tmp_path / "table" / "wave.csv").write_text(table_text(columns))
+    for folder, heading in (("bag", "### ROS bags"), ("table", "### Tables")):
+        (tmp_path / folder / "logs.toml").write_text(documented(heading))
+        ((_, log),) = read_logs(tmp_path / folder, arm)
+        assert log.joint_names == ("shoulder", "elbow")
 
 
 @pytest.mark.parametrize("fmt", WRITERS)

@@ -31,14 +31,14 @@ def guess_logs(recordings: list[Recording], robot: RobotSpec, fmt: str, known: d
     """The text of a logs.toml.
 
     Args:
-        recordings: Of one kind; the first is looked at, the names of all are listed.
+        recordings: Some of one kind; the first is looked at, and what the names of all have in common.
         known: What is said already (a logs.toml, the format's own), which is kept.
     """
     if not recordings:
         raise LogError("no recording found")
     first = recordings[0]
     told = dict(known) | {k: v for k, v in first.default.items() if k not in known}
-    lines = [f"# {fmt}, {len(recordings)} recording(s); the first: {first.where or first.source}",
+    lines = [f"# {fmt}; the first recording: {first.where or first.source}",
              f"# its columns: {first.shown(40)}", "# Lines with a ? are guesses: look at them.", ""]  # fmt: skip
     said = {c: told[c] for c in WORDS if c in told and _values(first, told[c]) is not None}
     channels = _channels(first) | said

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from types import ModuleType
 from typing import Any, cast
@@ -37,6 +38,7 @@ from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
 
 FORMATS = ("sage", "lerobot", "bam", "table", "rosbag", "hdf5", "npz", "mat", "pace", "asap")
+LOOK = 20  # recordings that are looked at before they are described
 ALWAYS = ("names", "ignore", "signs", "offsets", "motion", "manifest", "unit", "payload", "side", "kp", "kd", "format")
 DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
 
@@ -135,13 +137,13 @@ def read_logs(
 def look(
     path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
 ) -> tuple[str, LogsFile, list[Recording]]:
-    """The format, what is said of it already, and the recordings as they lie there; arguments as of read_logs."""
+    """The format, what is said of it already, and the first recordings as they lie there; arguments as of read_logs."""
     told, _ = _described(path, logs)
     reader = _reader(path, fmt or told.get("format"))
     kind = _require_allowed(reader, path, allow_pickle)
     if not hasattr(reader, "recordings"):
         raise UsageError(f"{path}: {about(kind)}: the format says itself what its columns are")
-    return kind, told, list(_recordings(reader, path, told))
+    return kind, told, list(islice(_recordings(reader, path, told), LOOK))
 
 
 def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
