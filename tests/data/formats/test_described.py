@@ -167,6 +167,8 @@ def test_bad_rows_are_cut_and_listed_where_that_is_asked_for(tmp_path, arm, caps
     [
         ('motion = "{motion}_{speed}"', "use each of {motion}, {unit}, {side}, {payload}"),
         ('motion = "{motion}_{motion}"', "at most once"),
+        ('motion = "{}_{}_{}_{motion}"', "at most 3 words may be of any text; use a manifest"),
+        ('manifest = "../sheet.csv"', "it lies beside logs.toml; give its name"),
         ('manifest = "no.csv"', "the manifest is missing, or no table"),
         ("[signs]\nelbow = 0", "a sign is 1 or -1"),
         ("kp = -1.0", "kp"),
@@ -215,3 +217,15 @@ def test_the_guess_knows_how_others_call_things(tmp_path, arm, capsys, names):
     ((_, log),) = read_logs(folder, arm)
     assert np.array_equal(log.channels["ctrl"].values[:, 1], arm_columns()["ctrl.elbow"])
     assert np.array_equal(log.channels["qpos"].values[:, 1], arm_columns()["qpos.elbow"])
+
+
+def test_clocks_that_were_swapped_for_others_do_not_stretch_anything(tmp_path, arm):
+    """Command and state each on its own clock; where these do not overlap, it is said."""
+    columns = theirs() | {"t_cmd": 0.02 * np.arange(60) + 0.007}
+    folder = write(tmp_path / "logs", NAMES + '[clock]\nctrl = "t_cmd"\n', columns=columns)
+    ((_, log),) = read_logs(folder, arm)
+    assert log.channels["ctrl"].time[0] - log.channels["qpos"].time[0] == pytest.approx(0.007)
+    write(folder, NAMES + '[clock]\nctrl = "t_cmd"\n', columns=columns | {"t_cmd": 1e3 + columns["t_cmd"]})
+    told = ["--robot", str(arm.mjcf.parent), "--unit-id", "lab", "--payload-mass", "0", "--out", str(tmp_path / "data")]
+    assert main(["import", str(folder), *told]) == 2
+    assert not (tmp_path / "data").exists()

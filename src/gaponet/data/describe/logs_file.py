@@ -54,6 +54,7 @@ FIELDS = {
     "level": ("level", r"[a-z_]+"), "virtual": ("virtual", r"yes|no"),
     "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "": ("", r".+?"),
 }  # fmt: skip
+MOST_LOOSE = 3  # of a pattern's words that match anything: each more makes a name that does not fit slower to refuse
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
 
 
@@ -108,6 +109,8 @@ class Naming:
         self.where = str(where or "logs.toml")
         self.pattern, self.by_path = _pattern(told.get("motion"), self.where)
         self.text = told.get("motion", "")
+        if Path(told.get("manifest", "")).name != told.get("manifest", ""):
+            raise UsageError(f'{self.where}: manifest = "{told["manifest"]}": it lies beside logs.toml; give its name')
         self.sheet = _read_sheet((where or Path()).parent / told["manifest"]) if "manifest" in told else None
         self.unused = set(range(len(self.sheet or ())))
         said = {k: told[k] for k in ("unit", "payload", "side", "kp", "kd") if k in told}
@@ -149,13 +152,16 @@ def _pattern(text: str | None, where: str) -> tuple[re.Pattern[str] | None, bool
     """The regular expression of "{motion}_{payload:g}kg", and whether it is of the path."""
     if text is None:
         return None, False
-    parts, seen = [], set()
+    parts, seen, loose = [], set(), 0
     for literal, word, brace in re.findall(r"([^{}]+)|\{(\w*)(?::[^{}]*)?\}|([{}])", text):
         if brace or (not literal and (word not in FIELDS or (word and word in seen))):
             known = ", ".join("{" + k + "}" for k in FIELDS)
             raise UsageError(f'{where}: motion = "{text}": use each of {known} at most once')
         seen.add(word)
+        loose += not literal and FIELDS[word][1].startswith(".+")
         parts.append(re.escape(literal) if literal else f"(?P<{word}>{FIELDS[word][1]})" if word else FIELDS[""][1])
+    if loose > MOST_LOOSE:
+        raise UsageError(f'{where}: motion = "{text}": at most {MOST_LOOSE} words may be of any text; use a manifest')
     return re.compile("".join(parts)), "/" in text
 
 
