@@ -1,4 +1,4 @@
-"""What the benchmarks behind docs/results have in common: their networks, their progress, and where results go."""
+"""What the benchmarks behind docs/results have in common: their progress, and where results go."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from gaponet.model.config import ModelConfig
 from gaponet.study.page import write
 from gaponet.study.pool import Running
 from gaponet.study.result import Result
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"
-# Networks of the published numbers, twice as wide as today's default.
-WIDE = ModelConfig(branch_hidden=(128, 128), trunk_hidden=(64, 64), sensor_hidden=(256, 256))
 
 
 def say(running: Running, done: int) -> None:
