@@ -51,8 +51,9 @@ def still(models: list[tuple[str, mujoco.MjModel, Array]]) -> bytes:
 def _box(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[Array, Array]:
     """Corners around all geoms but floors, m."""
     shown = model.geom_type != FLOOR
-    reach = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None]
-    places = data.geom_xpos[shown] if shown.any() else data.xpos
+    if not shown.any():
+        return data.xpos.min(axis=0), data.xpos.max(axis=0)
+    reach, places = np.linalg.norm(model.geom_aabb[shown, 3:], axis=1)[:, None], data.geom_xpos[shown]
     return (places - reach).min(axis=0, initial=np.inf), (places + reach).max(axis=0, initial=-np.inf)
 
 

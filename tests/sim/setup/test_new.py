@@ -132,6 +132,52 @@ def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
     assert (float(spec.joint("lift").damping[0]), float(spec.joint("lift").frictionloss)) == (0.3, 0.2)
 
 
+LINK = """<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/>
+</inertial>{3}</link>"""
+TURN = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="1"/></joint>"""
+
+
+def hand(*links: str) -> str:
+    """A URDF: base, left_arm, left_palm, and two fingers on it; what `links` say of arm, palm and fingers."""
+    chain = (
+        ("base", "left_arm"),
+        ("left_arm", "left_palm"),
+        ("left_palm", "left_hand_a"),
+        ("left_palm", "left_hand_b"),
+    )
+    turns = [TURN.format(f"turn_{child}", parent, child) for parent, child in chain]
+    return f'<robot name="r">{"".join(['<link name="base"/>', *links, *turns])}</robot>'
+
+
+def test_what_vendors_write_and_no_body_has_is_mended_and_said(tmp_path):
+    links = [LINK.format("left_arm", 1.0, 0.01, ""), LINK.format("left_palm", 0.5, 0, ""),
+             LINK.format("left_hand_a", 0, 0, ""), LINK.format("left_hand_b", 0.1, 1e-4, "")]  # fmt: skip
+    (tmp_path / "r.urdf").write_text(hand(*links))
+    made = make(tmp_path, tmp_path / "r.urdf")
+    told = " ".join(made.notes)
+    assert "inertia that no body has, taken as a ball's of the link's mass: left_palm" in told
+    assert "links without mass behind a joint, taken as 1 mg: left_hand_a" in told
+    palm, tip = (made.vendor.body(name) for name in ("left_palm", "left_hand_a"))
+    radius = (3 * 0.5 / (4 * np.pi * 1000)) ** (1 / 3)
+    assert palm.mass[0] == 0.5
+    assert palm.inertia == pytest.approx(np.full(3, 0.4 * 0.5 * radius**2))
+    assert tip.mass[0] == pytest.approx(1e-6)
+    assert [(m.side, m.body) for m in made.robot.payload_mounts] == [
+        ("left", "left_palm")
+    ]  # not a finger, and not twice
+
+
+def test_a_mesh_that_cannot_be_read_is_left_out_and_said(tmp_path):
+    (tmp_path / "bad.stl").write_bytes(b"solid nothing of the kind" * 10)
+    shape = '<visual><geometry><mesh filename="bad.stl"/></geometry></visual>'
+    links = [LINK.format(name, 0.5, 0.01, shape) for name in ("left_arm", "left_palm", "left_hand_a", "left_hand_b")]
+    (tmp_path / "r.urdf").write_text(hand(*links))
+    made = make(tmp_path, tmp_path / "r.urdf")
+    assert any(note.startswith("mesh left out:") for note in made.notes)
+    assert made.vendor.nmesh == 0
+
+
 def test_a_package_elsewhere_is_named(tmp_path):
     urdf = write_urdf(tmp_path / "a", URDF.replace("bar_description", "other"))
     assert make(tmp_path / "b", urdf, kp=("50",), packages=(f"other={tmp_path}/a/bar_description",)).vendor.nmesh == 1

@@ -13,7 +13,7 @@ from gaponet.cli.out import Out, show_findings
 from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
 from gaponet.files import whole
-from gaponet.robot import RobotSpec, available, load_robot
+from gaponet.robot import RobotSpec, as_option, available, load_robot
 
 if TYPE_CHECKING:
     from gaponet.sim.setup.new import Made
@@ -152,7 +152,7 @@ def new(
         screen.say(f"  no picture: {error}", "   note", "cyan")
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
-    screen.say(f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {_as_folder(out)} --out data")
+    screen.say(f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {as_option(out)} --out data")
     screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
 
 
@@ -166,10 +166,6 @@ def _picture(made: Made, label: str) -> Path:
     with whole(path) as temporary:
         temporary.write_bytes(png)
     return path
-
-
-def _as_folder(path: Path) -> str:
-    return str(path) if path.name != str(path) else f"./{path}"
 
 
 def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]) -> dict[str, Any]:

@@ -248,12 +248,14 @@ def _mounts(
     """Side, body, place in it (m), and why."""
     if asked:
         return [_mount(model, *_pair(word)) for word in asked]
-    ends = [(body, _beyond(model, body)) for body in _ends(model, operated)]
+    ends = tips = _ends(model, operated)
+    if len(ends) > 1:
+        ends = _palms(model, [e for e in ends if any(_hand(model.body(b).name) for b in _beyond(model, e))])
     found: list[tuple[str, str, np.ndarray, str]] = []
-    hands = [(e, beyond) for e, beyond in ends if len(ends) == 1 or any(_hand(model.body(b).name) for b in beyond)]
-    for end, beyond in hands:
+    for end in ends:
+        beyond = _beyond(model, end)
         sites = [s for s in range(model.nsite) if model.site_bodyid[s] in beyond and _hand(model.site(s).name)]
-        bodies = [b for b in beyond if b != end and _hand(model.body(b).name)]
+        bodies = [b for b in beyond if b != end and _hand(model.body(b).name)] if end in tips else []
         if sites:
             body, pos, why = int(model.site_bodyid[sites[0]]), model.site_pos[sites[0]], model.site(sites[0]).name
         elif bodies:
@@ -282,6 +284,27 @@ def _ends(model: mujoco.MjModel, operated: list[str]) -> list[int]:
     """Bodies with an operated joint, beyond which there is none."""
     moved = {int(model.jnt_bodyid[model.joint(name).id]) for name in operated}
     return [b for b in sorted(moved) if not moved & set(_beyond(model, b)[1:])]
+
+
+def _palms(model: mujoco.MjModel, ends: list[int]) -> list[int]:
+    """Ends of one side, the fingers of a hand, as the body that carries them all; others as they are."""
+    sides: dict[str, list[int]] = {}
+    for end in ends:
+        name = model.body(end).name.lower()
+        sides.setdefault(next((word for word in ("left", "right") if word in name), ""), []).append(end)
+    found = []
+    for part in sides.values():
+        palm = max(set.intersection(*(set(_chain(model, end)) for end in part)))
+        found += [palm] if model.body_parentid[palm] else part
+    return sorted(found)
+
+
+def _chain(model: mujoco.MjModel, body: int) -> list[int]:
+    """A body and all that carry it, the world among them."""
+    found = [body]
+    while found[-1]:
+        found.append(int(model.body_parentid[found[-1]]))
+    return found
 
 
 def _beyond(model: mujoco.MjModel, body: int) -> list[int]:

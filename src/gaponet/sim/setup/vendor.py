@@ -6,6 +6,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from gaponet.data.checks.finding import some
 from gaponet.errors import RobotError
@@ -13,7 +14,8 @@ from gaponet.mjcf import read_mjcf, require_size
 
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 KEEP = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
-        "autolimits": "true"}  # fmt: skip
+        "boundmass": "1e-6", "boundinertia": "1e-9", "autolimits": "true"}  # fmt: skip
+DENSITY = 1000.0  # kg/m³, of links whose inertia is impossible
 
 
 def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
@@ -44,7 +46,7 @@ def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
         spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
-    return spec, _left_out(sorted(missing), f"are not in {place}")
+    return spec, _left_out(sorted(missing), f"are not in {place}") + _unreadable(spec)
 
 
 def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
@@ -64,6 +66,7 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
                 link.remove(shape)
             else:
                 mesh.set("filename", str(file.resolve()))
+    mended = _inertias(root)
     own = root.find("mujoco")
     own = ET.SubElement(root, "mujoco") if own is None else own
     for compiler in own.findall("compiler"):
@@ -74,11 +77,67 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
     except (ValueError, mujoco.FatalError) as error:
         raise RobotError(f"{path}: not valid URDF: {' '.join(str(error).split())}") from None
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
-    return spec, _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
+    notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
+    return spec, notes + _unreadable(spec) + mended
 
 
 def _left_out(names: list[str], why: str) -> list[str]:
     return [f"{len(names)} mesh(es) {why}; left out: {some(names)}"] if names else []
+
+
+def _inertias(root: ET.Element) -> list[str]:
+    """Give links with mass whose inertia no body can have (URDFs often hold zeros) that of a ball; says which."""
+    impossible, light = [], []
+    for link in root.iter("link"):
+        inertial = link.find("inertial")
+        mass, inertia = (None, None) if inertial is None else (inertial.find("mass"), inertial.find("inertia"))
+        m = _number(mass, "value")
+        if inertial is not None and mass is not None and m <= 0:
+            link.remove(inertial)
+        if inertial is None or mass is None or m <= 0:
+            light.append(link.get("name", ""))
+            continue
+        xx, yy, zz, xy, xz, yz = (_number(inertia, f"i{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+        matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if inertia is None or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] > 0:
+            continue
+        ball = 0.4 * m * (3 * m / (4 * np.pi * DENSITY)) ** (2 / 3)
+        for axes in ("xx", "yy", "zz", "xy", "xz", "yz"):
+            inertia.set(f"i{axes}", repr(float(ball)) if axes[0] == axes[1] else "0")
+        impossible.append(link.get("name", ""))
+    moved = {j.find("child").get("link", "") for j in root.iter("joint")  # type: ignore[union-attr]
+             if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
+    said = [f"inertia that no body has, taken as a ball's of the link's mass: {some(impossible)}"] if impossible else []
+    light = [name for name in light if name in moved]
+    return said + ([f"links without mass behind a joint, taken as 1 mg: {some(light)}"] if light else [])
+
+
+def _number(element: ET.Element | None, name: str) -> float:
+    try:
+        return float(element.get(name, "0")) if element is not None else 0.0
+    except ValueError:
+        return float("nan")
+
+
+def _unreadable(spec: mujoco.MjSpec) -> list[str]:
+    """Leave out meshes that MuJoCo cannot read, for all but their looks are in the links' own inertias; says which."""
+    said = []
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
+    while len(spec.meshes):
+        try:
+            spec.copy().compile()
+            break
+        except (ValueError, mujoco.FatalError) as error:
+            why = " ".join(str(error).split())
+            bad = next((m for m in spec.meshes if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why), None)
+            if bad is None:
+                break
+            said.append(f"mesh left out: {why}")
+            for geom in [g for g in spec.geoms if g.meshname == bad.name]:
+                spec.delete(geom)
+            spec.delete(bad)
+    return said
 
 
 def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:
