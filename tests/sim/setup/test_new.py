@@ -147,7 +147,7 @@ def hand(*links: str) -> str:
         ("left_palm", "left_hand_b"),
     )
     turns = [TURN.format(f"turn_{child}", parent, child) for parent, child in chain]
-    return f'<robot name="r">{"".join(['<link name="base"/>', *links, *turns])}</robot>'
+    return "".join(['<robot name="r"><link name="base"/>', *links, *turns, "</robot>"])
 
 
 def test_what_vendors_write_and_no_body_has_is_mended_and_said(tmp_path):
