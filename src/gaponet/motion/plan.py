@@ -89,19 +89,19 @@ def sheet(robot: RobotSpec, plan: Plan, files: list[str], rate: float) -> str:
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
-        f"{plan.minutes:.0f} minutes of motion: {len(plan.motions)} motions at {masses} kg, commands at {rate:g} Hz. On "
-        f"virtual H1-2 robots {ENOUGH:g} minutes left a third of the simulator's error, and {BEST:g} were within a tenth "
-        f"of the best.{few}",
+        f"{plan.minutes:.0f} minutes of motion: {len(plan.motions)} motions at {masses} kg, commands at {rate:g} Hz. "
+        f"On virtual H1-2 robots {ENOUGH:g} minutes left a third of the simulator's error, {BEST:g} came "
+        f"within a tenth of the best.{few}",
         "",
         "Robot: ____________  unit: ____________  date: ____________  by: ____________",
         "",
         "1. Warm up for ten minutes with any of these motions: cold joints rub more.",
         "2. Note kp and kd of the controller and leave them: one setting for all motions, or a folder for each.",
         f"   The simulator has (N·m/rad, N·m·s/rad): {gains}.",
-        "3. Log the command as it is sent, the measured position and, if there are, velocity and signed torque: with one",
-        "   clock, at the commands' rate or above, with all digits, from before the motion to a second after it.",
-        "4. Nothing may touch the robot. Play each motion slowly first, a hand on the stop. Play a motion again that was",
-        "   stopped.",
+        "3. Log the command as it is sent, the measured position and, if there are, velocity and signed torque: with",
+        "   one clock, at the commands' rate or above, with all digits, from before the motion to a second after it.",
+        "4. Nothing may touch the robot. Play each motion slowly first, a hand on the stop. Play a motion again that",
+        "   was stopped.",
         "5. Weigh payloads to 10 g and mount them where robot.toml says.",
         "",
         "| nr | file | kg | s | time | temperature | remarks |",
