@@ -90,7 +90,7 @@ def recordings(robot: RobotSpec, kp: float = 0.9) -> list[Recording]:
 
 
 def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Callable[[Path], None] | None = None,
-            gain: float | None = None) -> Diagnosis | GAPONetError:  # fmt: skip
+            gain: float | None = None, logs_toml: str = "") -> Diagnosis | GAPONetError:  # fmt: skip
     """Write the logs, import them and call the doctor; an import that refuses is an answer as well."""
     for log in logs:
         place = folder / f"{log.payload:g}" / "real" / robot.name / "tests" / log.motion
@@ -99,6 +99,7 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
         damage(folder)
     try:
         for mass in dict.fromkeys(log.payload for log in logs):
+            (folder / f"{mass:g}" / "logs.toml").write_text(logs_toml)
             kp = (
                 ()
                 if gain is None
@@ -168,7 +169,8 @@ EVERY = slice(None)
 FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, object]]] = {
     "sign of a state": (lambda logs: all_of(logs, lambda g: g.change(J, qpos=lambda x: -x, qvel=lambda x: -x)), {}),
     "sign of command and state": (
-        lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: -x, qpos=lambda x: -x, qvel=lambda x: -x)), {}),
+        lambda logs: all_of(logs, lambda g: g.change(J, **dict.fromkeys(("ctrl", "qpos", "qvel", "tau"), np.negative))),
+        {}),
     "swap of two states": (lambda logs: all_of(logs, lambda g: replace(g, qpos=swapped(g.qpos))), {}),
     "degrees of all": (
         lambda logs: all_of(logs, lambda g: g.change(EVERY, ctrl=np.degrees, qpos=np.degrees, qvel=np.degrees)), {}),
@@ -200,6 +202,8 @@ FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, 
     "wrong gains": (list, {"gain": 2.0}),
     "wrong payload label": (lambda logs: one_of(logs, lambda g: replace(g, payload=0.2)), {}),
     "joint order": (lambda logs: all_of(logs, rotated), {}),
+    "zero of command and state": (
+        lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: x - 0.6, qpos=lambda x: x - 0.6)), {}),
     "torque unsigned": (lambda logs: all_of(logs, lambda g: g.change(EVERY, tau=np.abs)), {}),
     "torque of the other sign": (lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: -x)), {}),
     "quantised": (lambda logs: all_of(logs, lambda g: g.change(EVERY, qpos=lambda x: np.round(x, 2))), {}),

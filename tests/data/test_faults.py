@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from faulty import FAULTS, all_of, examine, recordings
 
+from gaponet.data.checks.finding import proposal
+from gaponet.data.store import Dataset
 from gaponet.errors import GAPONetError
+from gaponet.eval.draw_findings import draw_findings
 from gaponet.robot import load_robot
 
 # Check, level and words of the finding that names it; no level: the import refuses with these words.
@@ -34,6 +37,7 @@ NAMED = {
     "wrong gains": ("gains", "warning", "times as far as the stated kp says"),
     "wrong payload label": ("payload", "warning", "m2 rests as with 0"),
     "joint order": ("gravity", "warning", "the order of joints one place back"),
+    "zero of command and state": ("gravity", "warning", "with its zero turned by +0.60 rad at elbow_flex"),
     "torque unsigned": ("torque", "warning", "torque is unsigned"),
     "torque of the other sign": ("gravity", "warning", "with its torque negated at elbow_flex"),
     "quantised": ("resolution", "warning", "come in steps of up to 10.0 mrad"),
@@ -81,4 +85,25 @@ def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
         return
     assert [f for f in answer.findings if (f.check, f.level) == (check, level) and words in f.message]
     others = {f.check for f in answer.findings if f.level in ("warning", "error")} - {check}
-    assert others <= {"jitter", "blocked", "jumps", "unit", "stuck"}  # what follows from it
+    assert others <= {"jitter", "blocked", "jumps", "unit", "stuck", "range"}  # what follows from it
+
+
+@pytest.mark.parametrize("fault", ["sign of command and state", "zero of command and state", "joint order"])
+def test_the_doctors_proposal_for_logs_toml_mends_what_it_can(robot, logs, tmp_path, fault):
+    faulty = FAULTS[fault][0](logs)
+    proposed = proposal(examine(robot, faulty, tmp_path / "faulty").findings)
+    assert "applied to nothing" in proposed
+    mended = examine(robot, faulty, tmp_path / "mended", logs_toml=proposed)
+    assert [f.message for f in mended.findings if f.level in ("warning", "error")] == []
+
+
+def test_good_logs_need_no_mending(robot, logs, tmp_path):
+    assert proposal(examine(robot, logs, tmp_path).findings) == "# gaponet doctor --fix: nothing to mend.\n"
+
+
+def test_each_finding_has_a_picture(robot, logs, tmp_path):
+    change, _ = FAULTS["spike of a state"]
+    findings = examine(robot, change(logs), tmp_path).findings
+    written = draw_findings(Dataset(tmp_path / "data"), robot, findings, tmp_path)
+    assert (tmp_path / "01-jumps.png") in written
+    assert len(written) == 2 * sum(f.level != "ok" and (f.level != "note" or bool(f.joints)) for f in findings)

@@ -9,10 +9,11 @@ import numpy as np
 import tyro
 
 from gaponet import api
-from gaponet.cli.options import Data, Folder, Json, like
+from gaponet.cli.options import Data, Flag, Folder, Json, like
 from gaponet.cli.out import Out, show_findings
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
+from gaponet.files import writing
 from gaponet.robot import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -83,12 +84,17 @@ def import_logs(
     show_import(Out(json), report, spec)
 
 
-def doctor(dataset: Data, robot: str | None = None, json: Json = False) -> None:
-    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
+def doctor(
+    dataset: Data, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
+) -> None:
+    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque, payload.
 
     Args:
         robot: Robot name or folder, if not the one that the dataset keeps.
+        fix: Print a proposal for logs.toml after the findings; nothing is applied.
+        figures: Folder for a picture of each finding.
     """
+    from gaponet.data.checks.finding import proposal
     from gaponet.data.doctor import inventory
 
     out = Out(json)
@@ -96,7 +102,18 @@ def doctor(dataset: Data, robot: str | None = None, json: Json = False) -> None:
     diagnosis = api.doctor(data, spec)
     out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
-    out.result({"dataset": data.path.name, "robot": spec.name} | diagnosis.as_dict())
+    mended = proposal(diagnosis.findings) if fix else ""
+    for line in mended.splitlines():
+        out.say(line)
+    drawn: list[Path] = []
+    if figures is not None:
+        from gaponet.eval.draw_findings import draw_findings
+
+        with writing(figures, "figures"):
+            drawn = draw_findings(data, spec, diagnosis.findings, figures)
+        out.say(f"{len(drawn)} pictures written: {figures!s}")
+    out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": mended,
+                "figures": [str(path) for path in drawn]} | diagnosis.as_dict())  # fmt: skip
 
 
 def formats(json: Json = False) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,15 +13,19 @@ from gaponet.robot import RobotSpec
 LEVELS = ("ok", "note", "warning", "error")
 
 
+Mend = dict[str, dict[str, Any]]  # table of logs.toml → joint → value
+
+
 @dataclass(frozen=True)
 class Finding:
-    """`message` is for people and says what to do; `values` are the numbers in it."""
+    """`message` is for people and says what to do; `values` are the numbers in it, `mend` what logs.toml would say."""
 
     level: str
     check: str
     message: str
     joints: tuple[str, ...] = ()
     values: dict[str, Any] = field(default_factory=dict)
+    mend: Mend = field(default_factory=dict)
 
 
 def some(motions: list[str]) -> str:
@@ -32,3 +37,23 @@ def some(motions: list[str]) -> str:
 def names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
     """Joint names where mask (n) is true."""
     return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)
+
+
+def proposal(findings: list[Finding]) -> str:
+    """Lines to add to a logs.toml where the findings say how, and as comments what it cannot mend."""
+    bad = [f for f in findings if f.level in ("warning", "error")]
+    lines = [
+        "# gaponet doctor --fix: a proposal, applied to nothing. Look it over, add it to the logs.toml of these logs,",
+        "# import into a new folder and call the doctor again. Joints have the robot's names.",
+        "",
+    ]
+    tables: Mend = {}
+    for finding in bad:
+        lines += [f"# {finding.level}, {finding.check}: {finding.message}"]
+        for table, values in finding.mend.items():
+            tables.setdefault(table, {}).update(values)
+    for table, values in tables.items():
+        lines += ["", f"[{table}]", *(f"{json.dumps(joint)} = {json.dumps(value)}" for joint, value in values.items())]
+    if not bad:
+        lines = ["# gaponet doctor --fix: nothing to mend."]
+    return "\n".join(lines) + "\n"

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding
+from gaponet.data.checks.finding import Finding, Mend
 from gaponet.data.offsets import Carried, Gravity
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
@@ -38,11 +38,13 @@ LOADED = 0.01  # of the torque limit: a joint that gravity loads less says nothi
 
 
 class _Guess(NamedTuple):
-    """A way in which the logs may be wrong, in words, at these joints; and gravity's torque (k, n) if they are so."""
+    """A way in which the logs may be wrong, in words, at these joints; gravity's torque (k, n) if they are so; and what
+    logs.toml would say then."""
 
     words: str
     joints: tuple[int, ...]
     torque: Callable[[Array, Carried], Array]
+    mend: Mend
 
 
 class _Best(NamedTuple):
@@ -73,7 +75,7 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
             f"than as logged ({best.as_logged:.0%}): wrong in command and state alike, where neither shows it; check "
             "it against the model"
         )
-        yield Finding("warning", "gravity", text, names, {"evidence": best.evidence})
+        yield Finding("warning", "gravity", text, names, {"evidence": best.evidence}, best.guess.mend)
         return
     shares = " and ".join(f"{b.as_logged:.0%}" for b in found)
     text = f"no other zero, sign or order fits gravity better; it explains {shares} of the torques"
@@ -114,7 +116,9 @@ def _turned(robot: RobotSpec, loaded: Array, model: Gravity) -> Iterator[_Guess]
                 found[:, j] *= how[2]
                 return found
 
-            yield _Guess(f"{what} at {robot.joint_names[j]}", (j,), torque)
+            name = robot.joint_names[j]
+            mend: Mend = {"offsets": {name: turn}} if turn else {"signs": {name: sign}} if sign < 0 else {}
+            yield _Guess(f"{what} at {name}", (j,), torque, mend)
 
 
 def _ordered(robot: RobotSpec, model: Gravity) -> Iterator[_Guess]:
@@ -131,7 +135,8 @@ def _ordered(robot: RobotSpec, model: Gravity) -> Iterator[_Guess]:
         order[op] = way
         orders.append((f"the order of joints {words}", tuple(op.tolist()), order))
     for words, joints, order in orders:
-        yield _Guess(words, joints, partial(_as_if_ordered, model, order))
+        names = {robot.joint_names[o]: robot.joint_names[i] for i, o in enumerate(order) if i != o}
+        yield _Guess(words, joints, partial(_as_if_ordered, model, order), {"names": names})
 
 
 def _as_if_ordered(model: Gravity, order: Array, qpos: Array, key: Carried) -> Array:
