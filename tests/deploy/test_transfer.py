@@ -83,6 +83,17 @@ def test_it_follows_where_motors_give_all_they_can(tmp_path, how):
 
 
 @pytest.mark.parametrize("how", ["closed", "probes"])
+def test_jumps_that_saturate_motors_do_not_wind_it_up(tmp_path, how):
+    weak = write_arm(tmp_path, TOML.replace("effort_limit = 5.0", "effort_limit = 0.7"), HEAVY)
+    jumps = np.repeat([[-0.6, -0.6], [0.6, 0.6], [-0.6, -0.6]], [20, 60, 60], axis=0)
+    there, target = follow(AlignedSim(weak, None), jumps), other(weak, kp=0.5)
+    alone, given = (
+        np.abs(follow(AlignedSim(target, like, inverse=how), jumps) - there).mean() for like in (None, weak)
+    )
+    assert given < 0.1 * alone
+
+
+@pytest.mark.parametrize("how", ["closed", "probes"])
 def test_a_payload_that_the_simulator_does_not_know_of(robot, model, how):
     there = follow(AlignedSim(robot, model, 0.2))
     sim = AlignedSim(robot, model, 0.2, simulator_payload=0.0, inverse=how)

@@ -225,7 +225,9 @@ class Probed:
         asked = PROBES[PROBES != 0, None, None] * wide
         probed = np.insert(missed(near + asked), len(PROBES) // 2, left, axis=0)
         more, slope = _crossing(_rising(probed / wide))
-        more, moves = more * wide, slope > FLAT
+        away = near - periods[0].qpos
+        wound = (slope <= FLAT) & (left * np.sign(away) > FLAT * np.abs(away))  # limited far beyond what is asked for
+        more, moves = np.where(wound, -away, more * wide), wound | (slope > FLAT)
         told, lefts = [near], [left]
         for _ in range(1 + MENDED):
             told.append(told[-1] + more)
