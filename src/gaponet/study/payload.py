@@ -104,7 +104,7 @@ class Payload:
         for q in asked:
             looks = {"nominal": (titles["nominal"], colour("nominal")), ALL: ("GAPONet trained on all", base),
                      q.words[0]: ("trained without it", shade(base, -0.4)),
-                     q.words[1]: ("trained without it, mass not told", shade(base, 0.5))}  # fmt: skip
+                     q.words[1]: ("… mass not told", shade(base, 0.5))}  # fmt: skip
             drawn = {name: (c, masses, error[w]) for w, (name, c) in looks.items() if w in error}
             panels.append((f"{q.payload:g} kg left out, {q.name} the others\n{study.who}", drawn))
         said, tables, name = [s for q in asked if (s := _sentence(q, found))], [table], "Payloads never trained on"
@@ -142,10 +142,10 @@ def _unladen(found: Beside, masses: list[float]) -> tuple[tuple[tuple[Any, ...],
 def _looks(found: Beside) -> list[tuple[tuple[str, str], dict[float, Spread]]]:
     """Label and colour of the rows beside, as far as a figure shows them."""
     looks = {
-        "GAPONet trained on all payloads, mass estimated": ("mass estimated", shade(colour(ALL), 0.75)),
-        EMPTY: ("identified, carrying nothing", colour("identified")),
-        LADEN: ("transfer, laden nominal", shade(colour("transfer"), 0.5)),
-        LADEN_FULL: ("transfer, laden identified", colour("transfer")),
+        "GAPONet trained on all payloads, mass estimated": ("… mass estimated", shade(colour(ALL), 0.75)),
+        EMPTY: ("identification", colour("identified")),
+        LADEN: ("laden one transferred", shade(colour("transfer"), 0.5)),
+        LADEN_FULL: ("… identified", colour("transfer")),
     }
     return [(looks[name], by) for name, by in found.rows.items() if name in looks and by]
 
