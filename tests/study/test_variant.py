@@ -39,7 +39,7 @@ def test_a_field_that_may_be_absent_reads_none():
     ("word", "complaint"),
     [
         ("lstm", "no model 'lstm'; there are gaponet, shared_mlp, mlp"),
-        ("mlp:hidden=3", "fields are history, stride, .*warm_start.rounds"),
+        ("mlp:hidden=3", "fields like that are .*mlp_hidden"),
         ("mlp:history", "'history' is not FIELD=VALUE"),
         ("mlp:kind=gaponet", "'kind=gaponet' is not"),
         ("mlp:seed=3", "'seed=3' is not"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from gaponet.errors import UsageError
@@ -60,7 +61,11 @@ def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
     field, equals, value = setting.partition("=")
     places = dict(_places(config))
     if not equals or field not in places:
-        raise UsageError(f"--models {text}: '{setting}' is not FIELD=VALUE; fields are {', '.join(places)}")
+        near = get_close_matches(field, places, 5, 0.4)
+        raise UsageError(
+            f"--models {text}: '{setting}' is not FIELD=VALUE; fields like that are {', '.join(near) or 'none'}; "
+            "all stand in gaponet train --help, without the model. in front"
+        )
     part, name = places[field]
     owner = getattr(config, part) if part else config
     change: dict[str, Any] = {name: _read(value, get_type_hints(type(owner))[name], f"--models {text}: {field}")}
