@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from publish import publish, say
-from virtual_h1_2 import CONFIG, RECIPE, UNIT, WORD, Bench, run
+from virtual_h1_2 import CONFIG, PPO, RECIPE, UNIT, WORD, Bench, run
 
 from gaponet.data.json_file import read_kept, write_json
 from gaponet.data.store import Dataset
@@ -179,7 +179,7 @@ def real(args: argparse.Namespace) -> Study:
     data = args.work / "so101"
     if not data.exists():
         run("import", args.logs, "--robot", "so101", "--unit-id", "lab", "--payload-mass", 0, "--out", data)
-    config = TrainConfig(warm_start=WarmStartConfig(rounds=6), validate_every=VALIDATE)
+    config = TrainConfig(warm_start=WarmStartConfig(rounds=6), ppo=PPO, validate_every=VALIDATE)
     study = Study(Dataset(data), load_robot("so101"), args.work / "real", config, "0", args.seeds, workers=args.workers)
     return identified(study, lambda done, total, note: None)
 

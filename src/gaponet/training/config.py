@@ -63,8 +63,9 @@ class PPOConfig:
     """Passes over each batch."""
     mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 4
     """Mini-batches per pass; 2048 samples each stay in the cache."""
-    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-4
-    """Start value of the actor's step size; adapts to desired_kl."""
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-5
+    """Start value of the actor's step size; adapts to desired_kl. Adam's first steps are that large whatever the
+    gradient: 1e-4 throws an operator that was fitted before."""
     critic_learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
     """The critic's own; with the actor's it would learn nothing in time."""
     desired_kl: Annotated[float, Interval(ge=0, le=1e6)] = 0.005
