@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gaponet.arrays import Array
+from gaponet.data.formats.npz import CYCLES
 from gaponet.data.log import Channel, Log
 from gaponet.deploy.driver import State
 from gaponet.errors import LogError
@@ -131,7 +132,7 @@ class Recording:
             "target": np.array([full(r.target) for r in self.rows]),
             "ctrl": np.array([full(r.ctrl) for r in self.rows]),
         }
-        with whole(folder / f"{name}.cycles.npz") as temporary:
+        with whole(folder / f"{name}{CYCLES}") as temporary:
             np.savez_compressed(temporary, **everything)  # type: ignore[arg-type]
         path = folder / f"{name}.parquet"
         if sum(r.phase == "run" for r in self.rows) >= 2:

@@ -32,6 +32,7 @@ GAPONET: LogsFile = {
 }  # fmt: skip
 NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
+CYCLES = ".cycles.npz"  # every period of a controller; deploy/recording.py writes it beside the table of its motion
 
 
 def detects(path: Path) -> bool:
@@ -40,8 +41,8 @@ def detects(path: Path) -> bool:
 
 
 def find(path: Path) -> list[Path]:
-    """The files."""
-    return files_under(path, (".npz",))
+    """The files, but for what a controller did beside its log."""
+    return [file for file in files_under(path, (".npz",)) if not file.name.endswith(CYCLES)]
 
 
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
