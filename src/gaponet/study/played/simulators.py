@@ -103,7 +103,8 @@ def free_run(
     given = None if how == "as it is" else reference
     sim = AlignedSim(
         robot, given, payload, first.meta.payload_side, first.dt / at.times, len(sequences), 0,
-        idle_limbs(sequences, robot), simulator_payload=at.payload, inverse="probes" if how == "probes" else "closed",
+        idle_limbs(sequences, robot), extrapolate=True, simulator_payload=at.payload,
+        inverse="probes" if how == "probes" else "closed",
     )  # fmt: skip
     loop = None
     if how == "as it is" and isinstance(reference, GapModel):
@@ -165,7 +166,9 @@ def microseconds(sequence: Sequence, at: Simulator, ways: ListOf[tuple[Reference
     """Median times of a control period of one robot on one thread, simulation and all, of each way in turns."""
     meta, locked = sequence.meta, idle_limbs([sequence], at.robot)
     sims = [
-        AlignedSim(at.robot, like, meta.payload_mass, meta.payload_side, sequence.dt, None, 1, locked, inverse=how)
+        AlignedSim(
+            at.robot, like, meta.payload_mass, meta.payload_side, sequence.dt, None, 1, locked, True, inverse=how
+        )
         for like, how in ways
     ]
     free = at.robot.index(sims[0].joint_names)
