@@ -12,7 +12,7 @@ from gaponet.data.repeatability import periods
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.eval.evaluate import LEARNED
-from gaponet.eval.gap import causes, floor, gap_by_step, removed
+from gaponet.eval.gap import CAUSES, causes, floor, gap_by_step, removed
 from gaponet.eval.gap_figure import waterfall
 from gaponet.eval.run_files import read_gap
 from gaponet.metrics import Run
@@ -117,3 +117,11 @@ def test_friction_creeps_where_it_is_asked_to(tmp_path):
     held = replace(still, ctrl=np.repeat(still.qpos[:1] + 0.05, 100, axis=0), qvel=np.zeros_like(still.qvel))
     moved = [np.abs(np.ptp(replay([held], heavy, creeps=c)[0].qpos, axis=0)).max() for c in (False, True)]
     assert moved[1] > 5 * moved[0]
+
+
+def test_the_steps_of_an_identified_simulator_are_those_that_a_report_reads(tmp_path):
+    panel = {"left": dict.fromkeys(["nominal", "delay", "offset", *CAUSES, "creep", "identified+gaponet"], 0.01)}
+    panel |= {"floor": {"both": 0.001}}
+    gap = panel | {"by_joint": {"elbow": panel}, "virtual": True, "unseen": True, "sequences": 1, "robot": "arm"}
+    (tmp_path / "gap.json").write_text(json.dumps(gap))
+    assert read_gap(tmp_path)["left"].keys() == panel["left"].keys()

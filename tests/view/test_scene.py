@@ -9,7 +9,7 @@ from arm import XML, commands, record, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.errors import UsageError
-from gaponet.robot import load_robot
+from gaponet.robot import Table, load_robot
 from gaponet.sim.model import build_model
 from gaponet.view.film import Clip, require_kind, write
 from gaponet.view.picture import Camera
@@ -106,6 +106,10 @@ def test_the_box_holds_the_robot_in_every_frame(four):
         assert left < x < right
         assert bottom < z < top
     assert right - left < 0.6
+
+
+def test_a_robot_that_stands_beside_a_table_can_be_dressed(arm):
+    assert dressed(dataclasses.replace(arm, table=Table(-0.05, 0.3, 3000.0)), "#c8102e", 0.0).compile().npair == 0
 
 
 @pytest.mark.parametrize("name", ["h1_2", "so101"])

@@ -32,6 +32,7 @@ METHODS = {  # name, colour
     "offset": ("offset", "#b36b00"),
     "gain": ("gains, inertia, delay", "#2a9d6f"),
     "friction": ("friction", "#24845d"),
+    "creep": ("creep", "#7fb8a0"),
     "stribeck": ("friction at rest", "#1d6b4c"),
     "load": ("friction by load", "#17543c"),
     "servo": ("least torque, encoder", "#113f2d"),

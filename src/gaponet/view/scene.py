@@ -165,7 +165,7 @@ def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: st
     """A robot to look at: one colour, housings, shells, payload; "" for a ghost."""
     spec = build_spec(robot, payload_mass, payload_side)
     spec.option = mujoco.MjSpec().option  # nothing is stepped; all copies must agree
-    for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys):
+    for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.excludes):
         spec.delete(part)
     for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
         spec.delete(geom)  # the scene has a ground of its own
