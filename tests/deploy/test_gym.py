@@ -1,5 +1,6 @@
 """gymnasium environments on the aligned simulator."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import mujoco
@@ -9,6 +10,7 @@ from arm import commands, write_arm
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.errors import UsageError
+from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model
 
 from .test_aligned_sim import small_model
@@ -23,7 +25,9 @@ def robot(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def model(robot, tmp_path_factory):
-    return small_model(robot, tmp_path_factory.mktemp("run") / "model")
+    run = tmp_path_factory.mktemp("run")
+    save_robot(robot, run / "robot")
+    return small_model(robot, run / "model")
 
 
 def test_the_tracking_environment_keeps_gymnasiums_rules(robot, model):
@@ -60,13 +64,14 @@ def test_motions_of_another_width_are_refused(robot, model):
         TrackingEnv(AlignedSim(robot, model), [np.zeros((10, 3))])
 
 
-def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model):
+@pytest.mark.parametrize(("stiffer", "atol"), [(1.0, 1e-6), (2.0, 5e-3)])
+def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model, stiffer, atol):
     from gaponet.deploy.gym import AlignedActions
 
     class Plain(gymnasium.Env):
         """A MuJoCo environment as users write them."""
 
-        model, dt = build_model(robot), 0.02
+        model, dt = build_model(replace(robot, kp=stiffer * robot.kp)), 0.02
         data = mujoco.MjData(model)
         action_space = observation_space = gymnasium.spaces.Box(-2, 2, (2,))
         spec = SimpleNamespace(id="plain")
@@ -87,4 +92,5 @@ def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model):
         for target in commands(20, 2):
             observation = env.step(target)[0]
             sim.step(target)
-        np.testing.assert_allclose(observation, sim.qpos, atol=1e-6)
+        np.testing.assert_allclose(observation, sim.qpos, atol=atol)
+    assert (env.align.transfer is not None) == (stiffer > 1.0)
