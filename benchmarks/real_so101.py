@@ -18,7 +18,7 @@ from publish import publish, say
 
 from gaponet.cli.main import main as gaponet
 from gaponet.data.store import Dataset
-from gaponet.plot.charts import against
+from gaponet.plot.charts import Course, against
 from gaponet.plot.style import joint_label
 from gaponet.robot import load_robot
 from gaponet.study.compare import Compare, identified
@@ -50,7 +50,7 @@ class RealSO101(Compare):
         recorded = motions.pop("recorded").qpos[rows, column]
         simulated = {name: m.qpos[rows, column] for name, m in motions.items()}
         time, joint = np.arange(len(recorded)) * shown.real.dt, joint_label(JOINT, wrapped=False)
-        example = against(time, {joint: (simulated, recorded)}, looks, "recorded", f"{SHOWN}, real SO-101")
+        example = against(time, {joint: Course(simulated, recorded)}, looks, "recorded", f"{SHOWN}, real SO-101")
         return replace(made, figures=dict(made.figures) | {"example": example})
 
 
