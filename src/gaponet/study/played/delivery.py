@@ -23,7 +23,7 @@ from gaponet.plot.table import Spread, Table
 from gaponet.study.paper import TABLE_1, TABLE_1_METHODS
 from gaponet.study.played.deliver import HOLD, LAST, NEAR, Cost, Placed, ShownHand, deliver
 from gaponet.study.played.goals import STOPS, Planner
-from gaponet.study.played.measured import LEFT_OUT, M, cut, duel, methods, of, over_seeds, payloads, percent, series
+from gaponet.study.played.measured import LEFT_OUT, M, cut, duels, methods, of, over_seeds, payloads, percent, series
 from gaponet.study.played.session import Playing, Session, Tell
 from gaponet.study.result import Result
 
@@ -163,11 +163,9 @@ def sentences(found: ListOf[Placed]) -> list[str]:
             said.append(f"At {light:g} kg, {title(m)} is WORSE than raw targets along {', '.join(worse)}.")
     if not any("WORSE" in s for s in said):
         said.append(f"At {light:g} kg nothing is worse than raw targets along any axis.")
-    if {"mlp", "gaponet"} <= set(names):
-        length = lambda m, p: float(np.hypot.reduce([axis(found, m, p, a) for a in range(3)]))  # noqa: E731
-        off = {p: {m: length(m, p) for m in ("mlp", "gaponet")} for p in masses}
-        said.append(f"{duel(off)} (length of the mean offsets).")
-    return said
+    length = lambda m, p: float(np.hypot.reduce([axis(found, m, p, a) for a in range(3)]))  # noqa: E731
+    off = {p: {m: length(m, p) for m in names} for p in masses}
+    return said + [f"{d} (length of the mean offsets)." for d in duels(off, names)]
 
 
 @styled

@@ -12,6 +12,7 @@ from gaponet.plot.methods import colour, title
 from gaponet.plot.table import Spread
 
 LEFT_OUT = ("identified feedforward",)  # of figures; it stands in the tables
+RIVALS = ("mlp", "shared_mlp")  # of the operator
 
 
 class Measured(Protocol):
@@ -73,9 +74,13 @@ def percent(change: float) -> str:
     return f"{change:.0f} % less" if change >= 0 else f"{-change:.0f} % MORE"
 
 
-def duel(error: Mapping[float, Mapping[str, float]]) -> str:
-    """Whether GAPONet beats the MLP, from {payload kg: {method: error}}."""
-    lost = [f"{p:g} kg" for p, of in error.items() if of["gaponet"] >= of["mlp"]]
+def duels(error: Mapping[float, Mapping[str, float]], names: ListOf[str]) -> list[str]:
+    """Whether GAPONet beats each MLP that was played, from {payload kg: {method: error}}."""
+    return [_duel(error, rival) for rival in RIVALS if "gaponet" in names and rival in names]
+
+
+def _duel(error: Mapping[float, Mapping[str, float]], rival: str) -> str:
+    lost = [f"{p:g} kg" for p, of in error.items() if of["gaponet"] >= of[rival]]
     if lost:
-        return f"GAPONet does NOT beat the MLP at {', '.join(lost)}"
-    return "GAPONet beats the MLP" + (" at every payload" if len(error) > 1 else "")
+        return f"GAPONet does NOT beat '{title(rival)}' at {', '.join(lost)}"
+    return f"GAPONet beats '{title(rival)}'" + (" at every payload" if len(error) > 1 else "")

@@ -23,7 +23,18 @@ from gaponet.plot.methods import colour, title
 from gaponet.plot.style import figure, joint_label, legend, styled
 from gaponet.plot.table import Spread, Table
 from gaponet.robot import RobotSpec
-from gaponet.study.played.measured import LEFT_OUT, cut, duel, methods, of, over_seeds, payloads, percent, series
+from gaponet.study.played.measured import (
+    LEFT_OUT,
+    RIVALS,
+    cut,
+    duels,
+    methods,
+    of,
+    over_seeds,
+    payloads,
+    percent,
+    series,
+)
 from gaponet.study.played.play import PLANNED
 from gaponet.study.played.session import Playing, Session, Tell
 from gaponet.study.played.track import Score, ShownMotion, align, track
@@ -121,7 +132,7 @@ def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
     """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
     of_part = [s for s in scores if s.part == part]
     names, masses = methods(of_part), payloads(of_part)
-    learned = [m for m in ("mlp", "gaponet") if m in names]
+    learned = [m for m in (*RIVALS, "gaponet") if m in names]
     rows: list[tuple[Any, ...]] = []
     for source, some in by_source(of_part).items():
         for label, columns in sets:
@@ -175,8 +186,7 @@ def sentences(scores: ListOf[Score], part: str, joints: Joints) -> list[str]:
             all_of, heavy = (percent(cut(error[p][m], error[p][BASE[part]])) for p in (None, masses[-1]))
             cuts.append(f"{title(m)} {all_of}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
         said.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASE[part])}: {'; '.join(cuts)}.")
-        if "gaponet" in names and "mlp" in names:
-            said.append(f"{part}, {SOURCES[source]}: {duel({p: error[p] for p in masses})}.")
+        said += [f"{part}, {SOURCES[source]}: {d}." for d in duels({p: error[p] for p in masses}, names)]
     return said
 
 
