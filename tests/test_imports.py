@@ -12,7 +12,7 @@ SOURCE = Path(gaponet.__file__).parent
 # the top folder that are not named here.
 RANKS = [
     {"data"}, {"metrics"}, {"sim"}, {"family"}, {"motion"}, {"virtual", "collect"}, {"model"},
-    {"training", "deploy"}, {"eval"}, {"study", "view", "bench"}, {"api"}, {"cli"},
+    {"training", "deploy"}, {"eval"}, {"study", "view", "bench", "share"}, {"api"}, {"cli"},
 ]  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {

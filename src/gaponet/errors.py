@@ -39,6 +39,10 @@ class ModelError(GAPONetError):
     """A run or model artifact is missing, damaged or does not fit the robot, rate or gains."""
 
 
+class RemoteError(GAPONetError):
+    """A place on the network cannot be reached, or does not hold what it says."""
+
+
 class UsageError(GAPONetError):
     """Options contradict each other or are out of range."""
 
@@ -48,7 +52,7 @@ EXTRAS = {
     "torch": "train", "onnx": "train", "onnxruntime": "deploy",
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
-    "rosbags": "ros", "h5py": "hdf5", "tensorboard": "tensorboard", "wandb": "wandb",
+    "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "tensorboard": "tensorboard", "wandb": "wandb",
 }  # fmt: skip
 
 

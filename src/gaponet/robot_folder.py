@@ -56,6 +56,13 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     load_robot(folder)
 
 
+def require_bare(folder: Path) -> None:
+    """Refuse a folder whose MJCF names other files: a stranger's could name anybody's."""
+    file = folder / "robot.xml"
+    if not file.is_file() or FILES.search(file.read_text(encoding="utf-8", errors="replace")):
+        raise RobotError(f"{file}: is missing, or names other files; a robot that was kept needs none")
+
+
 def kept_robot(holder: Path, name: str) -> RobotSpec:
     """The robot that a run or a dataset keeps, or in one written before they kept any, the package's of that name.
 

@@ -51,6 +51,10 @@ TASKS = {
         "record": "gaponet.cli.robots.record:record",
         "virtual": "gaponet.cli.robots.virtual:virtual",
     },
+    "Shared with others": {
+        "push": "gaponet.cli.share:push",
+        "pull": "gaponet.cli.share:pull",
+    },
     "Try it, time it": {
         "demo": "gaponet.cli.demo:demo",
         "bench": "gaponet.cli.bench:bench",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +14,7 @@ import tyro
 from gaponet.cli.out import Out
 from gaponet.deploy.drivers.unitree_virtual import FaultKind, VirtualH12
 from gaponet.errors import UsageError
+from gaponet.files import write_text
 
 
 def virtual(
@@ -29,6 +32,7 @@ def virtual(
     fault_at: float = 2.0,
     heard: Path | None = None,
     link: Path | None = None,
+    calibration: Path | None = None,
 ) -> None:
     """Be a VIRTUAL robot behind the real bus until interrupted, for gaponet run and record in another terminal.
 
@@ -47,6 +51,7 @@ def virtual(
         fault_at: s after the first command.
         heard: Write every command that arrived, and where the joints were, to this .npz at the end.
         link: Serial: also give the pseudo-terminal this name, e.g. /tmp/so101.
+        calibration: Serial: write what the servos hold of a calibration to this file, as lerobot-calibrate does.
     """
     from gaponet.deploy.drivers.so101_virtual import VirtualSO101
     from gaponet.robot import load_robot
@@ -68,6 +73,9 @@ def virtual(
     else:
         served = VirtualSO101(spec, physics, (payload_mass, payload_side if payload_side != "both" else "hand"), link)
         where = f"servo bus on {served.port}"
+        if calibration:
+            rows = {joint: asdict(row) for joint, row in served.calibration.rows.items()}
+            write_text(calibration, json.dumps(rows, indent=4) + "\n")
     out.say(f"{label}: {where}; Ctrl-C ends it")
     sys.stdout.flush()  # whoever started us through a pipe waits for this line
     try:
