@@ -46,7 +46,7 @@ class Hub:
                 with self._reaching(RepositoryNotFoundError):
                     info = self.api.repo_info(self.repo, repo_type=wanted, revision=self.revision)
                     place = {"repo_type": wanted, "revision": info.sha}
-                    listed = islice(self.api.list_repo_tree(self.repo, recursive=True, **place), MOST)  # type: ignore[arg-type]
+                    listed = islice(self.api.list_repo_tree(self.repo, recursive=True, **place), MOST)
                     sizes = {entry.path: entry.size for entry in listed if hasattr(entry, "size")}
             except RepositoryNotFoundError:
                 continue

@@ -125,9 +125,9 @@ def reaching(address: str, *errors: type[Exception], but: tuple[type[Exception],
     """Errors of these types, and of the operating system's network, become a RemoteError with the address."""
     try:
         yield
-    except (RemoteError, *but):
-        raise
-    except (*errors, OSError) as error:
+    except Exception as error:
+        if isinstance(error, (RemoteError, *but)) or not isinstance(error, (*errors, OSError)):
+            raise
         cause = error.__cause__ or error
         text = " ".join(str(cause).split()) or type(cause).__name__
         raise RemoteError(f"{address}: {text[:300]}") from None
