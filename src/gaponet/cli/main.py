@@ -51,13 +51,11 @@ TASKS = {
         "record": "gaponet.cli.robots.record:record",
         "virtual": "gaponet.cli.robots.virtual:virtual",
     },
-    "Shared with others": {
-        "push": "gaponet.cli.share:push",
-        "pull": "gaponet.cli.share:pull",
-    },
-    "Try it, time it": {
+    "Try it, time it, share it": {
         "demo": "gaponet.cli.demo:demo",
         "bench": "gaponet.cli.bench:bench",
+        "push": "gaponet.cli.share:push",
+        "pull": "gaponet.cli.share:pull",
     },
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."
