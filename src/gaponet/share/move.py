@@ -20,7 +20,8 @@ from gaponet.files import MARK, writing
 from gaponet.progress import bar, noted
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
-from gaponet.share.target import INDEX, LARGEST_INDEX, Index, Kind, Part, Target, open_target, part_of
+from gaponet.share.open import open_target
+from gaponet.share.target import INDEX, LARGEST_INDEX, Index, Kind, Part, Target, part_of
 from gaponet.structure import parse_json
 
 FORMAT = 1

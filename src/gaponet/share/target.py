@@ -105,21 +105,6 @@ def part_of(file: Path) -> Part:
     return Part(file.stat().st_size, digest.hexdigest())
 
 
-def open_target(address: str) -> Target:
-    """The place that an address names: USER/NAME of the Hugging Face Hub, or s3://, gs:// or file:// and a folder.
-
-    Raises:
-        RemoteError: It is no address.
-    """
-    if "://" in address:
-        from gaponet.share.bucket import Bucket
-
-        return Bucket(address)
-    from gaponet.share.hub import Hub
-
-    return Hub(address)
-
-
 @contextmanager
 def reaching(address: str, *errors: type[Exception], but: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Errors of these types, and of the operating system's network, become a RemoteError with the address."""
