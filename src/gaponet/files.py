@@ -1,8 +1,9 @@
 """Writing where a user said: files whole or not at all, one writer to a folder, nothing into somebody else's folder.
 
 A folder that gaponet writes into holds `.gaponet`: its first line says what the folder is, and the file is the lock of
-whoever writes (flock: it ends with its process, whatever ends that). A file being written is `.gaponet-PROCESS-NAME`
+whoever writes (it ends with its process, whatever ends that). A file being written is `.gaponet-PROCESS-NAME`
 beside its place; those of a killed process are removed by the next that writes there. Nothing else is ever removed.
+What Windows does otherwise is here and in `deploy/stop.py` alone.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from gaponet.errors import FolderError
 
+WINDOWS = os.name == "nt"
 MARK = ".gaponet"
 # What tells folders that were written before there was a mark.
 EARLIER = {
@@ -55,8 +57,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def sync(path: Path) -> None:
-    """Return when a file's content, or a folder's list of names, is on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
+    """Return when a file's content, or a folder's list of names, is on the disk (on Windows, files only)."""
+    if WINDOWS and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:
@@ -111,23 +115,28 @@ def writing(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
     _held.add(key)
     done = False
     try:
-        if not os.pread(descriptor, 1, 0):
-            os.pwrite(descriptor, line, 0)
+        if not os.fstat(descriptor).st_size:
+            _write(descriptor, 0, line)
         elif os.fstat(descriptor).st_size > len(line):  # the second line says who writes: that one was killed
             _clear(folder)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), len(line))
+        _write(descriptor, len(line), f"{os.getpid()}\n".encode())
         yield
         done = True
     finally:
         if not done and new and [p.name for p in folder.iterdir()] == [MARK]:
-            (folder / MARK).unlink()
-            with suppress(OSError):  # somebody else put something there
+            with suppress(OSError):  # somebody else put something there; Windows keeps what is open
+                (folder / MARK).unlink()
                 for path in made:
                     path.rmdir()
         elif os.fstat(descriptor).st_size > len(line):
             os.ftruncate(descriptor, len(line))
         _held.discard(key)
         os.close(descriptor)
+
+
+def _write(descriptor: int, at: int, line: bytes) -> None:
+    os.lseek(descriptor, at, os.SEEK_SET)
+    os.write(descriptor, line)
 
 
 def _sole(folder: Path, kind: str, wait: float) -> int:
@@ -152,20 +161,32 @@ def lock(path: Path, opened: Callable[[Path], int] | None = None) -> int | None:
     Args:
         opened: Opens it, for a file that may be another user's; by default it is opened for writing.
     """
-    import fcntl
-
     while True:
-        descriptor = opened(path) if opened else os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        binary = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        descriptor = opened(path) if opened else os.open(path, binary, 0o666)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+            _take(descriptor)
+            if WINDOWS or os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 return descriptor
-        except BlockingIOError:
+        except (BlockingIOError, PermissionError):  # POSIX's word for it and Windows'
             os.close(descriptor)
             return None
         except FileNotFoundError:
             pass
         os.close(descriptor)  # the file that was locked has been removed meanwhile
+
+
+def _take(descriptor: int) -> None:
+    """Lock an open file or raise OSError."""
+    try:
+        import fcntl
+    except ImportError:  # Windows, where a byte that is locked cannot be read: one far behind the end
+        import msvcrt
+
+        os.lseek(descriptor, 1 << 30, os.SEEK_SET)
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _clear(folder: Path) -> None:
@@ -177,6 +198,15 @@ def _clear(folder: Path) -> None:
 
 
 def _alive(process: int) -> bool:
+    if WINDOWS:  # where os.kill ends a process, whatever the signal
+        import ctypes
+
+        kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
+        handle = kernel.OpenProcess(0x100000, False, process)  # the right to wait for its end
+        try:
+            return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # not yet
+        finally:
+            kernel.CloseHandle(handle)
     try:
         os.kill(process, 0)
     except ProcessLookupError:

@@ -8,7 +8,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.errors import UsageError
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import BatchSim, OneByOne
 from gaponet.sim.model import build_model
 
 
@@ -89,3 +89,29 @@ def test_late_servos_want_to_know_what_is_on_its_way(tmp_path):
     sim = BatchSim(replace(write_arm(tmp_path), delay=0.03), [(0.0, "both", 0.02)])
     with pytest.raises(UsageError, match="past"):
         sim.reset(slice(None), np.zeros((1, 2)), np.zeros((1, 2)))
+
+
+@pytest.mark.parametrize("delay", [(0.0, 0.0), (0.05, 0.013)])
+def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypatch, delay):
+    """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
+    robot = replace(write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0])
+    conditions = [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)]
+    rng = np.random.default_rng(3)
+    past, targets, pushes = (rng.uniform(-1, 1, (k, 3, 2)) for k in (8, 20, 20))
+    moved = []
+    for one_by_one in (False, True):
+        if one_by_one:
+            monkeypatch.setattr("gaponet.sim.batch.Batch", OneByOne)
+        sim = BatchSim(robot, conditions)
+        force, bias = sim.batch.bind("qfrc_applied"), sim.batch.bind("qfrc_bias")
+        sim.batch.expand("dof_damping")[1] *= 2
+        sim.reset(slice(None), past[0], past[1], past=past[:6].transpose(1, 0, 2))
+        for t, target in enumerate(targets):
+            force[:] = pushes[t]
+            sim.step(target, np.array([0, 2]) if t % 3 == 0 else None)
+            seen = [sim.qpos.copy(), sim.qvel.copy(), sim.torque[[0, 0, 2]]]  # always of those that moved
+            sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+            moved.append([*seen, bias.copy()])
+        np.testing.assert_array_equal(sim.data(1).qpos, sim.qpos[1])
+        assert isinstance(sim.batch, OneByOne) == one_by_one
+    np.testing.assert_array_equal(np.array(moved[:20]), np.array(moved[20:]))

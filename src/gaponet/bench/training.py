@@ -7,7 +7,6 @@ median does: the parts' fastest turns add up to less than the whole's (bench_tra
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Callable
 from dataclasses import replace
 from statistics import median
@@ -97,6 +96,8 @@ def bench_train(
     counts |= {name: count for name, (_, count) in theirs.items()}
     turns |= {name: turn for name, (turn, _) in theirs.items()}
     seconds = take_turns(turns, rounds, median)
+    import resource  # Windows has none
+
     expected = batch / sum(seconds[part] for part in ("bare Batch loop", "inference", "update"))
     speeds = _speeds({name: (counts[name], best) for name, best in seconds.items()}, "bare Batch loop")
     return {

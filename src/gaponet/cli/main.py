@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         return _say(f"Missing: {missing}")
     except BrokenPipeError:  # `| head` has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 128 + signal.SIGPIPE
+        return 128 + 13  # SIGPIPE, which Windows has not
     except OSError as error:  # a full disk, a missing permission: the user's to mend, not a bug
         return _say(f"File: {error.filename or ''}: {error.strerror or error}")
     except MemoryError:

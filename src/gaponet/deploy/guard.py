@@ -96,8 +96,9 @@ class Guard:
 def main(spec: dict[str, Any]) -> None:
     """Watch stdin; damp when it falls silent or ends."""
     from gaponet.deploy.drivers.open import open_driver
+    from gaponet.deploy.stop import SIGNALS
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     hang, damp, early = spec.pop("hang"), spec.pop("damp"), spec.pop("early")
     driver = open_driver(**spec)

@@ -7,14 +7,13 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.arrays import Array
 from gaponet.deploy.transfer import Inverse, Transfer, periods_of
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
 from gaponet.robot_folder import keeper, keeps_robot
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Probed, alike
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION

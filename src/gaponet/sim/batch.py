@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import copy
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
-from mujoco.batch import MODEL_FIELDS, Batch
 
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
@@ -15,6 +16,74 @@ from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoLaw
 
 Array = np.ndarray
+
+
+class OneByOne:
+    """The part of mujoco.batch.Batch that gaponet uses, where MuJoCo has none: one MjData after another, slower.
+
+    Bound fields are live (nsim, …) arrays as there: state is taken from them before a call, all are filled after it.
+    """
+
+    STATE = frozenset({"time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied"})
+
+    def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0) -> None:
+        self.nsim, self._models = nsim, [model] * nsim
+        self._data = [mujoco.MjData(model) for _ in range(nsim)]
+        self._bound: dict[str, Array] = {}
+        self._expanded: dict[str, Array] = {}
+
+    def bind(self, name: str) -> Array:
+        """A field of MjData, (nsim, …)."""
+        if name not in self._bound:
+            self._bound[name] = np.array([getattr(data, name) for data in self._data])
+        return self._bound[name]
+
+    def expand(self, name: str) -> Array:
+        """A field of MjModel, or opt.NAME of its options, to be given a value for each simulation, (nsim, …)."""
+        if not self._expanded:
+            self._models = [copy.copy(model) for model in self._models]
+        if name not in self._expanded:
+            self._expanded[name] = np.array([_field(model, name) for model in self._models])
+        return self._expanded[name]
+
+    def expanded(self, name: str) -> Array | None:
+        """The same where it has been expanded."""
+        return self._expanded.get(name)
+
+    def step(self, ids: Array | None = None, nstep: int = 1) -> None:
+        """Advance by nstep physics steps."""
+        self._call(ids, lambda model, data: mujoco.mj_step(model, data, nstep))
+
+    def forward(self, ids: Array | None = None, stage: int = 0) -> None:
+        """Compute what follows from positions and velocities, the one stage that is asked for."""
+        self._call(ids, mujoco.mj_step1)
+
+    def get_data(self, i: int) -> mujoco.MjData:
+        """A copy of one simulation."""
+        self._call(np.array([i]), lambda model, data: None)
+        return copy.copy(self._data[i])
+
+    def _call(self, ids: Array | None, function: Callable[[mujoco.MjModel, mujoco.MjData], None]) -> None:
+        for i in np.arange(self.nsim)[slice(None) if ids is None else ids]:
+            model, data = self._models[i], self._data[i]
+            for name, x in self._expanded.items():
+                owner, name = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
+                setattr(owner, name, x[i])
+            for name in self.STATE & self._bound.keys():
+                setattr(data, name, self._bound[name][i])
+            function(model, data)
+            for name, x in self._bound.items():
+                x[i] = getattr(data, name)
+
+
+if TYPE_CHECKING:
+    from mujoco.batch import MODEL_FIELDS, Batch
+else:
+    try:
+        from mujoco.batch import MODEL_FIELDS, Batch
+    except ImportError:  # before MuJoCo 3.17
+        Batch = OneByOne
+        MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
 class Condition(NamedTuple):
@@ -191,7 +260,7 @@ def _field(model: mujoco.MjModel, name: str) -> Any:
     """A model or option field; numbers among the options as arrays."""
     if name.startswith("opt."):
         value = getattr(model.opt, name[4:], None)
-        return None if value is None else np.asarray(value)
+        return None if value is None or callable(value) else np.asarray(value)
     value = getattr(model, name, None)
     return value if isinstance(value, np.ndarray) else None
 

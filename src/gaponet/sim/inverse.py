@@ -17,12 +17,11 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import LAW
-from gaponet.sim.batch import BatchSim
+from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit
 
 PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import math
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.identity import lines
 from gaponet.mjcf import compiled, read_mjcf
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.table import add_table, soften_table
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w

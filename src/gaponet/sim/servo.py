@@ -8,11 +8,15 @@ does. A compiled model carries the numbers in actuator_user; without any, nothin
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.robot import LAW
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
 
 Array = np.ndarray
 Law = dict[str, Array]  # name of LAW → values that broadcast to the simulations' joints

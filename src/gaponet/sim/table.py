@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.errors import RobotError
 from gaponet.robot import RobotSpec
+
+if TYPE_CHECKING:
+    from mujoco.batch import Batch
 
 Array = np.ndarray
 

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch
 
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import expand_differences
+from gaponet.sim.batch import Batch, expand_differences
 from gaponet.sim.model import build_model, qpos_range, stiffen_friction
 from gaponet.virtual.motor import (
     Backlash,

@@ -13,6 +13,7 @@ import tyro
 
 from gaponet.cli.out import Out
 from gaponet.deploy.drivers.unitree_virtual import FaultKind, VirtualH12
+from gaponet.deploy.stop import SIGNALS
 from gaponet.errors import UsageError
 from gaponet.files import write_text
 
@@ -62,7 +63,7 @@ def virtual(
         raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
     name = f"virtual-{unit}" if unit.isdigit() else unit
     physics = load_fleet(fleet, spec).unit(name)
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in set(SIGNALS) - {signal.SIGINT}:
         signal.signal(number, signal.default_int_handler)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
     served: VirtualH12 | VirtualSO101

@@ -25,10 +25,14 @@ EXTRA = ""
 DEFAULT: LogsFile = {"time": "time"}
 
 PARSE = """
-import resource, sys
+import sys
 import numpy as np
 from scipy.io import loadmat
-resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
+except ImportError:  # Windows
+    pass
 told = loadmat(sys.argv[1], simplify_cells=True)
 told |= {f"{name}.{k}": x for name, v in told.items() if isinstance(v, dict) for k, x in v.items()}
 np.savez(sys.stdout.buffer, **{n: x for n, x in told.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"})

@@ -9,7 +9,6 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mujoco.batch import MODEL_FIELDS
 
 from gaponet.arrays import Array
 from gaponet.collect import fleet_of
@@ -21,7 +20,7 @@ from gaponet.eval.evaluate import choose
 from gaponet.model.artifact import GapModel
 from gaponet.plot.table import Spread
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import MODEL_FIELDS, BatchSim, Condition
 from gaponet.sim.model import idle_joints
 from gaponet.study.compare import identified
 from gaponet.study.found import Found
