@@ -1,13 +1,14 @@
 # make demo: set-up and the whole way on a virtual robot. make test: set-up and the tests. make check: lint and types. make site: docs/ as a site.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+TOOLS := PATH="$(CURDIR)/.tools/bin:$$PATH"
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers browser adversary fuzz kills check site clean
+.PHONY: setup demo test faults peers browser adversary fuzz kills check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -59,10 +60,39 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-forms .github/ISSUE_TEMPLATE/*.yml
+	$(BIN)/zizmor --offline --quiet .github/workflows
+
+# What is promised on Windows: from logs to a report.
+windows: setup
+	$(BIN)/python -m pytest tests/test_api.py tests/test_files.py tests/test_windows.py tests/data tests/sim tests/model tests/training tests/eval
+
+# These three need the package index, and uv from it in .tools.
+.tools/.done:
+	$(PYTHON) -m venv .tools
+	.tools/bin/pip install -q uv
+	touch $@
+
+# gaponet with every extra beside LeRobot, mjlab and Isaac Lab, on four systems and Python versions: resolved, not installed.
+resolve: .tools/.done
+	$(TOOLS) $(PYTHON) .ci/resolve.py
+
+# Wheel and sdist, tried in clean environments outside of the checkout, one for each extra.
+wheels: .tools/.done
+	$(TOOLS) $(PYTHON) .ci/wheels.py
+
+# The tests with the lowest versions that pyproject.toml allows, and with the newest.
+TESTS ?= tests
+ends: .tools/.done
+	for end in lowest-direct highest; do \
+	  $(TOOLS) uv venv -q --clear --python $(PYTHON) .ends/$$end && \
+	  $(TOOLS) uv pip install -q --python .ends/$$end --resolution $$end -e ".[dev]" && \
+	  .ends/$$end/bin/python -m pytest $(TESTS) || exit 1; done
 
 # docs/ as a site in site/; a broken link or a name that is not in the package ends the build.
 site: setup
 	$(BIN)/zensical build --strict --clean
 
 clean:
-	rm -rf $(VENV) site demo_run kills_work .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) .tools .ends dist site demo_run kills_work .pytest_cache .ruff_cache .mypy_cache

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from logs import late, wave, write_sage
 
 import gaponet
 
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="there it is so")
 SOURCE = Path(gaponet.__file__).parent
 POSIX = ("fcntl", "resource", "termios", "tty", "pty", "pwd", "grp", "syslog", "readline")
 WITHOUT = f"""
