@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers browser adversary fuzz kills check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults peers engines browser adversary fuzz kills check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -35,7 +35,11 @@ faults: setup
 
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup
-	$(BIN)/python -m pytest -m peers -s
+	$(BIN)/python -m pytest -m peers -s tests/deploy
+
+# mjlab (in an environment of its own in ~/.cache/gaponet, some GB) plays exports beside AlignedSim: minutes.
+engines: setup
+	$(BIN)/python -m pytest -m peers -s tests/engine
 
 # Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup

@@ -43,3 +43,20 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
     export(net, folder / "model", make_card(config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2]), drawn_states(net))
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
+
+
+def random_run(folder: Path, robot: RobotSpec, **how: object) -> GapModel:
+    """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a difference."""
+    small = {"history": 2, "stride": 2, "num_probes": 4}
+    small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
+    torch.manual_seed(0)
+    net = build_network(ModelConfig(**small | how), len(robot.operated)).eval()  # type: ignore[arg-type]
+    with torch.no_grad():
+        for p in net.parameters():
+            p.add_(0.1 * torch.randn_like(p))
+    net.features.standardise.std.fill_(0.3)
+    card = make_card(net.config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2])
+    export(net, folder / "model", card, torch.randn(20, net.config.input_dim(len(robot.operated))).numpy())
+    torch.save({"best_state": net.state_dict()}, folder / "checkpoint.pt")
+    save_robot(robot, folder / "robot")
+    return GapModel.load(folder)

@@ -68,10 +68,10 @@ def _fill(
     for child in [c for c in element if c.tag not in ("joint", "geom", "site", "body")]:
         element.remove(child)
     if body:
-        _set(element, pos=model.body_pos[body], quat=model.body_quat[body])
+        put(element, pos=model.body_pos[body], quat=model.body_quat[body])
         if model.body_mass[body]:
             inertial = ET.Element("inertial")
-            _set(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
+            put(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
                  diaginertia=model.body_inertia[body])  # fmt: skip
             element.insert(0, inertial)
     for child in element:
@@ -82,7 +82,7 @@ def _fill(
         elif child.tag == "site":
             s = next(next_["site"])
             child.attrib.pop("material", None)
-            _set(child, pos=model.site_pos[s], quat=model.site_quat[s])
+            put(child, pos=model.site_pos[s], quat=model.site_quat[s])
     for child in [c for c in element if c.tag == "body"]:
         _fill(child, next(bodies), model, asset, next_, bodies)
 
@@ -96,18 +96,18 @@ def _unwrap(element: ET.Element) -> None:
 
 def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
     dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
-    _set(element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at])
-    _set(element, **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in DYNAMICS})
+    put(element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at])
+    put(element, **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in DYNAMICS})
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
         first = getattr(model, f"{kind}_{name}")[i]
-        _set(element, **{name: [first, *higher] if np.any(higher) else first})
+        put(element, **{name: [first, *higher] if np.any(higher) else first})
     element.attrib.pop("springdamper", None)  # stiffness and damping were made of it
     for ours, theirs in (("", ""), ("actfrc", "actuatorfrc")):
         limited = bool(getattr(model, f"jnt_{ours}limited")[j])
         element.set(f"{theirs}limited", str(limited).lower())
         if limited:
-            _set(element, **{f"{theirs}range": getattr(model, f"jnt_{ours}range")[j]})
+            put(element, **{f"{theirs}range": getattr(model, f"jnt_{ours}range")[j]})
 
 
 def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element) -> None:
@@ -127,12 +127,12 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
             size = np.maximum(model.geom_aabb[g, 3:], 1e-4)
     element.set("type", kind)
     rgba = model.geom_rgba[g] if model.geom_matid[g] < 0 else model.mat_rgba[model.geom_matid[g]]
-    _set(element, pos=pos, quat=model.geom_quat[g], mass=0.0, rgba=rgba, friction=model.geom_friction[g])
+    put(element, pos=pos, quat=model.geom_quat[g], mass=0.0, rgba=rgba, friction=model.geom_friction[g])
     for name in ("contype", "conaffinity", "condim", "group", "priority"):
         element.set(name, str(int(getattr(model, f"geom_{name}")[g])))
-    _set(element, **{n: getattr(model, f"geom_{n}")[g] for n in ("solmix", "solref", "solimp", "margin", "gap")})
+    put(element, **{n: getattr(model, f"geom_{n}")[g] for n in ("solmix", "solref", "solimp", "margin", "gap")})
     if kind != "mesh":
-        _set(element, size=size)
+        put(element, size=size)
     else:
         element.attrib.pop("size", None)
 
@@ -144,12 +144,12 @@ def _mesh(model: mujoco.MjModel, mesh: int, asset: ET.Element) -> str:
         vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
         faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
         element = ET.SubElement(asset, "mesh", {"name": name, "inertia": "shell"})
-        _set(element, vertex=model.mesh_vert[vertices].astype(float))
+        put(element, vertex=model.mesh_vert[vertices].astype(float))
         element.set("face", " ".join(map(str, model.mesh_face[faces].ravel())))
     return name
 
 
-def _set(element: ET.Element, **figures: object) -> None:
+def put(element: ET.Element, **figures: object) -> None:
     """Attributes with all digits."""
     for name, values in figures.items():
         element.set(name, " ".join(repr(float(x)) for x in np.ravel(np.asarray(values, float))))

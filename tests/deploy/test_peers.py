@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,6 +19,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 
+from environments import environment
 from motion_files import write_motion
 
 from gaponet.motion.motion import Motion
@@ -30,28 +30,13 @@ pytestmark = pytest.mark.peers
 DOMAIN = 20 + os.getpid() % 150
 SECONDS = float(os.environ.get("GAPONET_PEER_SECONDS", "60"))
 GAPONET = [sys.executable, "-m", "gaponet"]
-PINNED = "cyclonedds==0.10.2"  # has wheels up to Python 3.10
+PINNED = "cyclonedds==0.10.2"
 
 
 @pytest.fixture(scope="module")
 def python() -> str:
     """A Python 3.10 with the SDK's cyclonedds, made once in the user's cache folder."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "gaponet" / "peers-0.10.2"
-    made = cache / "bin" / "python"
-    if not (cache / "done").is_file():
-        pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-        named = [shutil.which("python3.10"), *map(str, pyenv.glob("versions/3.10.*/bin/python"))]
-        runs = lambda path: subprocess.run([path, "-c", ""], capture_output=True).returncode == 0  # noqa: E731
-        found = next((path for path in named if path and runs(path)), None)
-        if found is None:
-            pytest.skip(f"no Python 3.10 here, and {PINNED} has no wheel for a newer one")
-        subprocess.run([found, "-m", "venv", "--clear", cache], check=True)
-        plain = {k: v for k, v in os.environ.items() if k != "PIP_CONSTRAINT"}
-        installed = subprocess.run([made, "-m", "pip", "install", "-q", PINNED], env=plain)
-        if installed.returncode:
-            pytest.skip(f"{PINNED} cannot be installed here")
-        (cache / "done").touch()
-    return str(made)
+    return environment("peers-0.10.2", "3.10", (PINNED,))  # newer ones have no wheel
 
 
 @pytest.fixture

@@ -5,6 +5,8 @@ import pytest
 import torch
 from arm import recordings, write_arm
 
+from gaponet.engine.step import largest_difference
+from gaponet.engine.torchscript import export_torchscript
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
@@ -12,7 +14,6 @@ from gaponet.model.deeponet import build_network
 from gaponet.model.export import drawn_states, export
 from gaponet.model.fuse import FusedNet, fuse
 from gaponet.model.fused import FusedForward
-from gaponet.model.torchscript import export_torchscript, largest_difference
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
 
@@ -215,7 +216,7 @@ def test_torchscript_is_self_contained_and_the_same(artifact, tmp_path):
 def test_torchscript_refuses_what_it_does_not_hold(robot, tmp_path, how):
     net = trained(**how)
     export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), torch.randn(20, net.config.input_dim(2)).numpy())
-    with pytest.raises(ModelError, match="which TorchScript does not; train"):
+    with pytest.raises(ModelError, match="which torch exports do not; train"):
         export_torchscript(GapModel.load(tmp_path), tmp_path, tmp_path / "delta.pt")
 
 

@@ -118,7 +118,7 @@ def _delta(model: GapModel, states: Array) -> Callable[[], object]:
 def _torch(model: GapModel, run: Path) -> dict[str, Callable[[], object]]:
     """torch and TorchScript, where torch is installed and the run holds the network."""
     try:
-        from gaponet.model.torchscript import network_calls
+        from gaponet.engine.torchscript import network_calls
     except ImportError:
         return {}
     return network_calls(model, run)

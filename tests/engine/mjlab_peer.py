@@ -1,0 +1,88 @@
+"""In an environment with mjlab: play targets on an export under its action term, and hand back what happened.
+
+python mjlab_peer.py EXPORT IN.npz OUT.npz     # IN: test_mjlab.py writes it
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+from mjlab.envs import ManagerBasedRlEnv, ManagerBasedRlEnvCfg
+from mjlab.managers.event_manager import EventTermCfg
+from mjlab.scene import SceneCfg
+from mjlab.sim import SimulationCfg
+
+KINDS = {
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT, "dof": mujoco.mjtObj.mjOBJ_JOINT, "body": mujoco.mjtObj.mjOBJ_BODY,
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR,
+}  # fmt: skip
+NOT_COMPARED = ("id", "adr", "num", "group", "user", "plugin", "sameframe", "simple", "sensor", "ctrlspec")  # numbering
+
+
+def environment(folder: str, num_envs: int, start: torch.Tensor, names: list[str]) -> ManagerBasedRlEnv:
+    sys.path.insert(0, folder)
+    import gaponet_action as gaponet
+
+    options, decimation = gaponet.mjlab_options(folder)
+
+    def begin(env, env_ids):
+        robot = env.scene["robot"]
+        order = [names.index(name) for name in robot.joint_names]
+        robot.write_joint_state_to_sim(start[env_ids][:, order], 0.0 * start[env_ids], env_ids=env_ids)
+
+    cfg = ManagerBasedRlEnvCfg(
+        decimation=decimation,
+        scene=SceneCfg(num_envs=num_envs, entities={"robot": gaponet.mjlab_entity(folder)}),
+        actions={"joint_pos": gaponet.mjlab_action(folder, entity_name="robot", actuator_names=tuple(reversed(names)))},
+        events={"begin": EventTermCfg(func=begin, mode="reset")},
+        sim=SimulationCfg(mujoco=options),
+    )
+    return ManagerBasedRlEnv(cfg, device="cpu")
+
+
+def fields(env: ManagerBasedRlEnv) -> dict[str, np.ndarray]:
+    """What is simulated, "FIELD NAME" → numbers: of the model on the device, or as compiled."""
+    model, device, found = env.sim.mj_model, env.sim.wp_model, {}
+    for field, compiled in ((f, getattr(model, f)) for f in dir(model)):
+        kind = KINDS.get(field.split("_")[0])
+        if kind is None or field.endswith(NOT_COMPARED) or not isinstance(compiled, np.ndarray):
+            continue
+        values = getattr(device, field).numpy() if hasattr(device, field) else compiled
+        values = values[0] if values.ndim > compiled.ndim or len(values) != len(compiled) else values  # of one world
+        for i in range(len(values)):
+            name = mujoco.mj_id2name(model, kind, int(model.dof_jntid[i]) if field.startswith("dof_") else i)
+            if name and name.startswith("robot/"):
+                found[f"{field} {name.removeprefix('robot/')}"] = np.array(values[i], float)
+    for name in dir(model.opt):
+        value = getattr(model.opt, name)
+        if not name.startswith("_") and np.asarray(value).dtype.kind in "fiu":
+            found[f"opt {name}"] = np.array(value, float)
+    return found
+
+
+def main(folder: str, given: str, out: str) -> None:
+    data = np.load(given)
+    names, targets = data["names"].tolist(), torch.from_numpy(data["targets"]).float()
+    start = torch.from_numpy(data["start"]).float()
+    env = environment(folder, targets.shape[1], start[0], names)
+    env.reset()
+    term, robot = env.action_manager.get_term("joint_pos"), env.scene["robot"]
+    asked = [names.index(name) for name in term.target_names]
+    order = [list(robot.joint_names).index(name) for name in names]
+    qpos, sent = [], []
+    for t, target in enumerate(targets):
+        if t == int(data["reset_at"]):
+            start[0] = start[1]  # what `begin` writes
+            env.reset(env_ids=torch.from_numpy(data["reset_ids"]))
+        env.step(target[:, asked])
+        qpos.append(robot.data.joint_pos[:, order].clone())
+        sent.append(robot.data.joint_pos_target[:, order].clone())
+    np.savez(out, qpos=torch.stack(qpos), sent=torch.stack(sent), **fields(env))
+
+
+if __name__ == "__main__":
+    main(*map(str, map(Path, sys.argv[1:])))
