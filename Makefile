@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers engines browser adversary fuzz kills check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults peers engines browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -60,6 +60,15 @@ fuzz: setup
 kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
 
+# LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.
+LEROBOT ?= $(HOME)/.cache/gaponet/lerobot-0.6.1
+lerobot: $(LEROBOT)/.done
+	OMP_NUM_THREADS=1 $(LEROBOT)/bin/python benchmarks/lerobot_so101.py lerobot_work
+$(LEROBOT)/.done: plugins/lerobot_robot_gaponet/pyproject.toml
+	python3.12 -m venv $(LEROBOT)
+	PIP_CONSTRAINT= $(LEROBOT)/bin/pip install -q "lerobot[dataset,feetech]==0.6.1" -e ".[train,so101,zmq]" -e plugins/lerobot_robot_gaponet
+	touch $@
+
 check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -99,4 +108,4 @@ site: setup
 	$(BIN)/zensical build --strict --clean
 
 clean:
-	rm -rf $(VENV) .tools .ends dist site demo_run kills_work .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) .tools .ends dist site demo_run kills_work lerobot_work .pytest_cache .ruff_cache .mypy_cache

@@ -7,6 +7,7 @@ import random
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -455,3 +456,18 @@ def test_it_speaks_over_a_pseudo_terminal_in_another_thread(so101, arm):
     finally:
         over.set()
         thread.join()
+
+
+def test_a_bus_on_which_frames_pass_stands_still_until_a_goal_is_written(so101):
+    arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"), frame=0.04)
+    bus = reg.ServoBus(Wire(SimpleNamespace(answer=arm.hear)), SILENCE)  # type: ignore[arg-type]
+    try:
+        before = bus.sync_read([1, 2], reg.PRESENT)
+        assert arm.live.steps == 0
+        bus.sync_write(reg.GOAL_POSITION, {1: 2048, 2: 2048})
+        assert arm.live.steps == round(0.04 / PERIOD)
+        bus.sync_write(reg.TORQUE_ENABLE, {1: 1, 2: 1})
+        assert arm.live.steps == round(0.04 / PERIOD)
+        assert bus.sync_read([1, 2], reg.PRESENT) != before
+    finally:
+        arm.close()

@@ -34,6 +34,7 @@ def virtual(
     heard: Path | None = None,
     link: Path | None = None,
     calibration: Path | None = None,
+    frame: float | None = None,
 ) -> None:
     """Be a VIRTUAL robot behind the real bus until interrupted, for gaponet run and record in another terminal.
 
@@ -53,6 +54,7 @@ def virtual(
         heard: Write every command that arrived, and where the joints were, to this .npz at the end.
         link: Serial: also give the pseudo-terminal this name, e.g. /tmp/so101.
         calibration: Serial: write what the servos hold of a calibration to this file, as lerobot-calibrate does.
+        frame: Serial: instead of real time, this much time passes with every goal, s, for programs that keep none.
     """
     from gaponet.deploy.drivers.so101_virtual import VirtualSO101
     from gaponet.robot import load_robot
@@ -72,7 +74,8 @@ def virtual(
         served = VirtualH12(spec, physics, payload, domain, interface, rate, fault, fault_at)
         where = f"rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}"
     else:
-        served = VirtualSO101(spec, physics, (payload_mass, payload_side if payload_side != "both" else "hand"), link)
+        side = payload_side if payload_side != "both" else "hand"
+        served = VirtualSO101(spec, physics, (payload_mass, side), link, frame)
         where = f"servo bus on {served.port}"
         if calibration:
             rows = {joint: asdict(row) for joint, row in served.calibration.rows.items()}

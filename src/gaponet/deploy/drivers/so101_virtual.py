@@ -32,14 +32,20 @@ class VirtualSO101:
     """The servos' side of the bus; `port` is what a driver opens."""
 
     def __init__(
-        self, robot: RobotSpec, physics: Physics, payload: tuple[float, str] = (0.0, "hand"), link: Path | None = None
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str] = (0.0, "hand"),
+        link: Path | None = None,
+        frame: float | None = None,
     ) -> None:
         """
         Args:
             payload: kg, and mount.
             link: Another name for the port, a symbolic link; replaced if it is one.
+            frame: s that pass with every goal position; default: real time passes.
         """
-        self.robot = robot
+        self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
         self.live = LiveUnit(robot, physics, payload, period=PERIOD)
         self._order = robot.index(SPEAK)  # servo number − 1 → joint
         self.calibration = ArmCalibration(_as_calibrated(robot), robot)
@@ -73,9 +79,12 @@ class VirtualSO101:
         start = began - self.live.steps * PERIOD
         while time.monotonic() - began < seconds:
             due = start + self.live.steps * PERIOD
-            readable, _, _ = select.select([self._master], [], [], min(max(0.0, due - time.monotonic()), PERIOD))
+            wait = min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else BEHIND
+            readable, _, _ = select.select([self._master], [], [], wait)
             if readable:
                 os.write(self._master, self.hear(os.read(self._master, 4096)))
+            if self._frame is not None:
+                continue
             now = time.monotonic()
             if now - due > BEHIND:
                 start += now - due
@@ -123,6 +132,9 @@ class VirtualSO101:
             for i in range(2, len(parameters), size):
                 self._store(parameters[i], parameters[0], parameters[i + 1 : i + size])
         self._apply()
+        if instruction == reg.SYNC_WRITE and parameters[0] == reg.GOAL_POSITION.address:
+            for _ in range(self._frame or 0):
+                self.live.step()
 
     def _answer(self, servo: int, data: bytes) -> None:
         if not 1 <= servo <= len(SPEAK) or servo in self.deaf:

@@ -1,0 +1,151 @@
+"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK, where lerobot and our plug-in are.
+
+`make lerobot` makes such an environment and runs this in it. LeRobot's own discovery finds the plug-in. Its own
+so101_follower, which speaks to the servos by Feetech's SDK, and its record() play excitation; gaponet imports it,
+identifies and trains; LeRobot opens what gaponet exports; record() plays motions that nothing was trained on,
+uncorrected and corrected by the processor step gaponet_correct, in turn. On the bus a frame passes with each goal, so a
+busy machine measures the same. Errors are of what LeRobot recorded: |observation − action of the frame before|, joints
+that move, after the way to the start.
+What is there already is not made again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import tyro
+
+GAPONET = [sys.executable, "-m", "gaponet"]
+LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
+
+
+def main(
+    work: tyro.conf.Positional[Path],
+    motions: tuple[str, ...] = ("tour-all-20", "tour-all-21", "limber-all-20", "limber-all-21"),
+    minutes: float = 8.0,
+    fps: int = 25,
+    unit: str = "1",
+    windows: int = 12,
+    budget: str = "10m",
+) -> None:
+    """Print errors as JSON, rad.
+
+    Args:
+        work: Folder for everything that is made.
+        motions: For the test, by the names of gaponet's library; excitation has other ones.
+        minutes: Of excitation.
+        fps: LeRobot's rate, Hz.
+        unit: Of the fleet `hard`.
+        windows: Of identification.
+        budget: Of training.
+    """
+    work = work.resolve()
+    work.mkdir(parents=True, exist_ok=True)
+    os.environ |= {"HF_LEROBOT_HOME": str(work / "lerobot"), "HF_HUB_OFFLINE": "1"}
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
+    if not excitation.is_dir():
+        call("excite", "--robot", "so101", "--minutes", f"{minutes:g}", "--out", excitation)
+    with served(unit, fps, work):
+        sets = work / "lerobot" / "me"
+        record(sets / "excitation", work, fps, str(excitation), round(2 * minutes), 30.0)
+        if not (data / "dataset.json").is_file():
+            words = ["--position-unit", "deg", "--kp", "8.9", "--unit-id", f"virtual-{unit}", "--payload-mass", "0"]
+            call("import", sets / "excitation", "--robot", "so101", *words, "--out", data)
+        if not (arm / "robot.toml").is_file():
+            call("identify", data, "--out", arm, "--windows", windows)
+        if not (run / "model" / "card.json").is_file():
+            call("train", data, "--robot", arm, "--out", run, "--budget", budget)
+        if not out.is_dir():
+            call("data", "export", data, "--out", out, "--to", "lerobot")
+        errors = {}
+        for motion in motions:
+            for how, model in (("uncorrected", None), ("corrected", run)):
+                record(sets / f"{motion}-{how}", work, fps, motion, 1, LEAD + 8.0, model)
+                errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}", fps)
+    ratios = [errors[f"{m} corrected"] / errors[f"{m} uncorrected"] for m in motions]
+    nominal = json.loads(call("gap", data, "--json"))["methods"]["nominal"]["mpjae"]
+    print(json.dumps({
+        "virtual": True, "unit": unit, "fps": fps, "gap_rad": nominal, "opened_by_lerobot": opened(out),
+        "error_rad": errors, "ratio": {"mean": float(np.mean(ratios)), "each": ratios},
+    }, indent=1))  # fmt: skip
+
+
+def call(*words: object) -> str:
+    """Run a command of gaponet; what it printed."""
+    return subprocess.run([*GAPONET, *map(str, words)], check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+@contextmanager
+def served(unit: str, fps: int, work: Path) -> Iterator[None]:
+    """A VIRTUAL arm on the pseudo-terminal WORK/so101, its calibration in WORK/virtual.json."""
+    words = ["--robot", "so101", "--unit", unit, "--link", work / "so101", "--calibration", work / "virtual.json"]
+    (work / "virtual.json").unlink(missing_ok=True)
+    process = subprocess.Popen([*GAPONET, "virtual", "serve", *map(str, words), "--frame", str(1 / fps)])
+    try:
+        while not (work / "virtual.json").exists():
+            if process.poll() is not None:
+                raise SystemExit("gaponet virtual serve has ended")
+            time.sleep(0.1)
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def record(
+    out: Path, work: Path, fps: int, motions: str, episodes: int, seconds: float, model: Path | None = None
+) -> None:
+    """LeRobot's record() with its own SO-101 and our motions, through the processor step where there is a model."""
+    if (out / "meta" / "stats.json").is_file():
+        return
+    from lerobot.configs.dataset import DatasetRecordConfig
+    from lerobot.processor import ProcessorStepRegistry, RobotProcessorPipeline
+    from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
+    from lerobot.robots.so_follower import SO101FollowerConfig
+    from lerobot.scripts.lerobot_record import RecordConfig
+    from lerobot.scripts.lerobot_record import record as play
+    from lerobot.teleoperators import TeleoperatorConfig
+
+    steps = [ProcessorStepRegistry.get("gaponet_correct")(model=str(model))] if model else []
+    processor = RobotProcessorPipeline(
+        steps=steps, to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
+    )
+    teleop = TeleoperatorConfig.get_choice_class("gaponet_motion")(motions=motions, fps=fps)
+    robot = SO101FollowerConfig(port=str(work / "so101"), id="virtual", calibration_dir=work)
+    dataset = DatasetRecordConfig(
+        repo_id=f"me/{out.name}", root=out, fps=fps, single_task=out.name, num_episodes=episodes, reset_time_s=0,
+        episode_time_s=seconds, video=False, push_to_hub=False, no_stamp=True,
+    )  # fmt: skip
+    play(RecordConfig(robot, dataset, teleop, play_sounds=False), robot_action_processor=processor)
+
+
+def opened(folder: Path) -> list[int]:
+    """Episodes, frames and joints that LeRobot finds in what gaponet exported."""
+    from lerobot.datasets import LeRobotDataset
+
+    found = LeRobotDataset("me/exported", root=folder)
+    return [found.num_episodes, found.num_frames, len(found[0]["action"])]
+
+
+def error(recorded: Path, fps: int) -> float:
+    """Mean |observation − action of the frame before| over the joints that move, rad."""
+    table = pq.read_table(recorded / "data", columns=["action", "observation.state"])
+    asked, seen = (np.array(table[name].to_pylist())[round(LEAD * fps) :, :5] for name in table.column_names)
+    moves = np.ptp(asked, axis=0) > 1.0  # degrees
+    return float(np.deg2rad(np.abs(seen[1:] - asked[:-1])[:, moves]).mean())
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,318 @@
+"""LeRobot plug-in: an SO-101 whose targets are corrected and watched, motions to record, a processor step.
+
+LeRobot finds this module by the name of its distribution (register_third_party_plugins) and the classes by the names of
+their configurations. Angles are LeRobot's outside (degrees, gripper 0..100) and rad inside. The robot is commanded by
+`gaponet run --targets zmq` in a process of its own: compensator, limits, watchdogs and guard are those of gaponet, and
+a policy that stalls leaves the arm held, then damped.
+"""
+
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.cameras import CameraConfig, make_cameras_from_configs
+from lerobot.lerobot_types import EnvTransition, TransitionKey
+from lerobot.processor import ProcessorStep, ProcessorStepRegistry
+from lerobot.robots import Robot, RobotConfig
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+from lerobot.utils.errors import DeviceNotConnectedError
+
+from gaponet.robot import RobotSpec, load_robot
+
+DEFAULT_RATE = 30.0  # Hz: LeRobot's own
+START, BACK = 180.0, 60.0  # s: until the first state; until the arm is back where it was found
+
+
+class Units:
+    """LeRobot's values by name ↔ rad in the robot's order."""
+
+    def __init__(self, robot: RobotSpec) -> None:
+        self.keys = [f"{joint}.pos" for joint in robot.joint_names]
+        low, high = robot.qpos_range.T
+        share = np.array([unit == "fraction" for unit in robot.log_units])
+        self.scale = np.where(share, (high - low) / 100, np.pi / 180)
+        self.zero = np.where(share, low, 0.0)
+
+    def rad(self, action: dict[str, Any]) -> np.ndarray:
+        """(n,) rad; NaN where a joint is not named."""
+        return self.zero + self.scale * np.array([float(action.get(key, np.nan)) for key in self.keys])
+
+    def named(self, qpos: np.ndarray) -> dict[str, float]:
+        """(n,) rad as LeRobot has it."""
+        return dict(zip(self.keys, ((qpos - self.zero) / self.scale).tolist(), strict=True))
+
+
+@RobotConfig.register_subclass("gaponet_so101")
+@dataclass
+class GaponetSO101Config(RobotConfig):
+    """SO-101 follower; its calibration is what so101_follower's lerobot-calibrate wrote."""
+
+    port: str = "/dev/ttyACM0"
+    calibration: Path | None = None  # that file, compared with what the servos hold; without one the servos' counts
+    model: Path | None = None  # run of gaponet train; without one targets go to the arm as they are, within limits
+    fps: float | None = None  # control rate, Hz, the same as LeRobot's: default what the model was trained at, else 30
+    options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
+    cameras: dict[str, CameraConfig] = field(default_factory=dict)
+
+
+class GaponetSO101(Robot):
+    """Targets go through compensator and limits to the arm; observations are the newest state of each period."""
+
+    config_class = GaponetSO101Config
+    name = "gaponet_so101"
+
+    def __init__(self, config: GaponetSO101Config) -> None:
+        super().__init__(config)
+        self.config = config
+        self.cameras = make_cameras_from_configs(config.cameras)
+        self.spec = load_robot("so101")
+        self.units = Units(self.spec)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @cached_property
+    def observation_features(self) -> dict[str, type | tuple]:
+        cameras = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
+        return self.action_features | cameras
+
+    @cached_property
+    def action_features(self) -> dict[str, type]:
+        return dict.fromkeys(self.units.keys, float)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._process is not None and all(camera.is_connected for camera in self.cameras.values())
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """lerobot-calibrate --robot.type=so101_follower does it; the servos hold what it found."""
+
+    def configure(self) -> None:
+        """Servos are left as they are set; the limits and the model's card ask what they have."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        from gaponet.deploy.targets.client import RemoteRobot
+
+        from gaponet.deploy.driver import DriverError
+
+        self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
+        address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")
+        with said.open("wb") as log:
+            self._process = subprocess.Popen(self._command(address), stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        self._remote = RemoteRobot(address, patience=0.5)
+        began, self._log = time.monotonic(), said
+        while True:  # until the first state
+            try:
+                self._states = iter(self._remote)
+                next(self._states)
+                break
+            except (DriverError, StopIteration):
+                if self._process.poll() is not None or time.monotonic() - began > START:
+                    self._leave()
+                    raise DeviceNotConnectedError(f"gaponet run: {said.read_text(errors='replace').strip()}") from None
+        self._remote.patience = 5.0
+        for camera in self.cameras.values():
+            camera.connect()
+
+    def _command(self, address: str) -> list[str]:
+        config, rate = self.config, self.config.fps
+        if rate is None and config.model is not None:
+            from gaponet.model.artifact import GapModel
+
+            rate = 1 / GapModel.load(config.model).card["dt"][0]
+        words = ["--driver", "so101", "--port", config.port, "--rate", str(rate or DEFAULT_RATE), "--yes"]
+        words += ["--targets", "zmq", "--live.address", address]
+        words += ["--model", str(config.model)] if config.model else []
+        words += ["--calibration", str(config.calibration)] if config.calibration else []
+        return [sys.executable, "-m", "gaponet", "run", *words, *shlex.split(config.options)]
+
+    def get_observation(self) -> dict[str, Any]:
+        state = next(self._states, None) if self._process else None
+        if state is None:
+            said = self._log.read_text(errors="replace").strip().splitlines() if self._process else []
+            raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(said[-2:])}")
+        return self.units.named(state.qpos) | {name: camera.read_latest() for name, camera in self.cameras.items()}
+
+    def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        if self._process is None:
+            raise DeviceNotConnectedError(f"{self} is not connected")
+        target = self.units.rad(action)
+        named = zip(self.spec.joint_names, target.tolist(), strict=True)
+        self._remote.send({joint: rad for joint, rad in named if np.isfinite(rad)})
+        return action
+
+    def disconnect(self) -> None:
+        """The arm goes back to where it was found and is held there."""
+        if self._process is not None:
+            self._remote.close()
+            try:
+                self._process.wait(BACK)
+            except subprocess.TimeoutExpired:
+                self._process.terminate()  # it damps
+            self._leave()
+        for camera in self.cameras.values():
+            camera.disconnect()
+
+    def _leave(self) -> None:
+        process, self._process = self._process, None
+        if process and process.poll() is None:
+            process.terminate()
+            process.wait()
+
+
+@TeleoperatorConfig.register_subclass("gaponet_motion")
+@dataclass
+class GaponetMotionConfig(TeleoperatorConfig):
+    """Motions instead of a leader arm: what gaponet excite wrote, a motion file, or names of the library."""
+
+    motions: str = ""  # a folder, or files and names with commas between; each begins where the last one ended
+    fps: float = DEFAULT_RATE  # as --dataset.fps
+    lead: float = 4.0  # s for which the first target stands, until the arm is there
+
+
+class GaponetMotion(Teleoperator):
+    """Says one row of its motions a call, the last one for ever."""
+
+    config_class = GaponetMotionConfig
+    name = "gaponet_motion"
+
+    def __init__(self, config: GaponetMotionConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self.spec = load_robot("so101")
+        self.units = Units(self.spec)
+        self._rows: Iterator[np.ndarray] | None = None
+
+    @property
+    def action_features(self) -> dict[str, type]:
+        return dict.fromkeys(self.units.keys, float)
+
+    @property
+    def feedback_features(self) -> dict[str, type]:
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        return self._rows is not None
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def calibrate(self) -> None:
+        """Nothing to do."""
+
+    def configure(self) -> None:
+        """Nothing to do."""
+
+    def connect(self, calibrate: bool = True) -> None:
+        self._rows = self._all_rows()
+
+    def _all_rows(self) -> Iterator[np.ndarray]:
+        from gaponet.motion.files import SUFFIXES, read_motion
+        from gaponet.motion.library import Library
+        from gaponet.motion.minjerk import blend, move_time
+
+        given, dt = self.config.motions, 1 / self.config.fps
+        files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES) if Path(given).is_dir() else []
+        library, last = Library(self.spec, max_payload=0.0), None
+        for word in files or given.split(","):
+            name = word
+            if word.endswith(SUFFIXES):
+                motion = read_motion(word, self.spec)
+                library.add(motion)
+                name = motion.name
+            rows = library.make(name).sample(dt)
+            if last is None:
+                yield from [rows[0]] * round(self.config.lead / dt)
+            else:
+                steps = round(float(move_time(np.abs(rows[0] - last).max(), 0.5, 1.0)) / dt)
+                yield from (last + float(blend(np.array(k / steps))) * (rows[0] - last) for k in range(steps))
+            yield from rows
+            last = rows[-1]
+        while True:
+            yield last
+
+    def get_action(self) -> dict[str, float]:
+        if self._rows is None:
+            raise DeviceNotConnectedError(f"{self} is not connected")
+        return self.units.named(next(self._rows))
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Nobody feels it."""
+
+    def disconnect(self) -> None:
+        self._rows = None
+
+
+@ProcessorStepRegistry.register("gaponet_correct")
+@dataclass
+class GaponetCorrect(ProcessorStep):
+    """Corrects SO-101 joint targets, once per control period at the rate that the model was trained at.
+
+    For a robot that is not gaponet_so101: the correction is bounded in size and rate, but nothing watches the arm. As
+    last step of a policy's postprocessor actions are tensors (..., 6) of all joints, and no state is known; as a robot
+    action processor they are named, and the observation is used.
+    """
+
+    model: str = ""
+    payload_mass: float = 0.0
+
+    def __post_init__(self) -> None:
+        from gaponet.deploy.compensator import Compensator
+        from gaponet.deploy.safety import Limits, SafetyConfig, limit_delta
+        from gaponet.model.artifact import GapModel
+
+        network = GapModel.load(self.model)
+        self.spec = network.simulator()
+        self.units, self.dt = Units(self.spec), network.card["dt"][0]
+        self.compensator = Compensator(self.spec, network, dt=self.dt)
+        self.limits = Limits.of(self.spec, self.spec.joint_names, SafetyConfig())
+        self._bounded = limit_delta
+        self.reset()
+
+    def reset(self) -> None:
+        self._delta: np.ndarray | None = None
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        transition = transition.copy()
+        action = transition[TransitionKey.ACTION]
+        named = isinstance(action, dict)
+        flat = None if named else action.reshape(-1, len(self.units.keys))
+        if flat is not None and len(flat) != 1:
+            raise ValueError(f"gaponet_correct corrects one action a period, not {len(flat)}")
+        given = action if named else dict(zip(self.units.keys, flat[0].tolist(), strict=True))
+        seen = transition.get(TransitionKey.OBSERVATION) or {}
+        state = self.units.rad(seen) if all(key in seen for key in self.units.keys) else None
+        sent = self.units.named(self._corrected(self.units.rad(given), state))
+        transition[TransitionKey.ACTION] = (
+            action | sent if named else torch.tensor(list(sent.values()), dtype=action.dtype).reshape(action.shape)
+        )
+        return transition
+
+    def _corrected(self, target: np.ndarray, qpos: np.ndarray | None) -> np.ndarray:
+        if not np.isfinite(target).all():
+            raise ValueError("gaponet_correct: the action holds something that is not a number, or lacks a joint")
+        if self._delta is None:
+            self.compensator.reset(target, self.payload_mass)
+            self._delta = np.zeros_like(target)
+        wanted = self.compensator.step(target, qpos) - target
+        self._delta = self._bounded(wanted, self._delta, self.dt, self.limits)
+        return np.clip(target + self._delta, self.limits.low, self.limits.high)
+
+    def get_config(self) -> dict[str, Any]:
+        return {"model": self.model, "payload_mass": self.payload_mass}
+
+    def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
+        return features
