@@ -1,4 +1,4 @@
-"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK, where lerobot and our plug-in are.
+"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK, with lerobot and our plug-in.
 
 `make lerobot` makes such an environment and runs this in it. LeRobot's own discovery finds the plug-in. Its own
 so101_follower, which speaks to the servos by Feetech's SDK, and its record() play excitation; gaponet imports it,
@@ -54,6 +54,7 @@ def main(
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
+    wait_longer()
     excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
     if not excitation.is_dir():
         call("excite", "--robot", "so101", "--minutes", f"{minutes:g}", "--out", excitation)
@@ -80,6 +81,19 @@ def main(
         "virtual": True, "unit": unit, "fps": fps, "gap_rad": nominal, "opened_by_lerobot": opened(out),
         "error_rad": errors, "ratio": {"mean": float(np.mean(ratios)), "each": ratios},
     }, indent=1))  # fmt: skip
+
+
+def wait_longer() -> None:
+    """Replies of a servo bus on a busy machine take longer than the SDK waits: its patience, 50 ms, becomes 10 s."""
+    from lerobot.motors.feetech import feetech
+
+    given = feetech.patch_setPacketTimeout
+
+    def patient(self, length):  # type: ignore[no-untyped-def]
+        given(self, length)
+        self.packet_timeout += 10_000
+
+    feetech.patch_setPacketTimeout = patient
 
 
 def call(*words: object) -> str:

@@ -19,7 +19,7 @@ STEPS = 4096  # of an encoder, a turn
 STEP = 2 * np.pi / STEPS  # rad
 SPEAK = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")  # servo 1 to 6
 TURNS, GRIPPER = "wrist_roll", "gripper"  # has no stops; has its zero at one
-WHERE = "~/.cache/huggingface/lerobot/calibration/robots/so101_follower/ID.json"
+WHERE = "~/.cache/huggingface/lerobot/calibration/robots/so_follower/ID.json"
 
 Position = Annotated[int, at.Interval(ge=0, le=STEPS - 1)]
 
