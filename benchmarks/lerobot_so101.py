@@ -1,4 +1,4 @@
-"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK, with lerobot and our plug-in.
+"""LeRobot on a VIRTUAL SO-101 behind a servo bus: python benchmarks/lerobot_so101.py WORK. Needs lerobot and plug-in.
 
 `make lerobot` makes such an environment and runs this in it. LeRobot's own discovery finds the plug-in. Its own
 so101_follower, which speaks to the servos by Feetech's SDK, and its record() play excitation; gaponet imports it,
