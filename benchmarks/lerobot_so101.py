@@ -19,6 +19,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -55,6 +56,7 @@ def main(
 
     register_third_party_plugins()
     wait_longer()
+    count_frames()
     excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
     if not excitation.is_dir():
         call("excite", "--robot", "so101", "--minutes", f"{minutes:g}", "--out", excitation)
@@ -94,6 +96,20 @@ def wait_longer() -> None:
         self.packet_timeout += 10_000
 
     feetech.patch_setPacketTimeout = patient
+
+
+def count_frames() -> None:
+    """LeRobot's loop asks the clock how long an episode has been; now that is its frames, as on the bus."""
+    from lerobot.scripts import lerobot_record
+
+    passed = 0.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal passed
+        passed += seconds
+
+    lerobot_record.time = SimpleNamespace(perf_counter=lambda: passed)
+    lerobot_record.precise_sleep = sleep
 
 
 def call(*words: object) -> str:
