@@ -1,7 +1,55 @@
-"""What annotations call an array; docstrings say its shape and unit."""
+"""What annotations call an array, whose docstrings say shape and unit; and what numpy and torch call differently."""
 
 from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
 
 import numpy as np
 
 Array = np.ndarray
+
+
+def library(x: Any) -> Any:
+    """The module, numpy or torch, that an array is of."""
+    return import_module(type(x).__module__.partition(".")[0])
+
+
+def like(x: Any, values: Any) -> Any:
+    """Values as an array of x's kind and device: as they are in numpy, floats in x's type in torch."""
+    if isinstance(x, np.ndarray):
+        return np.asarray(values)
+    new = x.new_tensor if np.asarray(values).dtype.kind == "f" else library(x).tensor
+    return new(np.asarray(values), device=x.device)
+
+
+def zeros_like(x: Any, *shape: int) -> Any:
+    """Zeros of x's kind, type and device, numpy or torch."""
+    return np.zeros(shape, x.dtype) if isinstance(x, np.ndarray) else x.new_zeros(shape)
+
+
+def copy_of(x: Any) -> Any:
+    """A copy of a numpy or torch array."""
+    return x.copy() if isinstance(x, np.ndarray) else x.clone()
+
+
+def rows_of(x: Any, rows: Any, out: Any = None) -> Any:
+    """x[rows], or the same written into out for rows (k,)."""
+    if isinstance(x, np.ndarray):
+        return x.take(rows, axis=0, out=out)  # quicker than an index
+    return x[rows] if out is None else library(x).index_select(x, 0, rows, out=out)
+
+
+def single(x: Any) -> Any:
+    """As float32."""
+    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
+
+
+def host(x: Any) -> Array:
+    """As numpy; of a tensor on a GPU a copy."""
+    return x if isinstance(x, np.ndarray) else x.cpu().numpy()
+
+
+def indices(mask: Any) -> Array:
+    """Where a mask (k,) is true, on the host."""
+    return np.flatnonzero(mask) if isinstance(mask, np.ndarray) else host(mask.nonzero()[:, 0])

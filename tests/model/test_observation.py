@@ -51,5 +51,31 @@ def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
     assert frames[1, :2, 2].tolist() == [100 * k for k in seen[:2]]
 
 
+@pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
+@pytest.mark.parametrize("stride", [1, 3])
+@pytest.mark.parametrize("seed", range(5))
+def test_history_is_what_a_list_of_past_frames_says_whatever_is_pushed_and_reset(make, stride, seed):
+    rng, n, num = np.random.default_rng(seed), 2, 4
+    config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
+    x = make((num, config.input_dim(n)))
+    own = lambda values: values if make is np.zeros else torch.from_numpy(values).float()  # noqa: E731
+    history = History(config, n, x)
+    past = [[np.zeros(3 * n, np.float32)] * history.depth for _ in range(num)]
+    for _ in range(30):
+        if rng.random() < 0.3:
+            ids = np.flatnonzero(rng.random(num) < 0.5)
+            frames = rng.random((len(ids), history.depth, 3 * n)).astype(np.float32)
+            history.reset(ids, *(own(part) for part in np.split(frames, 3, axis=2)))
+            for i, mine in zip(ids, frames, strict=True):
+                past[i] = list(mine)
+        else:
+            frame = rng.random((num, 3 * n)).astype(np.float32)
+            history.push(*(own(part) for part in np.split(frame, 3, axis=1)))
+            past = [[new, *old[:-1]] for new, old in zip(frame, past, strict=True)]
+        history.write()
+        want = [np.concatenate(frames[::stride]) for frames in past]
+        np.testing.assert_array_equal(np.asarray(x)[:, Layout(config, n).past], want)
+
+
 def test_history_at_the_start_is_the_first_frame_repeated():
     assert frames_before(np.array([0, 2]), 3).tolist() == [[0, 0, 0], [1, 0, 0]]

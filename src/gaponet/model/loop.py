@@ -7,16 +7,15 @@ It takes numpy arrays or, where the network's buffers are torch tensors, those; 
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, library, zeros_like
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.backends import Bound, Network
 from gaponet.model.config import ModelConfig
-from gaponet.model.observation import History, Layout, zeros_like
+from gaponet.model.observation import History, Layout
 
 Infer = Callable[[Array], Array]  # x (B, dim) float32 → Δa (B, n) rad, or offsets (B, m, n) rad
 Ask = Callable[[Array, Array | None], Array]  # environments (k,), offsets (k, m, n) rad → answers (k, m, 2n)
@@ -39,6 +38,7 @@ class DeltaLoop:
         ask: Ask | None = None,
         points: Infer | None = None,
         context: Array | None = None,
+        of: Any = None,
     ) -> None:
         """
         Args:
@@ -47,6 +47,7 @@ class DeltaLoop:
             ask: The simulator, where config.asks_simulator.
             points: x → offsets, where these are learned; without it the fixed probes are asked.
             context: Which simulators they are, (num_envs, n · config.context_dim), where the model is told.
+            of: A float32 array of the kind and device of all buffers, where there is no network; default numpy.
 
         Raises:
             ModelError: The model asks the simulator, or is told which it is, and there is none.
@@ -64,7 +65,8 @@ class DeltaLoop:
         n = len(qpos_range)
         self.config, self.n, self.num_envs, self.ask, self.points = config, n, num_envs, ask, points
         self.layout = at = Layout(config, n)
-        nothing = Bound(np.zeros((num_envs, at.dim), np.float32), np.zeros((num_envs, n), np.float32), lambda: None)
+        of = np.empty(0, np.float32) if of is None else of
+        nothing = Bound(zeros_like(of, num_envs, at.dim), zeros_like(of, num_envs, n), lambda: None)
         self.bound = network.bind(num_envs) if network else nothing
         self.x, self.history = self.bound.x, History(config, n, self.bound.x)
         self.more = self.x[
@@ -73,7 +75,7 @@ class DeltaLoop:
         self._host = isinstance(self.x, np.ndarray)
         if context is not None:
             self.x[:, at.context] = context if self._host else self.x.new_tensor(context)
-        self._xp = import_module(type(self.x).__module__.partition(".")[0])  # numpy or torch
+        self._xp = library(self.x)
         self._counts = config.delta_hold > 1 or self.more.shape[1] > 0
         self.low, self.high = (
             np.array(side, float) if self._host else self.x.new_tensor(side) for side in np.transpose(qpos_range)

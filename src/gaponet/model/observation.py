@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, copy_of, zeros_like
 from gaponet.model.config import ModelConfig
 
 
@@ -78,16 +78,6 @@ class History:
         """Bring x up to date."""
         if not self.inside:
             self.place[:] = self.frames[:, self.picked].reshape(len(self.place), -1)
-
-
-def zeros_like(x: Any, *shape: int) -> Any:
-    """Zeros of x's kind, type and device, numpy or torch."""
-    return np.zeros(shape, x.dtype) if isinstance(x, np.ndarray) else x.new_zeros(shape)
-
-
-def copy_of(x: Any) -> Any:
-    """A copy of a numpy or torch array."""
-    return x.copy() if isinstance(x, np.ndarray) else x.clone()
 
 
 def frames_before(t: Array, depth: int) -> Array:

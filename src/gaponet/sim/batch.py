@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
+from gaponet.arrays import like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import LAW, RobotSpec
@@ -141,12 +142,17 @@ class BatchSim:
         self.torque: Array = self.batch.bind("actuator_force")
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
         self.law = ServoLaw(self.batch, first) if robot.has_law or law else None
-        self._late = CommandHistory(self.batch, first) if first.nhistory else None
+        late = [self.batch.bind(name) for name in ("history", "time")] if first.nhistory else []
+        self._late = CommandHistory(late[0], late[1], first) if late else None
         # Physics steps per control period, and their length in s, of each simulation.
         self.nstep = np.array([robot.steps_per(c[2]) for c in conditions])
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
         self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
+
+    def array(self, values: Any) -> Array:
+        """Values as this simulator's arrays are: numpy's here, tensors in sim/warp.py."""
+        return np.asarray(values)
 
     def reset(self, ids: Array | slice, qpos: Array, qvel: Array, past: Array | None = None) -> None:
         """Put simulations `ids` into a state, (k, n) rad and rad/s.
@@ -271,19 +277,20 @@ class CommandHistory:
     Layout of an actuator's part: one user number, the cursor, the samples' times, the samples (mj_initCtrlHistory).
     """
 
-    def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
-        self.buffer: Array = batch.bind("history")
-        self.time: Array = batch.bind("time")
+    def __init__(self, buffer: Any, time: Any, model: mujoco.MjModel) -> None:
+        """buffer: Of the batch, (nsim, nhistory), numpy or torch; time: (nsim,) s."""
+        self.buffer, self.time = buffer, time
         self.samples = int(model.actuator_history[0, 0])
-        self.shape = (model.nu, 2 + 2 * self.samples)
+        parts = buffer.reshape(len(buffer), model.nu, 2 + 2 * self.samples)  # a view
+        self.cursor, self.times = parts[..., :2], parts[..., 2 : -self.samples]
+        self.values = parts[..., -self.samples :]
+        self.ago = like(time, np.arange(self.samples, 0, -1))  # oldest first
 
-    def fill(self, ids: Array | slice, past: Array, nstep: Array, timestep: Array) -> None:
+    def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
         """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""
         self.time[ids] = 0.0
-        ago = np.arange(self.samples, 0, -1)  # oldest first
-        part = np.zeros((len(past), *self.shape))
-        part[:, :, 1] = self.samples - 1
-        part[:, :, 2 : 2 + self.samples] = -ago * timestep[:, None, None]
-        frame = np.minimum((ago - 1) // nstep[:, None], past.shape[1] - 1)  # (k, samples)
-        part[:, :, 2 + self.samples :] = np.take_along_axis(past, frame[:, :, None], axis=1).transpose(0, 2, 1)
-        self.buffer[ids] = part.reshape(len(past), -1)
+        self.cursor[ids] = like(self.time, [0.0, self.samples - 1.0])
+        self.times[ids] = (-self.ago * timestep[:, None])[:, None]
+        frame = ((self.ago - 1) // nstep[:, None]).clip(max=past.shape[1] - 1)  # (k, samples)
+        each = like(self.time, np.arange(len(past)))[:, None]
+        self.values[ids] = past[each, frame].swapaxes(1, 2)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gaponet.arrays import like
 from gaponet.files import whole
 from gaponet.training.env import DeltaEnv
 from gaponet.training.warm_start import WarmStart
@@ -44,13 +45,13 @@ def env_state(env: DeltaEnv) -> StateDict:
     """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
     arrays = {name: getattr(env, name) for name in ROWS} | _inputs(env) | env.sim.state()
     return {
-        "arrays": {name: torch.from_numpy(np.array(x)) for name, x in arrays.items()},
-        "reward": (env.reward_sum, env.reward_count),
+        "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
+        "reward": (float(env.reward_sum), env.reward_count),
         "rng": rng_text(env.rng),
     }
 
 
-def _inputs(env: DeltaEnv) -> dict[str, np.ndarray]:
+def _inputs(env: DeltaEnv) -> dict[str, Any]:
     """What the next observation remembers."""
     return {"frames": env.loop.history.frames, "age": env.loop.age, "more": env.loop.more}
 
@@ -59,9 +60,9 @@ def restore_env(env: DeltaEnv, state: StateDict) -> None:
     """Undo env_state in an environment made alike."""
     arrays = {name: x.numpy() for name, x in state["arrays"].items()}
     for name in ROWS:
-        getattr(env, name)[:] = arrays[name]
+        getattr(env, name)[:] = env.sim.array(arrays[name])
     for name, x in _inputs(env).items():
-        x[:] = arrays[name]
+        x[:] = like(x, arrays[name])
     env.sim.set_state(arrays)
     env.reward_sum, env.reward_count = state["reward"]
     set_rng(env.rng, state["rng"])

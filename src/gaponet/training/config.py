@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import asdict, dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
 
@@ -120,6 +120,9 @@ class TrainConfig:
     """PPO updates between free runs over the validation motions."""
     threads: Annotated[int, Interval(ge=0, le=4096)] = 0
     """Threads of the simulator, and in turn of the learner; 0 for all cores."""
+    device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
+    """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'); warp-cpu: the same on the CPU, slowly, to
+    test it. Scores, identification and robots stay on C MuJoCo."""
 
     @property
     def drawn(self) -> Family | None:
@@ -139,6 +142,18 @@ class TrainConfig:
             if said:
                 raise UsageError(f"--family {self.family}: does not go with {what}; leave one of them out")
         return load_family(self.family)
+
+    def network_device(self) -> str:
+        """Where networks are trained, in torch's words; refuses a GPU that is not there, or what it takes."""
+        if self.device != "cpu":
+            import gaponet.sim.warp  # noqa: F401
+        if self.device != "cuda":
+            return "cpu"
+        import torch
+
+        if not torch.cuda.is_available():
+            raise UsageError("--device cuda: torch sees no GPU, or is a build without; use --device cpu")
+        return "cuda"
 
     @property
     def learner_threads(self) -> int:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
+from typing import Any
 
 import numpy as np
 import torch
 
+from gaponet.arrays import Array, copy_of, indices, library, rows_of, single, zeros_like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.family.context import context
@@ -19,8 +21,6 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
-
-Array = np.ndarray
 
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
@@ -47,13 +47,17 @@ class DeltaEnv:
         seed: int = 0,
         nthread: int = 0,
         members: Members | None = None,
+        device: str = "cpu",
     ) -> None:
         """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
 
-        With members each environment is one simulator of a family.
+        With members each environment is one simulator of a family. On "cpu" C MuJoCo steps and arrays are numpy's; on
+        "cuda" or "warp-cpu" mujoco_warp does (sim/warp.py), and they are tensors that stay there.
         """
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
+        if device != "cpu" and config.asks_simulator:
+            raise UsageError(f"--device {device}: sensors = {config.sensors} ask C MuJoCo; use --device cpu")
         self.robot, self.config, self.reward_config = robot, config, reward
         self.num_envs = num_envs
         self.num_actions = len(robot.operated)
@@ -63,24 +67,20 @@ class DeltaEnv:
         conditions = [self.conditions[g] for g in self.group]
         self.drawn, told = members, None
         if members is None:
-            self.sim = BatchSim(robot, conditions, nthread, self.locked)
+            sim = BatchSim(robot, conditions, nthread, self.locked)
         else:
-            self.sim = BatchSim(members.robot(robot), members.conditions(conditions), nthread, self.locked)
-            members.put(self.sim, robot)
+            sim = BatchSim(members.robot(robot), members.conditions(conditions), nthread, self.locked)
+            members.put(sim, robot)
         if config.context != "none":
             told = context(config.context, robot.nominal or robot, robot, conditions, members, nthread)
+        self._place(sim, device)
         ask = self._simulator(conditions, nthread) if config.asks_simulator else None
-        self.loop = DeltaLoop(config, self.sim.range[self.op], num_envs, ask=ask, context=told)
+        self.loop = DeltaLoop(config, sim.range[self.op], num_envs, ask=ask, context=told, of=self.now)
         shortest = min(c[2] for c in self.conditions)
         under_way = 1 + int(
             np.ceil(self.sim.robot.delay.max() / shortest)
         )  # periods whose command a late servo has not met yet
         self.depth = max(self.loop.history.depth, under_way)
-        self.elapsed = np.zeros(num_envs, np.int64)  # control periods since the reset
-        self.row = np.zeros(num_envs, np.int64)  # row of the recording that the simulation stands at
-        self.first = np.zeros(num_envs, np.int64)  # first row of its recording
-        self.last = np.zeros(num_envs, np.int64)
-        self.now = np.zeros((num_envs, self.track.shape[1]), np.float32)  # the recorded row, as in track
         self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
 
@@ -121,83 +121,103 @@ class DeltaEnv:
         rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
         self.condition_features = np.stack([self.payload / self.config.payload_max, rate / 100], axis=1)
 
+    def _place(self, sim: BatchSim, device: str) -> None:
+        """Put the simulations, and all that a step looks up or writes, on the device; in numpy nothing is copied."""
+        self.sim: Any = sim
+        if device != "cpu":
+            from gaponet.sim.warp import WarpSim
+
+            self.sim = WarpSim(sim, device.removeprefix("warp-"))
+        place, num = self.sim.array, self.num_envs
+        for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features"):
+            setattr(self, name, place(getattr(self, name)))
+        self.at, self.ahead = place(self.op), place(AHEAD)
+        self.low, self.high = place(sim.range[self.op].T)
+        self.elapsed = place(np.zeros(num, np.int64))  # control periods since the reset
+        self.row = place(np.zeros(num, np.int64))  # row of the recording that the simulation stands at
+        self.first = place(np.zeros(num, np.int64))  # first row of its recording
+        self.last = place(np.zeros(num, np.int64))
+        self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
+        self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
+
     def _simulator(self, conditions: list[Condition], nthread: int) -> Ask:
         oracle = ProbeOracle(self.robot, self.config, conditions, nthread, self.locked)
         return lambda ids, offsets: oracle(self.sim.qpos[ids], self.sim.qvel[ids], offsets, ids)
 
     def reset(self, ids: Array | None = None) -> None:
-        """Put environments at uniformly drawn recorded frames, with the frames before as history."""
+        """Put environments at uniformly drawn recorded frames, with the frames before as history; ids on the host."""
         ids = np.arange(self.num_envs) if ids is None else ids
+        seq = np.empty(len(ids), np.int64)
         for g in np.unique(self.group[ids]):
-            mine = ids[self.group[ids] == g]
-            seq = self.rng.choice(self.members[g], size=len(mine), p=self.weights[g])
-            self.first[mine], self.last[mine] = self.seq_first[seq], self.seq_last[seq]
-        self.row[ids] = self.rng.integers(self.first[ids], self.last[ids] - self.config.delta_hold + 1)
-        t = self.row[ids]
-        before = self.first[ids][:, None] + frames_before(t - self.first[ids], self.depth)
+            mine = self.group[ids] == g
+            seq[mine] = self.rng.choice(self.members[g], size=mine.sum(), p=self.weights[g])
+        first, last = self.seq_first[seq], self.seq_last[seq]
+        t = self.rng.integers(first, last - self.config.delta_hold + 1)
+        before = first[:, None] + frames_before(t - first, self.depth)
+        first, last, t, before = (self.sim.array(x) for x in (first, last, t, before))
+        self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
-        self.loop.begin(ids, *(x[before][..., self.op] for x in (self.qpos, self.qvel, self.ctrl)))
-        self.elapsed[ids] = 0
+        self.loop.begin(ids, *(x[before][..., self.at] for x in (self.qpos, self.qvel, self.ctrl)))
         self.now[ids] = self.track[t]
 
     def get_observations(self) -> dict[str, torch.Tensor]:
         """Actor and critic observations of the present row."""
         n, sim = self.num_actions, self.sim
-        q, v = sim.qpos[:, self.op], sim.qvel[:, self.op]
-        actor = self.loop.observe(q, v, self.now[:, 2 * n :], self.payload).copy()
-        rows = np.minimum(self.row[:, None] + AHEAD, self.last[:, None])
-        ahead = self.track.take(rows, axis=0)  # (num_envs, rows ahead, 3n)
+        q, v = sim.qpos[:, self.at], sim.qvel[:, self.at]
+        actor = copy_of(self.loop.observe(q, v, self.now[:, 2 * n :], self.payload))
+        rows = library(self.row).minimum(self.row[:, None] + self.ahead, self.last[:, None])
+        ahead = rows_of(self.track, rows)  # (num_envs, rows ahead, 3n)
         # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
         seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
                 (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
-        critic = np.concatenate(seen, axis=1, dtype=np.float32)
-        return {"actor": torch.from_numpy(actor), "critic": torch.from_numpy(critic)}
+        return {"actor": torch.as_tensor(actor), "critic": torch.cat([torch.as_tensor(x) for x in seen], dim=1).float()}
 
-    def step(self, delta: Array) -> tuple[Array, Array]:
+    def step(self, delta: Any) -> tuple[Any, Any]:
         """Hold corrections for delta_hold control periods; each is compared with the recording one row on.
 
         Args:
-            delta: (num_envs, n) rad.
+            delta: (num_envs, n) rad, numpy or torch.
 
         Returns:
-            Mean reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,).
+            Mean reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
+            arrays of the simulator's kind.
         """
-        delta = np.clip(delta, -self.config.delta_max, self.config.delta_max)
-        reward = np.zeros((self.num_envs, self.num_actions), np.float32)
+        delta = self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max)
+        reward = zeros_like(self.now, self.num_envs, self.num_actions)
         for _ in range(self.config.delta_hold):
             self.advance(delta)
             reward += self._reward() / self.config.delta_hold
         done = self.ended() | (self.elapsed >= self.max_episode_length)
-        ids = np.flatnonzero(done)
+        ids = indices(done)
         if ids.size:
             self.reset(ids)
         return reward, done
 
-    def ended(self) -> Array:
+    def ended(self) -> Any:
         """Whether the recording has too few rows left for one more decision, (num_envs,)."""
         return self.row > self.last - self.config.delta_hold
 
-    def advance(self, delta: Array) -> None:
+    def advance(self, delta: Any) -> None:
         """Step all simulations by one control period, without reward or reset; delta (num_envs, n_operated)."""
-        op, n = self.op, self.sim
-        target = self.ctrl.take(self.row, axis=0).astype(float)
-        target[:, op] = np.clip(target[:, op] + delta, n.range[op, 0], n.range[op, 1])
-        self.loop.push(n.qpos[:, op], n.qvel[:, op], target[:, op])
+        at, n, target = self.at, self.sim, self.target
+        target[:] = rows_of(self.ctrl, self.row)
+        target[:, at] = (target[:, at] + n.array(delta)).clip(self.low, self.high)
+        self.loop.push(n.qpos[:, at], n.qvel[:, at], target[:, at])
         n.step(target)
         self.row += 1
-        self.track.take(self.row, axis=0, out=self.now)
+        rows_of(self.track, self.row, out=self.now)
         self.elapsed += 1
 
-    def _reward(self) -> Array:
+    def _reward(self) -> Any:
         c, n = self.reward_config, self.num_actions
-        cost = np.minimum(np.abs(self.sim.qpos[:, self.op] - self.now[:, :n]) / c.position, c.cap)
-        self.reward_sum -= float(cost.mean())
+        cost = (abs(self.sim.qpos[:, self.at] - self.now[:, :n]) / c.position).clip(max=c.cap)
+        self.reward_sum = self.reward_sum - cost.mean()
         self.reward_count += 1
-        return -cost.astype(np.float32)
+        return -single(cost)
 
     def mean_reward(self) -> float:
         """Per step, environment and joint since last asked."""
-        mean = self.reward_sum / max(self.reward_count, 1)
+        mean = float(self.reward_sum) / max(self.reward_count, 1)
         self.reward_sum, self.reward_count = 0.0, 0
         return mean

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, host
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.family.draw import Members
@@ -134,8 +134,9 @@ class MemberLabels:
         self.late, self.limit = robot.delay[op] + members.delay[:, None], limit
         self.dt = np.repeat([s.dt for s in sequences], length)
 
-    def __getitem__(self, rows: Array) -> Array:
-        """Δa* of one row for each member, (num, n) rad."""
+    def __getitem__(self, rows: Any) -> Array:
+        """Δa* of one row for each member, (num, n) rad; numpy whatever the rows are."""
+        rows = host(rows)
         last, late = self.last[rows][:, None], self.late / self.dt[rows][:, None]
         first = rows[:, None] + late.astype(int)
         low, high = self._band(np.minimum(first, last))

@@ -67,7 +67,7 @@ class Kept:
             UsageError: Trained on other recordings.
         """
         try:
-            state = torch.load(out / CHECKPOINT, weights_only=True)
+            state = torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu")
             net.load_state_dict(state.pop("net"))
             rng = state.pop("rng")
             kept = cls(**state)

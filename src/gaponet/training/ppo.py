@@ -72,13 +72,14 @@ class Learner:
             net.predictor.requires_grad_(False)
         self.trained = [p for p in net.parameters() if p.requires_grad]
         observed = env.get_observations()
-        self.critic = Critic(net.features.dim, observed["critic"].shape[1], config.critic_hidden, env.num_actions)
+        seen = observed["critic"]
+        self.critic = Critic(net.features.dim, seen.shape[1], config.critic_hidden, env.num_actions).to(seen.device)
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
         held = env.robot.dt * env.config.delta_hold
         self.kept = math.exp(-held / config.noise_time) if config.noise_time else 0.0
         self.spread = config.std * math.sqrt(1 - self.kept**2)
-        self.noise = torch.zeros(env.num_envs, env.num_actions)
+        self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
         self.updates, self.ready, self.found = 0, False, Update()
 
     def update(self) -> Update:
@@ -101,7 +102,7 @@ class Learner:
                 known = self.kept * self.noise
                 self.noise = known + self.spread * explored * torch.randn_like(known)
                 delta = row["mean"] + self.noise
-                reward, done = (torch.from_numpy(x) for x in env.step(delta.numpy()))
+                reward, done = (torch.as_tensor(x) for x in env.step(delta))
                 row |= {"sampled": delta - known, "explored": explored, "done": done.float()[:, None]}
                 # The end of a motion is a time-out: what would have come is worth what the critic says of now.
                 row["reward"] = (1 - gamma) * reward + gamma * row["value"] * row["done"]
@@ -184,7 +185,8 @@ class Learner:
         self.critic.load_state_dict(state["critic"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
-        self.noise, self.updates, self.ready = state["noise"].clone(), state["updates"], state["ready"]
+        self.noise.copy_(state["noise"])
+        self.updates, self.ready = state["updates"], state["ready"]
 
 
 def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:

@@ -118,6 +118,7 @@ class Trainer:
             if resume:
                 self.kept, self.rng = Kept.read(out, self.net, self.kept.dataset)
             self._write_config(holdout_units, resume)
+        self.net.to(config.network_device())
         self.loggers = Loggers(log, out, asdict(config))
 
     def run(self) -> GapModel:
@@ -253,17 +254,15 @@ class Trainer:
         net = build_network(self.config.model, self.n)
         net.load_state_dict(self.kept.best_state)
         net.eval()
-        env = self._env(max(64, len(self._conditions())), 10, seed=0)
+        env = self._env(max(64, len(self._conditions())), 10, 0, "cpu")
         self.loggers.close()
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
         return GapModel.load(self.out)
 
-    def _env(self, num_envs: int, episode_steps: int, seed: int) -> DeltaEnv:
+    def _env(self, num_envs: int, episode_steps: int, seed: int, device: str | None = None) -> DeltaEnv:
         c = self.config
-        members = self._members(num_envs, c.seed)
-        return DeltaEnv(
-            self.train_set, self.robot, c.model, num_envs, episode_steps, c.reward, seed, c.threads, members
-        )
+        how = c.reward, seed, c.threads, self._members(num_envs, c.seed), device or c.device
+        return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
 
     def _members(self, num: int, seed: int) -> Members | None:
         return None if self.family is None else Members.draw(self.family, num, self.n, seed)

@@ -169,9 +169,10 @@ def points_of(net: DeltaNet) -> Infer | None:
 def torch_infer(net: torch.nn.Module) -> Infer:
     """A network as a function of numpy arrays, for validation while training."""
     net.eval()
+    device = next(net.parameters()).device
 
     def infer(x: Array) -> Array:
         with torch.inference_mode():
-            return net(torch.from_numpy(x)).numpy()
+            return net(torch.from_numpy(x).to(device)).cpu().numpy()
 
     return infer

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, copy_of, host, indices
 from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.training.config import TrainConfig, WarmStartConfig
@@ -52,7 +53,8 @@ class WarmStart:
     ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.config = net, env, config
-        self.labels = held_labels(labels, env.config.delta_hold) if isinstance(labels, np.ndarray) else labels
+        held = held_labels(labels, env.config.delta_hold) if isinstance(labels, np.ndarray) else labels
+        self.labels: Any = env.sim.array(held) if isinstance(held, np.ndarray) else held
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -81,16 +83,16 @@ class WarmStart:
             x = env.get_observations()["actor"]
             y = self.labels[env.row]
             xs.append(x)
-            ys.append(torch.from_numpy(y))
+            ys.append(torch.as_tensor(y, device=x.device))
             if follow_labels:
                 delta = y
             else:
                 with torch.inference_mode():
-                    delta = net(x).numpy()
-            applied = delta + self._disturb(disturbance)
+                    delta = net(x)
+            applied = env.sim.array(delta) + env.sim.array(self._disturb(disturbance))
             for _ in range(hold):
                 env.advance(applied)
-            ended = np.flatnonzero(env.ended())
+            ended = indices(env.ended())
             if ended.size:
                 env.reset(ended)
         self.pool_x.append(torch.cat(xs))
@@ -167,8 +169,10 @@ def fit_inputs(
     Returns:
         Its R² on held-out states; None for a network without one.
     """
-    net.fit_inputs(x)
-    return fit_sensors(net, env, states, seed, nthread) if net.predictor is not None else None
+    net.cpu().fit_inputs(x.cpu())  # the sensors to be predicted are C MuJoCo's answers
+    report = fit_sensors(net, env, states, seed, nthread) if net.predictor is not None else None
+    net.to(x.device)
+    return report
 
 
 def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
@@ -181,9 +185,9 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: i
     vs: list[Array] = []
     while sum(map(len, xs)) < states:
         env.reset()
-        xs.append(env.get_observations()["actor"].numpy())
-        qs.append(env.sim.qpos.copy())
-        vs.append(env.sim.qvel.copy())
+        xs.append(host(env.get_observations()["actor"]))
+        qs.append(copy_of(host(env.sim.qpos)))
+        vs.append(copy_of(host(env.sim.qvel)))
     x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
     of = np.tile(np.arange(env.num_envs), len(xs))  # environment of each state
     pick = np.sort(rng.permutation(len(x))[:states])

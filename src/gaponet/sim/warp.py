@@ -1,0 +1,173 @@
+"""BatchSim's simulations on Warp's device by mujoco_warp: thousands side by side on a GPU, or on the CPU, to test that.
+
+Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
+identification and robots stay on C MuJoCo, from which these simulations part by about 1e-6 rad in a second.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import mujoco_warp
+import numpy as np
+import torch
+import warp
+from mujoco.batch import MODEL_FIELDS
+from torch import Tensor
+
+from gaponet.errors import UsageError
+from gaponet.sim.batch import BatchSim, CommandHistory
+
+CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
+STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
+LATE = {"history": "history", "time": "time"}
+
+
+class Worlds:
+    """Simulations of one rate: mujoco_warp steps all of its worlds or none, and all as often."""
+
+    def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
+        self.device, self.nstep, self._graph = warp.get_device(device), int(sim.nstep[rows[0]]), None
+        model = next(iter(sim.models.values()))
+        own = {name: x[rows] for name in sorted(MODEL_FIELDS) if (x := sim.batch.expanded(name)) is not None}
+        timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
+        # The others among MuJoCo's fields shorten its arithmetic, or are for looking at.
+        own = {name: x for name, x in own.items() if name in mujoco_warp.Model.__dataclass_fields__}
+        touching = 0 if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT else CONTACTS
+        most = max(64, 2 * model.nv + ROWS * touching)
+        with warp.ScopedDevice(self.device):
+            try:
+                self.model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(own, len(rows)))
+            except (NotImplementedError, ValueError) as error:
+                raise UsageError(f"{sim.robot.name}: mujoco_warp refuses it ({error}); use --device cpu") from None
+            self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
+            self.model.opt.timestep = warp.array(timestep, dtype=float)
+        for name, x in own.items():
+            view = warp.to_torch(getattr(self.model, name))
+            view.copy_(torch.tensor(x).reshape(view.shape))
+
+    def bind(self, name: str) -> Tensor:
+        """A live view of a field of all worlds, (nworld, …)."""
+        return warp.to_torch(getattr(self.data, name))
+
+    def step(self) -> None:
+        """Advance by a control period."""
+        if self.device.is_cuda:
+            self._graph = self._graph or self._captured()
+            warp.capture_launch(self._graph, warp.stream_from_torch(torch.cuda.current_stream()))
+        else:
+            self._steps()
+
+    def _steps(self) -> None:
+        with warp.ScopedDevice(self.device):
+            for _ in range(self.nstep):
+                mujoco_warp.step(self.model, self.data)
+
+    def _captured(self) -> Any:
+        """The kernels of a control period as one CUDA graph; they are compiled by stepping once, which is undone."""
+        moved = [self.bind(name) for name in (*STATE, *LATE) if getattr(self.data, name).size]
+        before = [x.clone() for x in moved]
+        torch.cuda.synchronize()
+        self._steps()
+        warp.synchronize_device(self.device)
+        for x, old in zip(moved, before, strict=True):
+            x.copy_(old)
+        torch.cuda.synchronize()
+        with warp.ScopedCapture(self.device) as capture:
+            self._steps()
+        return capture.graph
+
+
+class WarpSim:
+    """The same simulations as a BatchSim's, as it has them now: payloads, rates, gains, friction, delays, state.
+
+    `qpos`, `qvel`, `ctrl` and `torque` are live (num_envs, n) float32 tensors on the device: a write is the state at
+    the next step.
+    """
+
+    def __init__(self, sim: BatchSim, device: str = "cuda") -> None:
+        """device: "cuda", "cuda:1", … or "cpu", Warp's.
+
+        Raises:
+            UsageError: No such device, or servos with a law (sim/servo.py).
+        """
+        if sim.law is not None:
+            raise UsageError(f"{sim.robot.name}: its servos have a law, which a GPU cannot step; use --device cpu")
+        warp.config.quiet = True
+        try:
+            warp.get_device(device)
+        except (ValueError, RuntimeError) as error:
+            raise UsageError(f"device {device}: Warp finds none ({error}); use cpu") from None
+        self.robot, self.joint_names, self.num_envs, self.n, self.range = (
+            sim.robot, sim.joint_names, sim.num_envs, sim.n, sim.range
+        )  # fmt: skip
+        # One rate's worlds are not stepped with another's, since they take more steps or fewer.
+        rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
+        self._worlds = [Worlds(sim, rows, device) for rows in rates]
+        self._late = next(iter(sim.models.values())).nhistory > 0
+        names = [*STATE, *(LATE if self._late else ()), "ctrl", "actuator_force"]
+        self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
+        if len(self._worlds) == 1:
+            self._all = self._views[0]
+        else:
+            self._all = {name: x.new_zeros(self.num_envs, *x.shape[1:]) for name, x in self._views[0].items()}
+        self.qpos, self.qvel, self.ctrl, self.torque = (
+            self._all[name] for name in ("qpos", "qvel", "ctrl", "actuator_force")
+        )
+        self._ids = [self.array(rows) for rows in rates]
+        self._low, self._high = self.array(self.range.T)
+        self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
+        if self._late:
+            model = next(iter(sim.models.values()))
+            self._commands = CommandHistory(self._all["history"], self._all["time"], model)
+        self.set_state(sim.state())
+
+    def array(self, values: Any) -> Tensor:
+        """Values as the device has them: floats of 32 bits, whole numbers of 64."""
+        values = torch.as_tensor(values)
+        return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else values.dtype)
+
+    def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
+        """As BatchSim.reset; arrays of any kind."""
+        ids = ids if isinstance(ids, slice) else self.array(ids)
+        self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
+        self._all["qacc_warmstart"][ids] = 0.0
+        if self._late:
+            if past is None:
+                raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
+            self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
+
+    def step(self, ctrl: Any, ids: Any = None) -> None:
+        """As BatchSim.step; all are stepped, and those that should not move are put back."""
+        torch.clamp(self.array(ctrl), self._low, self._high, out=self.ctrl)
+        before = {} if ids is None else self.state()
+        for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
+            if views is self._all:
+                worlds.step()
+                continue
+            for name, x in views.items():
+                x.copy_(self._all[name][rows])
+            worlds.step()
+            for name, x in views.items():
+                self._all[name][rows] = x
+        if self._late:  # a float32 tells physics steps apart for minutes only, so the clock starts again
+            self._commands.times -= self._commands.time[:, None, None]
+            self._commands.time.zero_()
+        if ids is not None:
+            still = torch.ones(self.num_envs, dtype=torch.bool, device=self.qpos.device)
+            still[self.array(ids)] = False
+            for name, x in self._state().items():
+                x[still] = before[name][still]
+
+    def state(self) -> dict[str, Tensor]:
+        """As BatchSim.state."""
+        return {name: x.clone() for name, x in self._state().items()}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Undo `state`, of this or of a BatchSim alike."""
+        for name, x in self._state().items():
+            x.copy_(self.array(state[name]))
+
+    def _state(self) -> dict[str, Tensor]:
+        return {name: self._all[field] for field, name in (STATE | (LATE if self._late else {})).items()}

@@ -1,0 +1,113 @@
+"""Simulations by mujoco_warp, on Warp's CPU device, are MuJoCo's but for rounding; kernels compile once."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import write_arm
+
+from gaponet.errors import UsageError
+from gaponet.robot import available, load_robot
+from gaponet.sim.batch import BatchSim, Condition
+
+pytest.importorskip("torch")
+pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
+
+from gaponet.sim.warp import WarpSim
+
+PERIODS, HOLD_S = 50, 10.0
+# rad: a few times what a float32 resolves at 2 rad. The band of accelerations in which a joint sticks (sim/model.py) is
+# hardly wider than what one resolves at 100 rad/s², so where a joint stops differs more, mostly by nothing.
+ROUNDING, STOPPED, HELD = 2e-6, 5e-4, 2e-3
+
+
+def worlds(robot, friction=True, both_rates=True):
+    """As shipped, with a payload, at another rate, of other gains, with friction × 10, with servos of their own."""
+    shipped = Condition(0.0, "both", robot.dt)
+    laden = shipped._replace(payload_mass=0.3 if robot.payload_mounts else 0.0)
+    fast = shipped._replace(dt=robot.dt / 2 if both_rates and robot.decimation > 1 else robot.dt)
+    soft = shipped._replace(kp=tuple(0.7 * robot.kp), kd=tuple(1.3 * robot.kd))
+    sim = BatchSim(robot, [shipped, laden, fast, soft, laden, fast], nthread=1)
+    rng = np.random.default_rng(0)
+    factor = rng.uniform(0.5, 1.5, sim.n)
+    sim.batch.expand("actuator_gainprm")[5, :, 0] *= factor
+    sim.batch.expand("actuator_biasprm")[5, :, :2] *= factor[:, None]
+    dry = sim.batch.expand("dof_frictionloss")
+    dry[4] *= 10
+    dry[5] *= rng.uniform(0, 3, sim.n)
+    dry *= friction
+    sim.batch.expand("dof_damping")[5] *= rng.uniform(0.5, 2, sim.n)
+    return sim
+
+
+class Both:
+    """The same simulations in C and in Warp, and how far apart each joint's position has been, (num_envs, n) rad."""
+
+    def __init__(self, robot, **how):
+        self.ours = worlds(robot, **how)
+        self.theirs, self.apart = WarpSim(self.ours, "cpu"), 0.0
+        low, high = np.clip(self.ours.range.T, -3, 3)
+        home, inside = robot.qpos_home[robot.index(self.ours.joint_names)], 0.1 * (high - low)
+        self.at = np.clip(home, low + inside, high - inside)
+        self.at = self.at + np.random.default_rng(1).uniform(-0.05, 0.05, self.ours.qpos.shape)
+
+    def put(self, ids, at):
+        past = at[ids][:, None] + np.linspace(0.02, 0, 3)[:, None]
+        for sim in (self.ours, self.theirs):
+            sim.reset(ids, at[ids], np.zeros_like(at[ids]), past=past)
+
+    def step(self, target, ids=None):
+        for sim in (self.ours, self.theirs):
+            sim.step(target, ids)
+        self.apart = np.maximum(self.apart, np.abs(self.ours.qpos - self.theirs.qpos.numpy()))
+
+
+@pytest.mark.parametrize("friction", [False, True])
+@pytest.mark.parametrize("name", available())
+def test_a_second_of_motion_is_mujocos(name, friction):
+    robot = load_robot(name)
+    if not friction:
+        robot = replace(robot, delay=np.linspace(0.004, 0.015, len(robot.joint_names)))
+    both = Both(robot, friction=friction)
+    both.put(slice(None), both.at)
+    phase = np.arange(both.ours.n)
+    for t in range(PERIODS):
+        if t == PERIODS // 2:
+            both.put(np.array([0, 2, 4]), both.at + 0.1)
+        both.step(both.at + 0.2 * (np.sin(np.pi * t * robot.dt + phase) - np.sin(phase)))
+    assert np.median(both.apart) <= ROUNDING
+    assert both.apart.max() <= (STOPPED if friction else ROUNDING)
+    assert np.ptp(both.ours.qpos, axis=0).max() > 1e-3  # the simulations are not one
+
+
+@pytest.mark.parametrize("name", available())
+def test_holding_for_ten_seconds_is_mujocos(name):
+    robot = load_robot(name)
+    both = Both(robot, both_rates=False)
+    both.put(slice(None), both.at)
+    for _ in range(round(HOLD_S / robot.dt)):
+        both.step(both.at + 0.03)
+    assert both.apart.max() <= HELD
+
+
+@pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
+def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
+    robot = replace(write_arm(tmp_path), delay=[0.03, 0.0])
+    sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), "cpu")
+    sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=np.zeros((3, 4, 2)))
+    for _ in range(3):
+        sim.step(np.ones((3, 2)), np.array([0, 2]))
+    assert (sim.qpos[1] == 0).all()
+    assert (sim.qpos[[0, 2]] != 0).all()
+    state, paths = sim.state(), []
+    for _ in range(2):
+        sim.set_state(state)
+        sim.step(-np.ones((3, 2)))
+        paths.append(sim.qpos.clone())
+    assert (paths[0] == paths[1]).all()
+
+
+def test_what_a_gpu_cannot_simulate_is_refused(tmp_path):
+    sim = BatchSim(replace(write_arm(tmp_path), stribeck=0.1), [Condition(0.0, "both", 0.02)], 1)
+    with pytest.raises(UsageError, match="law"):
+        WarpSim(sim, "cpu")

@@ -1,0 +1,81 @@
+"""The training environment on Warp's CPU device: the same numbers as on C MuJoCo's, and none that go to the host."""
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+from torch.overrides import TorchFunctionMode
+
+from gaponet.errors import UsageError
+from gaponet.model.config import ModelConfig
+from gaponet.training.config import RewardConfig
+from gaponet.training.env import DeltaEnv
+
+pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
+
+STEPS = 200
+
+
+def make(folder, device, rows=60, **model):
+    robot = write_arm(folder)
+    sequences = recordings(robot, 4, rows=rows, kp=0.6)
+    return DeltaEnv(sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device)
+
+
+def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
+    ours, theirs = (make(tmp_path, device, history=2, stride=3) for device in ("cpu", "warp-cpu"))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(STEPS):
+        seen, also = ours.get_observations(), theirs.get_observations()
+        for group in seen:
+            torch.testing.assert_close(also[group], seen[group], atol=1e-5, rtol=1e-5)
+        delta = rng.normal(0, 0.01, (8, 2)).astype(np.float32)
+        reward, done = ours.step(delta)
+        like, same = theirs.step(torch.from_numpy(delta))
+        np.testing.assert_allclose(like.numpy(), reward, atol=1e-5 / RewardConfig().position)  # 1e-5 rad
+        np.testing.assert_array_equal(same.numpy(), done)
+        ends += done.sum()
+    assert ends > 8
+    assert theirs.mean_reward() == pytest.approx(ours.mean_reward(), abs=1e-4)
+
+
+class Crossings(TorchFunctionMode):
+    """Notes every way from a tensor to the host."""
+
+    WAYS = ("cpu", "numpy", "item", "tolist", "__array__", "__bool__", "__float__", "__int__", "__index__")
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if getattr(func, "__name__", "") in self.WAYS:
+            self.seen.append((func.__name__, args[0].dtype, tuple(args[0].shape)))
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_tensor_that_goes_to_the_host_is_noted():
+    with Crossings() as crossings:
+        assert float(torch.zeros(1)) == 0
+        np.asarray(torch.zeros(2))
+    assert len(crossings.seen) >= 2
+
+
+def test_nothing_but_the_list_of_resets_goes_to_the_host(tmp_path):
+    env = make(tmp_path, "warp-cpu", history=2)
+    delta, resets = torch.zeros(8, 2), 0
+    for _ in range(60):
+        before = env.elapsed.clone()
+        with Crossings() as crossings:
+            env.get_observations()
+            _, done = env.step(delta)
+        assert (env.elapsed == torch.where(done, 0, before + 1)).all()
+        ended = int(done.sum())
+        assert crossings.seen == [("cpu", torch.int64, (ended,)), ("numpy", torch.int64, (ended,))]
+        resets += ended
+    assert resets
+
+
+def test_sensors_that_ask_c_mujoco_are_refused(tmp_path):
+    with pytest.raises(UsageError, match="use --device cpu"):
+        make(tmp_path, "warp-cpu", sensors="oracle")
