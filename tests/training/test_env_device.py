@@ -6,10 +6,13 @@ import torch
 from arm import recordings, write_arm
 from torch.overrides import TorchFunctionMode
 
+from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.training.config import RewardConfig
+from gaponet.training.budget import Budget
+from gaponet.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
+from gaponet.training.run import Trainer
 
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
 
@@ -79,3 +82,29 @@ def test_nothing_but_the_list_of_resets_goes_to_the_host(tmp_path):
 def test_sensors_that_ask_c_mujoco_are_refused(tmp_path):
     with pytest.raises(UsageError, match="use --device cpu"):
         make(tmp_path, "warp-cpu", sensors="oracle")
+
+
+def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
+    robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
+    dataset = Dataset.create(data, robot)
+    for sequence in recordings(robot, 8, rows=80, kp=0.5, delay=2):
+        dataset.append(sequence)
+    small = TrainConfig(
+        ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+        warm_start=WarmStartConfig(
+            rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
+        ),
+        ppo=PPOConfig(num_envs=16, num_steps=8, epochs=1, critic_warmup=0, explained=-1e9),
+        device="warp-cpu",
+    )
+    steps = 2 * 16 * 40 + 2 * 16 * 8
+    Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
+    model = Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
+    assert model.card["stages"]["ppo_updates"] >= 4
+    assert model.card["val_mpjae"]["model"] < 0.9 * model.card["val_mpjae"]["nominal"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused_before_any_time_is_spent():
+    with pytest.raises(UsageError, match="torch sees no GPU"):
+        TrainConfig(device="cuda").network_device()

@@ -171,7 +171,8 @@ class DeltaEnv:
         # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
         seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
                 (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
-        return {"actor": torch.as_tensor(actor), "critic": torch.cat([torch.as_tensor(x) for x in seen], dim=1).float()}
+        critic = single(library(ahead).concatenate(seen, 1))
+        return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
 
     def step(self, delta: Any) -> tuple[Any, Any]:
         """Hold corrections for delta_hold control periods; each is compared with the recording one row on.
