@@ -7,6 +7,7 @@ Needs the package index: make resolve
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -20,7 +21,7 @@ BESIDE = {"alone": "", "LeRobot": "lerobot>=0.6,<0.7", "mjlab": "mjlab>=1.6,<1.7
 PLATFORMS = {
     "Linux x86_64": "x86_64-manylinux_2_35",
     "Linux aarch64": "aarch64-manylinux_2_35",
-    "macOS arm64": "aarch64-apple-darwin",
+    "macOS 14 arm64": "aarch64-apple-darwin",
     "Windows": "x86_64-pc-windows-msvc",
 }
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
@@ -36,12 +37,14 @@ def extras() -> list[str]:
 
 
 def resolve(wanted: list[str], beside: str, where: str, python: str) -> dict[str, str] | None:
-    """Package → version; None where there is no solution. Alone, every package must have a wheel."""
-    lines = [beside] * bool(beside) + ([f"gaponet[{','.join(wanted)}] @ {ROOT.as_uri()}"] if wanted != ["-"] else [])
+    """Package → version; None where there is no solution. Nothing wanted: the other tool by itself; nothing beside it:
+    every package must have a wheel."""
+    lines = [beside] * bool(beside) + ([f"gaponet[{','.join(wanted)}] @ {ROOT.as_uri()}"] if wanted else [])
     words = ["uv", "pip", "compile", "-", "--quiet", "--no-header", "--no-annotate", "--python-version", python]
     words += ["--python-platform", PLATFORMS[where]]
     words += [] if beside else ["--only-binary", ":all:", "--no-binary", "gaponet"]
-    done = subprocess.run(words, input="\n".join(lines), capture_output=True, text=True)
+    system = os.environ | {"MACOSX_DEPLOYMENT_TARGET": "14.0"}
+    done = subprocess.run(words, input="\n".join(lines), capture_output=True, text=True, env=system)
     if done.returncode and "No solution found" not in done.stderr:
         raise SystemExit(f"{' '.join(words)}\n{done.stderr}")
     return None if done.returncode else dict(re.findall(r"^([a-z0-9-]+)==(\S+)", done.stdout, re.MULTILINE))
@@ -50,10 +53,10 @@ def resolve(wanted: list[str], beside: str, where: str, python: str) -> dict[str
 def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
     """What stands in the table, and what is missing though it should not be."""
     beside = BESIDE[name]
-    if beside and resolve(["-"], beside, where, python) is None:
-        return "not offered", []
     known = [extra for extra in extras() if (where, python, extra) in KNOWN]
     found = resolve([extra for extra in extras() if extra not in known], beside, where, python)
+    if found is None and beside and resolve([], beside, where, python) is None:
+        return "not offered", []
     if found is None:
         alone = [extra or "base" for extra in ["", *extras()] if resolve([extra], beside, where, python) is None]
         return "no", [f"{name}, {where}, Python {python}: {', '.join(alone) or 'each extra, but not all together'}"]
@@ -64,7 +67,7 @@ def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
 def main() -> int:
     """Print the table and what is wrong."""
     places = list(product(BESIDE, PLATFORMS))
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(8) as pool:
         cells = {key: pool.submit(cell, *key) for key in product(BESIDE, PLATFORMS, PYTHONS)}
     print("| beside | platform |" + "".join(f" Python {p} |" for p in PYTHONS))
     print("| --- | --- |" + " --- |" * len(PYTHONS))

@@ -94,6 +94,7 @@ def test_late_servos_want_to_know_what_is_on_its_way(tmp_path):
 @pytest.mark.parametrize("delay", [(0.0, 0.0), (0.05, 0.013)])
 def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypatch, delay):
     """Payloads, rates, laws, late servos, steps of some, forces: all that gaponet writes into a batch."""
+    pytest.importorskip("mujoco.batch")
     robot = replace(write_arm(tmp_path), delay=list(delay), stribeck=[0.1, 0.2], friction_motor=[0.1, 0.0])
     conditions = [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)]
     rng = np.random.default_rng(3)
