@@ -27,6 +27,7 @@ PLATFORMS = {
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 SHOWN = ("torch", "mujoco")
 # cyclonedds 11.0.1 has no wheel there; docs/install.md says how to build one.
+UNTIL = {"mjlab": "3.13"}  # an upper bound of Requires-Python, at which uv does not look
 KNOWN = {(*place, "dds") for place in product(PLATFORMS, PYTHONS) if "Linux aarch64" in place or "3.14" in place}
 
 
@@ -55,7 +56,7 @@ def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
     beside = BESIDE[name]
     known = [extra for extra in extras() if (where, python, extra) in KNOWN]
     found = resolve([extra for extra in extras() if extra not in known], beside, where, python)
-    if found is None and beside and resolve([], beside, where, python) is None:
+    if python > UNTIL.get(name, python) or (found is None and beside and resolve([], beside, where, python) is None):
         return "not offered", []
     if found is None:
         alone = [extra or "base" for extra in ["", *extras()] if resolve([extra], beside, where, python) is None]

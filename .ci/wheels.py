@@ -38,7 +38,7 @@ TRIES = {
     "gym": [GYM],
     "ros": ["data export data --to mcap --out bags", "import bags --robot so101 --out again"],
     "hdf5": ["formats"],
-    "view": ["view data --model run --duration 1 --render film.gif"],
+    "deploy,view": ["view data --model run --duration 1 --render film.gif"],
 }  # fmt: skip
 
 
@@ -60,7 +60,7 @@ def main(wanted: list[str]) -> None:
         for extra, commands in TRIES.items():
             if wanted and extra and extra not in wanted:
                 continue
-            place = folder / f"env-{extra or 'base'}"
+            place = folder / "env"
             run("uv", "venv", "--quiet", "--python", sys.executable, place, folder=folder)
             bin = place / ("Scripts" if os.name == "nt" else "bin")
             what = f"gaponet[{extra}] @ {wheel.as_uri()}"

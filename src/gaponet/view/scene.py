@@ -177,7 +177,7 @@ def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: st
         geom.material = ""
         geom.rgba = (PAYLOAD if colour else GHOST) if geom.parent.name in payload else rgba
     if not meshes:
-        for body in spec.bodies:
+        for body in spec.bodies[1:]:  # asked for the world's parent, MuJoCo 3.10 ends the process
             _add_housings(body, dark)
         _add_shells(spec, robot, rgba)
     if not colour:
@@ -195,7 +195,7 @@ def rgb(colour: str) -> tuple[float, float, float, float]:
 
 def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
     """A short cylinder about each joint axis, a third wider than the limb."""
-    around = [*body.geoms, *(body.parent.geoms if body.parent is not None else [])]
+    around = [*body.geoms, *body.parent.geoms]
     sizes = [g.size[0] for g in around if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
     if not sizes:
         return
