@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults peers engines browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults live peers engines browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -32,6 +32,10 @@ test: setup
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
 	$(BIN)/python -m pytest -m faults -rP
+
+# Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
+live: setup
+	$(BIN)/python tests/deploy/live.py --minutes 10 $(LIVE)
 
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup

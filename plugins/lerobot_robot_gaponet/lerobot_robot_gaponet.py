@@ -102,9 +102,8 @@ class GaponetSO101(Robot):
         """Servos are left as they are set; the limits and the model's card ask what they have."""
 
     def connect(self, calibrate: bool = True) -> None:
-        from gaponet.deploy.targets.client import RemoteRobot
-
         from gaponet.deploy.driver import DriverError
+        from gaponet.deploy.targets.client import RemoteRobot
 
         self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
         address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")

@@ -34,6 +34,7 @@ _HOMES = {  # name → module
     "MujocoAligner": "gaponet.deploy.mujoco_loop",
     "Compensator": "gaponet.deploy.compensator",
     "Controller": "gaponet.deploy.controller",
+    "RemoteRobot": "gaponet.deploy.targets.client",
 }
 __all__ = ["GAPONetError", "__version__", *_HOMES]
 

@@ -53,7 +53,7 @@ EXTRAS = {
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
     "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "tensorboard": "tensorboard", "wandb": "wandb",
-    "warp": "warp", "mujoco_warp": "warp",
+    "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp",
 }  # fmt: skip
 
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from gaponet.deploy.clock import SimulatedClock
 from gaponet.deploy.controller import Controller
-from gaponet.deploy.driver import DriverError, State
+from gaponet.deploy.driver import DriverError, Fault, State
 from gaponet.deploy.drivers.unitree import MOTOR_NAMES
 from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.safety import Limits, SafetyConfig
@@ -190,10 +190,12 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
     amplitude, wave = rng.choice([0.1, 0.5, 4.0]), rng.uniform(0.5, 8.0, len(robot.joint_names))
     length = int(rng.integers(50, 400))
 
-    def policy(k: int, state: State) -> Array | None:
+    def policy(k: int, state: State) -> Array | Fault | None:
         clock.now()
         if rng.random() < 0.0003:
             raise RuntimeError("the policy's own fault")
+        if rng.random() < 0.0003:  # live targets cease
+            return Fault("silence", "nobody speaks")
         target = robot.qpos_home + amplitude * np.sin(wave * k * DT)
         if rng.random() < 0.0003:
             target[rng.integers(len(target))] = rng.choice([np.nan, np.inf, 1e300])

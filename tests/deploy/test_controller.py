@@ -15,13 +15,14 @@ from arm import commands
 from gaponet.data.importer import import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.deploy.clock import SimulatedClock
-from gaponet.deploy.controller import Controller, play
+from gaponet.deploy.controller import Controller
 from gaponet.deploy.driver import DriverError, Fault
 from gaponet.deploy.drivers.virtual import VirtualDriver
 from gaponet.deploy.phases import COMMANDING, NEXT, ControlConfig, Phase
 from gaponet.deploy.publisher import sole_publisher
 from gaponet.deploy.recording import Recording
 from gaponet.deploy.safety import Limits, SafetyConfig
+from gaponet.deploy.targets.policy import play
 from gaponet.errors import LogError, UsageError
 from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec

@@ -25,12 +25,10 @@ from gaponet.deploy.publisher import sole_publisher
 from gaponet.deploy.recording import Event, Recording, Row
 from gaponet.deploy.safety import Limits, SafetyConfig, Watch, limit_command, limit_delta
 from gaponet.deploy.stop import Keys, StopRequest, on_signal
+from gaponet.deploy.targets.policy import NotYet, Policy
 from gaponet.errors import UsageError
 from gaponet.motion.minjerk import blend, move_time
-from gaponet.motion.motion import Motion
 from gaponet.robot import RobotSpec
-
-Policy = Callable[[int, State], Array | None]  # period since the start of the run, state → targets (n) rad; None: end
 
 
 class Compensates(Protocol):
@@ -47,12 +45,6 @@ HANG = 5.0  # control periods without a sign of life after which the guard proce
 FRESH = 5  # periods in a row without a fault before anything is commanded
 PATIENCE = 5.0  # s to wait for them
 PROMPT = 0.001  # s between the last look at the clock and a command's leaving that its limits allow for
-
-
-def play(motion: Motion, dt: float) -> Policy:
-    """A motion as a policy: row k in period k."""
-    rows = motion.sample(dt)
-    return lambda k, state: rows[k] if k < len(rows) else None
 
 
 class Controller:
@@ -243,6 +235,11 @@ class Controller:
             self._prepared, self._fresh = True, 0
             return
         first = policy(0, state)
+        if isinstance(first, Fault):
+            self._began = now  # all else is well
+            if not isinstance(first, NotYet):
+                self._fail(k, now, first)
+            return
         if first is None or not np.isfinite(first[self.joints]).all():
             self._fail(k, now, Fault("target", "the motion has no first target, or it is not a number"))
             return
@@ -301,15 +298,19 @@ class Controller:
         passed = (k - self._since) * self.dt
         if self.phase is Phase.BLEND_IN and passed >= self._blend_time + self.config.settle:
             self._enter(Phase.RUN, k, now, "", "motion")
+        asked = None
+        if self.phase in (Phase.BLEND_IN, Phase.RUN):
+            asked = policy(0 if self.phase is Phase.BLEND_IN else k - self._since, state)
+        if isinstance(asked, Fault):
+            self._fail(k, now, asked)
+            return None, 0.0
         if self.phase is Phase.BLEND_IN:
-            first = policy(0, state)
             share = float(blend(np.array(passed / self._blend_time)))
-            goal = self._found if first is None else first[self.joints]
+            goal = self._found if asked is None else asked[self.joints]
             return self._found + share * (goal - self._found), min(1.0, passed / self._blend_time)
         if self.phase is Phase.RUN:
-            target = policy(k - self._since, state)
-            if target is not None:
-                self._last = np.array(target[self.joints], float)
+            if asked is not None:
+                self._last = np.array(asked[self.joints], float)
                 return self._last, 1.0
             if not self.config.blend_out:
                 return self._end(k, now, "end of the motion")

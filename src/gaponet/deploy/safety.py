@@ -189,6 +189,7 @@ FAULTS = {
     "checksum": "too many messages with a wrong checksum",
     "torque": "no position command is within range, rate and torque",
     "target": "the motion or the model gave something that is not a number",
+    "silence": "no live target that could be taken for a while",
     "driver": "the bus failed",
     "robot": "the robot itself reports an error, or is not the one that was connected",
     "tilt": "the robot leans too far: it falls",

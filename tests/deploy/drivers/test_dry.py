@@ -7,12 +7,13 @@ from motion_files import write_motion
 
 from gaponet.cli.main import main
 from gaponet.deploy.clock import SimulatedClock
-from gaponet.deploy.controller import Controller, play
+from gaponet.deploy.controller import Controller
 from gaponet.deploy.drivers.dry import DryRun, would_send
 from gaponet.deploy.drivers.link import measure
 from gaponet.deploy.drivers.open import open_driver
 from gaponet.deploy.drivers.virtual import VirtualDriver
 from gaponet.deploy.phases import ControlConfig
+from gaponet.deploy.targets.policy import play
 from gaponet.motion.motion import Motion
 from gaponet.robot import load_robot
 from gaponet.virtual.fleet import load_fleet

@@ -55,6 +55,7 @@ def record(
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):
         recording, played, spec = perform(screen, name, request, count)
+        assert played
         known = Dataset.create(out, spec)
         slot = (played.name, unit_id, payload_mass, side)
         same = [e for e in known.entries if e.meta.slot == slot]

@@ -1,4 +1,4 @@
-"""`gaponet run`: play a motion on a robot, real or virtual, with or without a model."""
+"""`gaponet run`: play a motion, or live targets, on a robot, real or virtual, with or without a model."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.deploy.phases import ControlConfig
 from gaponet.deploy.safety import SafetyConfig
+from gaponet.deploy.targets.live import LiveConfig
 from gaponet.errors import UsageError
 
 if TYPE_CHECKING:
+    from gaponet.deploy.clock import Clock
     from gaponet.deploy.controller import Controller
     from gaponet.deploy.driver import Driver
     from gaponet.deploy.recording import Event, Recording
+    from gaponet.deploy.targets.live import LiveTargets, Wire
     from gaponet.motion.motion import Motion
     from gaponet.robot import RobotSpec
 
@@ -34,9 +37,9 @@ class Reach:
     joints: Literal["arms", "upper_body", "all"] = "arms"
     """unitree: what is commanded; the legs only with all, on lowcmd."""
     domain: int = 0
-    """unitree: DDS domain."""
+    """unitree, and targets over DDS: DDS domain."""
     interface: str = "lo"
-    """unitree: network interface to the robot; lo for a virtual one on this machine."""
+    """unitree, and targets over DDS: network interface to the robot; lo for a virtual one on this machine."""
     port: str = "/dev/ttyACM0"
     """so101: serial port."""
     calibration: Path | None = None
@@ -74,9 +77,26 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Request(Asked):
-    """The same, with a model between targets and commands."""
+class Live(LiveConfig):
+    """Targets that come while the robot moves."""
 
+    address: str = "tcp://127.0.0.1:5555"
+    """zmq: where to listen; 127.0.0.1 is heard from this machine alone."""
+    topic: str = "rt/joint_trajectory_controller/joint_trajectory"
+    """dds: of trajectory_msgs/JointTrajectory, as ROS 2 has it on the bus."""
+    states: str = "rt/joint_states"
+    """dds: of sensor_msgs/JointState, to which states go."""
+
+
+@dataclass(frozen=True)
+class Request(Asked):
+    """The same, with a model between targets and commands, and live targets."""
+
+    targets: Literal["zmq", "dds", "stdin"] | None = None
+    """Instead of a motion, targets that come while the robot moves: JSON over ZeroMQ or in lines on standard input, or
+    ROS 2's JointTrajectory over DDS. docs/deploy.md has the messages."""
+    live: Live = Live()
+    """Live targets: where they come from, and which are taken."""
     payload_mass: float | None = None
     """kg in each hand; with a model, None estimates it."""
     model: Path | None = None
@@ -93,15 +113,15 @@ class Request(Asked):
 
 @writes("recordings")
 def run(
-    motion: str,
+    motion: str | None = None,
     out: Path | None = None,
     asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
     json: Json = False,
 ) -> None:
-    """Play a motion on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
+    """Play a motion, or live targets, on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
 
     Args:
-        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz).
+        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
         out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npz.
         asked: Robot, loop and model.
     """
@@ -110,42 +130,79 @@ def run(
         raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
     recording, played, _ = perform(screen, motion, asked)
     if out:
-        screen.say(f"written: {recording.save(out, played.name).with_suffix('.*')}")
+        screen.say(f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}")
     screen.result(recording.summary() | tracking(recording))
     if recording.fault:
         sys.exit(3)
 
 
-def perform(screen: Out, motion_name: str, asked: Request, seed: int = 0) -> tuple[Recording, Motion, RobotSpec]:
-    """Make everything, ask, run, and say how it went; the seed is of a virtual robot's noise."""
+def perform(
+    screen: Out, motion_name: str | None, asked: Request, seed: int = 0
+) -> tuple[Recording, Motion | None, RobotSpec]:
+    """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
     from gaponet.deploy.clock import MonotonicClock, SimulatedClock
-    from gaponet.deploy.controller import Controller, play
+    from gaponet.deploy.controller import Controller
     from gaponet.deploy.drivers.dry import DryRun
+    from gaponet.deploy.targets.policy import play
 
+    if (motion_name is None) == (asked.targets is None):
+        raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
     spec = asked_robot(asked)
     fast = asked.reach.fast and asked.driver == "virtual"
+    if fast and asked.targets:
+        raise UsageError("live targets come in real time; leave out --fast")
     clock = SimulatedClock() if fast else MonotonicClock()
-    motion = find_motion(motion_name, asked, spec)
+    motion = None if motion_name is None else find_motion(motion_name, asked, spec)
     driver, facts = make_driver(asked, spec, clock, seed)
-    _require_commanded(motion, spec, driver)
+    if motion:
+        _require_commanded(motion, spec, driver)
     if asked.dry_run:
         driver = DryRun(driver)
     compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
+    live = None if motion else _listen(screen, asked, spec, driver, clock)
     controller = Controller(
         driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass,
-        on_event=lambda event: _tell(screen, event), motion=motion.name, payload_side=asked.payload_side,
-        model=str(asked.model) if asked.model else None, calibrated=calibrated,
+        on_event=lambda event: _tell(screen, event), motion=motion.name if motion else "live",
+        payload_side=asked.payload_side, model=str(asked.model) if asked.model else None, calibrated=calibrated,
         on_connect=lambda met: compensator.require_gains(met.joint_names, met.kp, met.kd) if compensator else None,
-        **facts,
+        **facts | ({"targets": live.counts} if live else {}),
     )  # fmt: skip
-    if asked.driver != "virtual" and not asked.yes and not asked.dry_run:
-        _ask(screen, driver, motion)
-    recording = controller.run(play(motion, controller.dt), keys=True)
+    try:
+        if asked.driver != "virtual" and not asked.yes and not asked.dry_run:
+            what = f"for {motion.duration:.1f} s ({motion.name})" if motion else f"as {asked.targets} says"
+            _ask(screen, driver, what)
+        recording = controller.run(play(motion, controller.dt) if motion else live, keys=True)  # type: ignore[arg-type]
+    finally:
+        if live:
+            events = controller.recording.events
+            live.close(events[-1].text if events else "nothing was commanded")
     if asked.dry_run:
         _report_dry(screen, recording, controller)
     else:
         _report(screen, recording)
     return recording, motion, spec
+
+
+def _listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
+    """The wire of live targets, open."""
+    from gaponet.deploy.targets.live import LiveTargets
+
+    wire: Wire
+    live = asked.live
+    if asked.targets == "zmq":
+        from gaponet.deploy.targets.zeromq import ZeroMQWire
+
+        wire = ZeroMQWire(live.address)
+    elif asked.targets == "dds":
+        from gaponet.deploy.targets.ros2 import ROS2Wire
+
+        wire = ROS2Wire(asked.reach.domain, asked.reach.interface, live.topic, live.states)
+    else:
+        from gaponet.deploy.targets.pipe import PipeWire
+
+        wire = PipeWire()
+    screen.say(f"targets are expected on {wire.address}")
+    return LiveTargets(wire, robot, driver.commanded, clock, 1.0 / asked.control.rate, asked.safety.speed, live)
 
 
 def asked_robot(asked: Request) -> RobotSpec:
@@ -249,11 +306,10 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
     return compensator, unit if unit in known else None
 
 
-def _ask(screen: Out, driver: Driver, motion: Motion) -> None:
+def _ask(screen: Out, driver: Driver, what: str) -> None:
     screen.say(
-        f" will move {len(driver.commanded)} joints for {motion.duration:.1f} s "
-        f"({motion.name}). Is the space around it free, and a hand on its own emergency stop? "
-        "Enter to start, Ctrl-C to leave.",
+        f" will move {len(driver.commanded)} joints {what}. Is the space around it free, and a hand on its own "
+        "emergency stop? Enter to start, Ctrl-C to leave.",
         driver.address,
     )
     if not sys.stdin.isatty():

@@ -35,7 +35,7 @@ except ImportError:
     raise DriverError("cyclonedds is not installed; run: pip install 'gaponet[dds]'") from None
 
 QUEUE = 64  # messages kept for us between two reads: 128 ms at 500 Hz
-
+LARGEST = 64  # KiB of a message that is put together from its parts
 
 KINDS = {"<f4": float32, "<i2": int16, "<u4": uint32, "u1": byte}
 
@@ -88,7 +88,8 @@ class Bus:
         config = (
             f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"/></Interfaces>'
             f"<AllowMulticast>{str(not lonely).lower()}</AllowMulticast></General>"
-            f"<Discovery>{discovery if lonely else ''}</Discovery></Domain></CycloneDDS>"
+            f"<Discovery>{discovery if lonely else ''}</Discovery>"
+            f"<Internal><MaxSampleSize>{LARGEST} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
         )
         try:
             self._domain = (
@@ -103,9 +104,9 @@ class Bus:
         """A writer as Unitree's SDK makes it: reliable, the newest sample only."""
         return DataWriter(self._participant, self._topic(topic, kind))
 
-    def reader(self, topic: str, kind: type[IdlStruct]) -> DataReader:
-        """A reader that keeps what came since the last look."""
-        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(QUEUE))
+    def reader(self, topic: str, kind: type[IdlStruct], keep: int = QUEUE) -> DataReader:
+        """A reader that keeps the newest that came since the last look."""
+        qos = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(keep))
         return DataReader(self._participant, self._topic(topic, kind), qos)
 
     def _topic(self, name: str, kind: type[IdlStruct]) -> Topic:
@@ -140,23 +141,27 @@ def _program(qos: Qos) -> str:
 _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
 
 
-def send(writer: DataWriter, kind: type[IdlStruct], data: Array) -> None:
+def send(writer: DataWriter, kind: type[IdlStruct], data: Array | bytes) -> None:
     """Publish one message."""
     sample = kind.__new__(kind)
-    sample.data = data.tobytes()
+    sample.data = bytes(data)
     try:
         writer.write(sample)
     except DDSException as error:
         raise DriverError(f"DDS refused a message: {error}") from None
 
 
-def receive(reader: DataReader) -> list[Array]:
-    """All messages since the last call, oldest first, as bytes."""
+def samples(reader: DataReader, most: int = QUEUE) -> list[Any]:
+    """All messages since the last call, oldest first, each with bytes (`.data`) and source (`.sample_info`)."""
     try:
-        samples = reader.take(N=QUEUE)
+        return [sample for sample in reader.take(N=most) if hasattr(sample, "data")]
     except DDSException as error:
         raise DriverError(f"DDS does not give messages: {error}") from None
-    return [np.frombuffer(s.data, np.uint8) for s in samples if hasattr(s, "data")]
+
+
+def receive(reader: DataReader) -> list[Array]:
+    """All messages since the last call, oldest first, as bytes."""
+    return [np.frombuffer(s.data, np.uint8) for s in samples(reader)]
 
 
 def _interfaces() -> list[str]:
