@@ -70,6 +70,7 @@ def main(folder: str, given: str, out: str) -> None:
     start = torch.from_numpy(data["start"]).float()
     env = environment(folder, targets.shape[1], start[0], names)
     env.reset()
+    simulated = fields(env)  # a servo's law changes them from step to step
     term, robot = env.action_manager.get_term("joint_pos"), env.scene["robot"]
     asked = [names.index(name) for name in term.target_names]
     order = [list(robot.joint_names).index(name) for name in names]
@@ -81,7 +82,7 @@ def main(folder: str, given: str, out: str) -> None:
         env.step(target[:, asked])
         qpos.append(robot.data.joint_pos[:, order].clone())
         sent.append(robot.data.joint_pos_target[:, order].clone())
-    np.savez(out, qpos=torch.stack(qpos), sent=torch.stack(sent), **fields(env))
+    np.savez(out, qpos=torch.stack(qpos), sent=torch.stack(sent), **simulated)
 
 
 if __name__ == "__main__":

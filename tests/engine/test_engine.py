@@ -13,17 +13,26 @@ from arm import write_arm
 from runs import random_run
 
 from gaponet.cli.main import main
-from gaponet.engine.action_term import AlignedAction, Aligner, LateServos, isaaclab_actuators, read_facts, require_scene
-from gaponet.engine.facts import mjcf_text
-from gaponet.engine.folder import export_model, export_simulator
+from gaponet.engine.action_term import (
+    AlignedAction,
+    Aligner,
+    LateServos,
+    ServoLaw,
+    isaaclab_actuators,
+    read_facts,
+    require_scene,
+)
+from gaponet.engine.facts import mjcf_text, simulator_facts
+from gaponet.engine.folder import export_model
 from gaponet.engine.program import program
 from gaponet.engine.step import delta_step, largest_difference
 from gaponet.engine.torchscript import export_torchscript
 from gaponet.errors import ModelError
 from gaponet.identity import lines
-from gaponet.robot import load_robot
+from gaponet.robot import LAW, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
+from gaponet.sim.servo import friction_limit, servo_torque
 
 LATE = {"shoulder": {"delay": 0.007, "offset": 0.02, "zero": 0.01}, "elbow": {"delay": 0.013, "stop_low": -1.2}}
 
@@ -231,13 +240,26 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
         other.align(None, slice(None), ["shoulder", "elbow"])
 
 
-def test_servos_with_a_law_of_their_own_are_refused_where_there_is_none(tmp_path):
-    robot = write_arm(tmp_path / "arm").with_servos({"elbow": {"friction_external": 0.1}})
-    export_simulator(robot, tmp_path / "out")
-    term = Term()
-    term.folder = tmp_path / "out"
-    with pytest.raises(ValueError, match=r"own law \(friction_external\) this engine does not have"):
-        term.align(None, slice(None), ["shoulder", "elbow"])
+def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
+    rng, law = np.random.default_rng(0), dict(zip(LAW, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02), strict=True))
+    robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
+    scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
+    q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
+    seen = {"qpos": q, "qvel": v, "actuator_force": torque, "qfrc_bias": load}
+    model = SimpleNamespace(dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10))
+    data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
+    sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
+    sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
+    found = ServoLaw(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
+    entity.update(0.005)
+    found.before(torch.tensor(ctrl).float())
+    terms, kp = {name: getattr(robot, name) for name in LAW}, robot.kp
+    friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
+    np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
+    asked = servo_torque(terms, kp, ctrl + robot.offset, q)
+    np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
+    found.begin(torch.ones(20, dtype=torch.bool))
+    np.testing.assert_allclose(found.torque, np.tile(kp * robot.offset, (20, 1)), atol=1e-6)
 
 
 def test_isaac_labs_servos_are_late_by_whole_physics_steps(place, monkeypatch):

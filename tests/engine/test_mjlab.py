@@ -100,13 +100,14 @@ def test_a_trained_model_moves_mjlab_as_it_moves_alignedsim(python, tmp_path):
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
     recipe = ["--robot", "h1_2", "--fleet", "easy", "--recipe", "demo", "--units", "virtual-1", "--nproc", "1"]
     assert main(["collect", "--out", data, *recipe]) == 0
-    assert main(["train", data, "--out", run, "--budget", "2m"]) == 0
+    assert main(["train", data, "--out", run, "--budget", "3m"]) == 0
     model = GapModel.load(run)
-    compare(python, model, 2.0, tmp_path, "H1-2, trained for 2 minutes, 2 kg per hand")
+    compare(python, model, 2.0, tmp_path, "H1-2, trained for 3 minutes, 2 kg per hand")
 
 
 def test_identified_servos_move_in_mjlab_as_here(python, tmp_path):
     robot = load_robot("so101")
-    found = {j: {"delay": 0.006 * i, "offset": 0.01 * i, "zero": -0.01 * i} for i, j in enumerate(robot.operated, 1)}
+    law = {"stribeck": 0.03, "stribeck_speed": 0.05, "friction_motor": 0.08, "friction_external": 0.15}
+    found = {j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)}
     model = random_run(tmp_path / "run", robot.with_servos(found))
-    compare(python, model, 0.0, tmp_path, "SO-101 with servos late by 6 to 30 ms, random network")
+    compare(python, model, 0.0, tmp_path, "SO-101, servos late by 6 to 30 ms with a law of friction, random network")

@@ -81,7 +81,7 @@ def _mjcf(screen: Out, holder: Path, folder: Path, payload_mass: float) -> None:
 
     robot = load_robot(holder / KEPT if keeps_robot(holder) else holder)
     export_simulator(robot, folder, payload_mass=payload_mass)
-    lost = "; friction at rest or by load, least torque and encoder steps are in no MJCF" if robot.has_law else ""
+    lost = "; what servos do beyond PD is in no MJCF, but in facts.json" if robot.has_law else ""
     screen.say(f"{folder}: robot.xml and facts.json of {robot.name}{lost}")
     screen.result({"path": str(folder), "to": "mjcf", "robot": robot.name, "law_lost": robot.has_law})
 

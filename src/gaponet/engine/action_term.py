@@ -8,8 +8,8 @@ mjlab:      cfg.scene.entities["robot"] = mjlab_entity(FOLDER)
 Isaac Lab:  cfg.scene.robot.actuators = isaaclab_actuators(FOLDER)
             cfg.actions.joint_pos = isaaclab_action(FOLDER, asset_name="robot", joint_names=[".*"])
 
-Both call process_actions once per control period, with the state of that moment: what the policy asks for becomes what
-makes the simulator move like the robot. Options are those of JointPositionActionCfg.
+Both call process_actions once per control period: what the policy asks for becomes what makes the simulator move like
+the robot. Options are those of JointPositionActionCfg.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ FIELDS = (
     "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp", "jnt_range", "jnt_stiffness",
     "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_delay", "actuator_history",
 )  # fmt: skip
+LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 OPTIONS = (
     "timestep", "gravity", "impratio", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "ccd_iterations",
     "noslip_iterations", "density", "viscosity", "wind",
@@ -108,16 +109,10 @@ class AlignedAction:
     payload_mass: float | None
     _processed_actions: Tensor
 
-    def align(self, entity: Any, ids: Any, names: list[str], check: bool = True, offset: float = 0.0) -> None:
+    def align(self, entity: Any, ids: Any, names: list[str], offset: float = 0.0) -> None:
         """Begin; offset: share of the servos' own offsets that the engine's actuators do not have."""
         me: Any = self
         facts = read_facts(self.folder)
-        if facts["law"] and check:
-            law = ", ".join(facts["law"])
-            raise ValueError(
-                f"{self.folder}: was trained with servos whose own law ({law}) this engine does not have; "
-                "train on a robot without it (gaponet identify --terms), or check=False"
-            )
         dt = me._env.step_dt
         if abs(dt / facts["dt"] - 1) > 0.02:
             raise ValueError(f"{self.folder}: a control period is {facts['dt']} s, here it is {dt} s")
@@ -152,14 +147,21 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
         def __init__(self, cfg: Any, env: Any) -> None:
             super().__init__(cfg, env)
             self.folder, self.payload_mass = Path(folder), payload_mass
-            self.align(self._entity, self._target_ids, self._target_names, check)
+            self.align(self._entity, self._target_ids, self._target_names)
             if check:
                 require_scene(env.sim.mj_model, f"{cfg.entity_name}/", self.folder)
-            self.late = LateServos(env.sim, cfg.entity_name, list(self._target_names))
+            names = list(self._target_names)
+            self.late = LateServos(env.sim, cfg.entity_name, names)
+            self.law = ServoLaw(env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder))
             hold_friction(env.sim, cfg.entity_name, self.folder)
 
         def begin(self, qpos: Tensor) -> None:
             self.late.begin(self.aligner.past.fresh, qpos)
+            self.law.begin(self.aligner.past.fresh)
+
+        def apply_actions(self) -> None:
+            super().apply_actions()
+            self.law.before(self._processed_actions - self._entity.data.encoder_bias[:, self._target_ids])
 
     class Cfg(JointPositionActionCfg):
         def build(self, env: Any) -> Any:
@@ -176,8 +178,8 @@ def mjlab_entity(folder: str | Path, **options: Any) -> Any:
 
     home = {name: joint["home"] for name, joint in read_facts(folder)["joints"].items()}
     servos = EntityArticulationInfoCfg(actuators=(XmlActuatorCfg(target_names_expr=(".*",), command_field="position"),))
-    defaults = {"articulation": servos, "init_state": EntityCfg.InitialStateCfg(joint_pos=home)}
-    return EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(Path(folder) / ROBOT)), **defaults | options)
+    own = {"articulation": servos, "init_state": EntityCfg.InitialStateCfg(joint_pos=home)} | options
+    return EntityCfg(spec_fn=lambda: mujoco.MjSpec.from_file(str(Path(folder) / ROBOT)), **own)
 
 
 def mjlab_options(folder: str | Path) -> tuple[Any, int]:
@@ -247,11 +249,10 @@ def solver_options(model: Any) -> dict[str, Any]:
 
 def hold_friction(sim: Any, entity: str, folder: str | Path) -> None:
     """Make joint friction hold as in training, which no MJCF can say; again after events that recompute constants."""
-    facts, field = read_facts(folder), sim.model.dof_invweight0
-    factor = facts["dof_invweight0_factor"]
+    facts = read_facts(folder)
     for name in facts["joints"]:
         dof = sim.mj_model.joint(f"{entity}/{name}").dofadr[0]
-        field[:, dof] = float(sim.mj_model.dof_invweight0[dof]) * factor
+        sim.model.dof_invweight0[:, dof] = float(sim.mj_model.dof_invweight0[dof]) * facts["dof_invweight0_factor"]
 
 
 class LateServos:
@@ -273,9 +274,7 @@ class LateServos:
             self.base[times] = -model.opt.timestep * torch.arange(count, 0, -1)
             self.source[values] = column
         self.any = bool(self.mine.any())
-        for name, value in vars(self).copy().items():
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(sim.device))
+        vars(self).update({k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)})
 
     def begin(self, fresh: Tensor, qpos: Tensor) -> None:
         """The command under way in fresh worlds is to stay at qpos, (num_envs, names) rad."""
@@ -283,6 +282,50 @@ class LateServos:
             history, time = self.sim.data.history, self.sim.data.time
             begun = self.base + self.timed * time[:, None] + self.held * qpos[:, self.source]
             history[:] = torch.where(fresh[:, None] & self.mine, begun, history[:])
+
+
+class ServoLaw:
+    """What servos do beyond PD, before every physics step: gaponet's sim/servo.py in torch."""
+
+    def __init__(self, sim: Any, entity: Any, name: str, joints: list[str], facts: dict[str, Any]) -> None:
+        self.sim, self.any, model, of = sim, bool(facts["law"]), sim.mj_model, facts["joints"]
+        if not self.any:
+            return
+        sim.expand_model_fields(("dof_frictionloss", "actuator_biasprm"))
+        self.dof = torch.tensor([model.joint(f"{name}/{j}").dofadr[0] for j in joints], device=sim.device)
+        self.at = torch.tensor([model.joint(f"{name}/{j}").qposadr[0] for j in joints], device=sim.device)
+        self.servo = torch.tensor([model.actuator(f"{name}/{j}").id for j in joints], device=sim.device)
+        fields = ("kp", "offset", "frictionloss", *LAW)
+        self.law = law = {f: torch.tensor([of[j][f] for j in joints], device=sim.device) for f in fields}
+        self.kp, self.bias = law["kp"], law["kp"] * law["offset"]
+        self.torque = torch.zeros(sim.num_envs, len(joints), device=sim.device)
+        self.load, update = torch.zeros_like(self.torque), entity.update
+
+        def updated(dt: float) -> None:  # after each physics step, before forward() renews what it was
+            update(dt)
+            self.torque, self.load = sim.data.actuator_force[:, self.servo], sim.data.qfrc_bias[:, self.dof]
+
+        entity.update = updated
+
+    def begin(self, fresh: Tensor) -> None:
+        """Fresh worlds stand where they are."""
+        if self.any:
+            self.torque = torch.where(fresh[:, None], self.bias, self.torque)
+            self.load = torch.where(fresh[:, None], self.sim.data.qfrc_bias[:, self.dof], self.load)
+
+    def before(self, ctrl: Tensor) -> None:
+        """Set friction and bias for the next physics step, under targets (num_envs, joints) rad."""
+        if not self.any:
+            return
+        law, q, v = self.law, self.sim.data.qpos[:, self.at], self.sim.data.qvel[:, self.dof]
+        limit = law["frictionloss"] + (law["friction_motor"] * self.torque + law["friction_external"] * self.load).abs()
+        limit = limit + law["stribeck"] * torch.exp(-v.abs() / law["stribeck_speed"].clamp(min=1e-3))
+        self.sim.model.dof_frictionloss[:, self.dof] = limit
+        step, fine, least = law["encoder_step"], law["encoder_step"].clamp(min=1e-9), law["min_torque"]
+        torque = self.kp * (ctrl + self.bias / self.kp - torch.where(step > 0, (q / fine).round() * fine, q))
+        pushed = torch.copysign(torch.maximum(torque.abs(), least), torque) * (torque.abs() > 0.5 * step * self.kp)
+        torque = torch.where((least > 0).any(), pushed, torque)
+        self.sim.model.actuator_biasprm[:, self.servo, 0] = torque - self.kp * (ctrl - q)
 
 
 # ---- Isaac Lab; written against its published source (3.0), never run
@@ -297,7 +340,11 @@ def isaaclab_action(folder: str | Path, payload_mass: float | None = None, check
         def __init__(self, cfg: Any, env: Any) -> None:
             super().__init__(cfg, env)
             self.folder, self.payload_mass = Path(folder), payload_mass
-            self.align(self._asset, self._joint_ids, self._joint_names, check, offset=1.0)
+            if check and (law := read_facts(folder)["law"]):
+                raise ValueError(
+                    f"{folder}: trained with servos whose law ({', '.join(law)}) is not here; or check=False"
+                )
+            self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0)
 
     return JointPositionActionCfg(**{"class_type": Term, "use_default_offset": False} | options)
 

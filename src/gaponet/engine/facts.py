@@ -25,7 +25,7 @@ MEANING = {
     "offset": "the servo aims at command + offset",
     "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",
     "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, so that friction holds; no MJCF can say it",
-    "law": "what servos do beyond PD, by joint; in no MJCF",
+    "law": "what servos do beyond PD, by joint; in no MJCF, but the action term has it in mjlab",
     "mujoco": "fields of the compiled MjModel by their names",
 }
 
@@ -59,6 +59,8 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
     option = root.find("option")
     assert option is not None
     put(option, timestep=model.opt.timestep)
+    for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
+        put(pair, **{name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")})
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):
         name, bias = model.actuator(i).name, model.actuator_biasprm[i]
