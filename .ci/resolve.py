@@ -1,7 +1,7 @@
 """Whether gaponet with its extras can be installed beside the tools its users have: uv resolves, nothing is installed.
 
 A cell is a platform and a Python version: the newest versions that suit both; "not offered" where the other tool cannot
-be resolved by itself; "without X" where that extra has no wheel. Exit code 1 where anything but KNOWN is missing.
+be resolved by itself; "without X" where that extra has no wheel. Exit code 1 where anything else is missing.
 Needs the package index: make resolve
 """
 
@@ -26,15 +26,18 @@ PLATFORMS = {
 }
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 SHOWN = ("torch", "mujoco")
-# cyclonedds 11.0.1 has no wheel there; docs/install.md says how to build one.
 UNTIL = {"mjlab": "3.13"}  # an upper bound of Requires-Python, at which uv does not look
-KNOWN = {(*place, "dds") for place in product(PLATFORMS, PYTHONS) if "Linux aarch64" in place or "3.14" in place}
 
 
 def extras() -> list[str]:
     """Those for users."""
     known = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     return sorted(set(known) - {"dev", "docs"})
+
+
+def missing(name: str, where: str, python: str) -> list[str]:
+    """Extras that are known not to go: cyclonedds has no wheel (docs/install.md), mujoco-warp is MuJoCo 4's."""
+    return ["dds"] * (where == "Linux aarch64" or python == "3.14") + ["warp"] * (name in ("mjlab", "Isaac Lab"))
 
 
 def resolve(wanted: list[str], beside: str, where: str, python: str) -> dict[str, str] | None:
@@ -54,7 +57,7 @@ def resolve(wanted: list[str], beside: str, where: str, python: str) -> dict[str
 def cell(name: str, where: str, python: str) -> tuple[str, list[str]]:
     """What stands in the table, and what is missing though it should not be."""
     beside = BESIDE[name]
-    known = [extra for extra in extras() if (where, python, extra) in KNOWN]
+    known = missing(name, where, python)
     found = resolve([extra for extra in extras() if extra not in known], beside, where, python)
     if python > UNTIL.get(name, python) or (found is None and beside and resolve([], beside, where, python) is None):
         return "not offered", []

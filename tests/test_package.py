@@ -16,6 +16,14 @@ def test_the_version_is_one():
     assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
+def test_the_page_on_installing_names_every_extra():
+    page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`.+?) \|", page, re.MULTILINE)
+    assert sorted(re.findall(r"`([a-z0-9]+)`", " ".join(rows))) == sorted(
+        set(PROJECT["optional-dependencies"]) - {"dev", "docs"}
+    )
+
+
 def test_hosted_workflows_call_what_is_here():
     """A command of a workflow is .ci/run, a make target that the Makefile has, or one of these few words."""
     targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
