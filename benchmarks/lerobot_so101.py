@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -25,6 +26,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import tyro
 
+from gaponet.robot import load_robot
+
 GAPONET = [sys.executable, "-m", "gaponet"]
 LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
 
@@ -36,6 +39,7 @@ def main(
     fps: int = 25,
     unit: str = "1",
     windows: int = 12,
+    terms: tuple[str, ...] = (),
     budget: str = "10m",
 ) -> None:
     """Print errors as JSON, rad.
@@ -47,6 +51,7 @@ def main(
         fps: LeRobot's rate, Hz.
         unit: Of the fleet `hard`.
         windows: Of identification.
+        terms: Of the servo's law that it tries beside gains, damping, friction, delay and offset.
         budget: Of training.
     """
     work = work.resolve()
@@ -64,10 +69,10 @@ def main(
         sets = work / "lerobot" / "me"
         record(sets / "excitation", work, fps, str(excitation), round(2 * minutes), 30.0)
         if not (data / "dataset.json").is_file():
-            words = ["--position-unit", "deg", "--kp", "8.9", "--unit-id", f"virtual-{unit}", "--payload-mass", "0"]
-            call("import", sets / "excitation", "--robot", "so101", *words, "--out", data)
+            words = ["--position-unit", "deg", "--unit-id", f"virtual-{unit}", "--payload-mass", "0"]
+            call("import", sets / "excitation", "--robot", softer(work / "so101_p16"), *words, "--out", data)
         if not (arm / "robot.toml").is_file():
-            call("identify", data, "--out", arm, "--windows", windows)
+            call("identify", data, "--out", arm, "--windows", windows, "--no-table", "--terms", *terms)
         if not (run / "model" / "card.json").is_file():
             call("train", data, "--robot", arm, "--out", run, "--budget", budget)
         if not out.is_dir():
@@ -96,6 +101,15 @@ def wait_longer() -> None:
         self.packet_timeout += 10_000
 
     feetech.patch_setPacketTimeout = patient
+
+
+def softer(folder: Path) -> Path:
+    """The packaged robot with the P of 16 that LeRobot writes into the servos, instead of 32."""
+    if not folder.is_dir():
+        shutil.copytree(load_robot("so101").folder, folder)
+        toml = (folder / "robot.toml").read_text(encoding="utf-8")
+        (folder / "robot.toml").write_text(toml.replace("kp = 17.8", "kp = 8.9"), encoding="utf-8")
+    return folder
 
 
 def count_frames() -> None:

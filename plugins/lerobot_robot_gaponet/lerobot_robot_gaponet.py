@@ -118,6 +118,7 @@ class GaponetSO101(Robot):
                 break
             except (DriverError, StopIteration):
                 if self._process.poll() is not None or time.monotonic() - began > START:
+                    self._remote.close(end=False)
                     self._leave()
                     raise DeviceNotConnectedError(f"gaponet run: {said.read_text(errors='replace').strip()}") from None
         self._remote.patience = 5.0
