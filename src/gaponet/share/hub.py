@@ -45,8 +45,8 @@ class Hub:
             try:
                 with self._reaching(RepositoryNotFoundError):
                     info = self.api.repo_info(self.repo, repo_type=wanted, revision=self.revision)
-                    place = {"repo_type": wanted, "revision": info.sha}
-                    listed = islice(self.api.list_repo_tree(self.repo, recursive=True, **place), MOST)
+                    tree = self.api.list_repo_tree(self.repo, recursive=True, repo_type=wanted, revision=info.sha)
+                    listed = islice(tree, MOST)
                     sizes = {entry.path: entry.size for entry in listed if hasattr(entry, "size")}
             except RepositoryNotFoundError:
                 continue
