@@ -2,6 +2,7 @@
 
 import io
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,12 @@ from motion_files import write_motion
 from runs import untrained
 
 from gaponet.cli.main import main
+from gaponet.cli.out import Out
+from gaponet.cli.robots.run import Live, Reach, Request, listen
 from gaponet.data.store import Dataset
+from gaponet.deploy.clock import SimulatedClock
+from gaponet.deploy.driver import State
+from gaponet.deploy.targets.policy import NotYet
 from gaponet.motion.motion import Motion
 
 FAST = ["--fast", "--yes", "--json", "--blend", "0.2", "--blend-speed", "4", "--settle", "0.1", "--damp", "0.1"]
@@ -84,3 +90,28 @@ def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(arm, motio
         assert json.loads(capsys.readouterr().out)["robot"] == arm.name
         assert main([*words, "--robot", str(tmp_path / "stiffer")]) == 2
         assert "another robot, or other gains or inertias" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_motion_or_live_targets_and_not_faster_than_time(arm, motion, capsys, monkeypatch):
+    robot = ["--robot", str(arm.mjcf.parent)]
+    for words in ([], ["--motion", motion, "--targets", "zmq"]):
+        assert main(["run", *robot, *words]) == 2
+        assert "give either --motion, what to play, or --targets" in " ".join(capsys.readouterr().err.split())
+    assert main(["run", *robot, "--targets", "zmq", "--fast"]) == 2
+    assert "live targets come in real time" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    assert main(["run", *robot, "--targets", "stdin"]) == 2
+    assert "PROGRAM | gaponet run --targets stdin" in " ".join(capsys.readouterr().err.split())
+    assert main(["run", *robot, "--targets", "zmq", "--live.hold", "-1"]) == 2
+    assert "hold is -1.0 s; give a positive number" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("kind", "needs"), [("zmq", "zmq"), ("dds", "cyclonedds")])
+def test_live_targets_are_listened_for_where_it_says(arm, kind, needs, tmp_path):
+    pytest.importorskip(needs)
+    asked = Request(targets=kind, live=Live(address=f"ipc://{tmp_path}/targets"), reach=Reach(domain=29))
+    targets = listen(Out(False), asked, arm, SimpleNamespace(commanded=arm.joint_names), SimulatedClock())
+    said = targets(0, State(0.0, *np.zeros((4, 2))))
+    assert isinstance(said, NotYet)
+    assert targets.wire.address in said.text
+    targets.close("over")

@@ -159,7 +159,7 @@ def perform(
     if asked.dry_run:
         driver = DryRun(driver)
     compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
-    live = None if motion else _listen(screen, asked, spec, driver, clock)
+    live = None if motion else listen(screen, asked, spec, driver, clock)
     controller = Controller(
         driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass,
         on_event=lambda event: _tell(screen, event), motion=motion.name if motion else "live",
@@ -183,7 +183,7 @@ def perform(
     return recording, motion, spec
 
 
-def _listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
+def listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
     """The wire of live targets, open."""
     from gaponet.deploy.targets.live import LiveTargets
 
