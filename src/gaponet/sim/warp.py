@@ -43,6 +43,7 @@ class Worlds:
                 raise UsageError(f"{sim.robot.name}: mujoco_warp refuses it ({error}); use --device cpu") from None
             self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
             self.model.opt.timestep = warp.array(timestep, dtype=float)
+            self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
