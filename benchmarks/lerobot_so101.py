@@ -29,6 +29,7 @@ import tyro
 from gaponet.robot import load_robot
 
 GAPONET = [sys.executable, "-m", "gaponet"]
+WAYS: dict[str, dict[str, bool] | None] = {"uncorrected": None, "corrected": {}, "dynamics": {"dynamics": True}}
 LEAD = 5.0  # s of a test motion that are not judged: the way to its start, and the correction's blending in
 
 
@@ -79,14 +80,15 @@ def main(
             call("data", "export", data, "--out", out, "--to", "lerobot")
         errors = {}
         for motion in motions:
-            for how, model in (("uncorrected", None), ("corrected", run)):
-                record(sets / f"{motion}-{how}", work, fps, motion, 1, LEAD + 8.0, model)
+            for how, given in WAYS.items():
+                step = {"model": str(run), **given} if given is not None else None
+                record(sets / f"{motion}-{how}", work, fps, motion, 1, LEAD + 8.0, step)
                 errors[f"{motion} {how}"] = error(sets / f"{motion}-{how}", fps)
-    ratios = [errors[f"{m} corrected"] / errors[f"{m} uncorrected"] for m in motions]
+    ratios = {how: [errors[f"{motion} {how}"] / errors[f"{motion} uncorrected"] for motion in motions] for how in WAYS}
     nominal = json.loads(call("gap", data, "--json"))["methods"]["nominal"]["mpjae"]
     print(json.dumps({
         "virtual": True, "unit": unit, "fps": fps, "gap_rad": nominal, "opened_by_lerobot": opened(out),
-        "error_rad": errors, "ratio": {"mean": float(np.mean(ratios)), "each": ratios},
+        "error_rad": errors, "ratio": ratios, "mean": {how: float(np.mean(each)) for how, each in ratios.items()},
     }, indent=1))  # fmt: skip
 
 
@@ -149,9 +151,9 @@ def served(unit: str, fps: int, work: Path) -> Iterator[None]:
 
 
 def record(
-    out: Path, work: Path, fps: int, motions: str, episodes: int, seconds: float, model: Path | None = None
+    out: Path, work: Path, fps: int, motions: str, episodes: int, seconds: float, step: dict[str, object] | None = None
 ) -> None:
-    """LeRobot's record() with its own SO-101 and our motions, through the processor step where there is a model."""
+    """LeRobot's record() with its own SO-101 and our motions, through the processor step where it is configured."""
     if (out / "meta" / "stats.json").is_file():
         return
     from lerobot.configs.dataset import DatasetRecordConfig
@@ -162,7 +164,7 @@ def record(
     from lerobot.scripts.lerobot_record import record as play
     from lerobot.teleoperators import TeleoperatorConfig
 
-    steps = [ProcessorStepRegistry.get("gaponet_correct")(model=str(model))] if model else []
+    steps = [ProcessorStepRegistry.get("gaponet_correct")(**step)] if step else []
     processor = RobotProcessorPipeline(
         steps=steps, to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
     )

@@ -268,16 +268,17 @@ class GaponetCorrect(ProcessorStep):
 
     model: str = ""
     payload_mass: float = 0.0
+    dynamics: bool = False  # feed forward what moving asks for: for planned, smooth targets alone
 
     def __post_init__(self) -> None:
-        from gaponet.deploy.compensator import Compensator
+        from gaponet.deploy.compensator import Compensator, CompensatorConfig
         from gaponet.deploy.safety import Limits, SafetyConfig, limit_delta
         from gaponet.model.artifact import GapModel
 
         network = GapModel.load(self.model)
         self.spec = network.simulator()
         self.units, self.dt = Units(self.spec), network.card["dt"][0]
-        self.compensator = Compensator(self.spec, network, dt=self.dt)
+        self.compensator = Compensator(self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt)
         self.limits = Limits.of(self.spec, self.spec.joint_names, SafetyConfig())
         self._bounded = limit_delta
         self.reset()
@@ -312,7 +313,7 @@ class GaponetCorrect(ProcessorStep):
         return np.clip(target + self._delta, self.limits.low, self.limits.high)
 
     def get_config(self) -> dict[str, Any]:
-        return {"model": self.model, "payload_mass": self.payload_mass}
+        return {"model": self.model, "payload_mass": self.payload_mass, "dynamics": self.dynamics}
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
         return features
