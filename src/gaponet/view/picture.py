@@ -95,7 +95,7 @@ class Camera:
         """Orthographic, so that every copy is seen from the same side."""
         scene, layout = self.scene, self.layout
         lens = mujoco.MjvCamera()
-        lens.orthographic = 1
+        lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 looks at the model alone
         lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
         lens.lookat[:] = scene.middle
         lens.distance = 4 * scene.extent
