@@ -42,7 +42,7 @@ def export_program(model: GapModel, run: Path, folder: Path) -> float:
 
 def program(step: DeltaStep) -> torch.export.ExportedProgram:
     """Any number of worlds, B ≥ 1."""
-    worlds = torch.export.Dim("worlds", min=1)
+    worlds = torch.export.Dim("worlds", min=1, max=2**31)  # torch 2.7 asks for an end
     rows = [torch.zeros(2, step.n) for _ in range(3)]
     past = [torch.zeros(2, step.depth, 3 * step.n), torch.ones(2, dtype=torch.bool)]
     with torch.no_grad():
