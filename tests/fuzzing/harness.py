@@ -27,6 +27,7 @@ from fuzzing.mutate import Files, mutate
 from gaponet.errors import GAPONetError
 
 HANG_S = 5.0
+PATIENCE = 12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too
 MEMORY = 2 << 30  # bytes
 RENEW = 4000  # mutants after which a worker is replaced: what it leaked is no mutant's fault
 
@@ -145,8 +146,8 @@ class _Crew:
             self._start()
         found = []
         if not self.pipe.poll(0.2):
-            if time.monotonic() - self.since > 4 * HANG_S and self.begun:  # on a machine that others use too
-                found.append(self._lost("hang", f"no answer after {4 * HANG_S:g} s", counts))
+            if time.monotonic() - self.since > PATIENCE * HANG_S and self.begun:
+                found.append(self._lost("hang", f"no answer after {PATIENCE * HANG_S:g} s", counts))
             return found
         try:
             while self.busy and self.process and self.pipe.poll(0):
