@@ -70,7 +70,7 @@ def test_the_table_holds_spread_ratio_and_the_paper_s_range(make_study, make_fou
 
 @pytest.mark.parametrize(
     ("with_it", "without", "verdict"),
-    [((0.0030, 0.0031), (0.0040, 0.0041), "disagrees"), ((0.0040, 0.0041), (0.0030, 0.0031), "agrees"),
+    [((0.0030, 0.0031), (0.0040, 0.0041), "finds 25 % less"), ((0.0040, 0.0041), (0.0030, 0.0031), "finds 33 % more"),
      ((0.003, 0.005), (0.003, 0.0051), "finds no difference")],
 )  # fmt: skip
 def test_where_the_paper_is_contradicted_the_sentence_says_so(make_study, make_found, with_it, without, verdict):

@@ -210,7 +210,7 @@ def _against_paper(lines: list[Setting], seeds: Seeds) -> list[str]:
         if abs(change.mean - 1) <= 2 * change.error:
             verdict = "finds no difference beyond the seeds'"
         else:
-            verdict = "agrees" if change.mean > 1 else "disagrees"
+            verdict = f"finds {abs(100 * (change.mean - 1)):.0f} % {'more' if change.mean > 1 else 'less'}"
         out.append(
             f"{other.factor}: the paper has {100 * min(more):.0f} to {100 * max(more):.0f} % more error with "
             f"'{other.setting}' than with '{own.setting}'; this run {verdict} "
