@@ -20,31 +20,31 @@ Array = np.ndarray
 
 
 class OneByOne:
-    """The part of mujoco.batch.Batch that gaponet uses, where MuJoCo has none: one MjData after another, slower.
+    """The part of mujoco.batch.Batch that gaponet uses, where MuJoCo has none: one simulation after another, slower.
 
-    Bound fields are live (nsim, …) arrays as there: state is taken from them before a call, all are filled after it.
+    Bound fields are live (nsim, …) arrays as there. All take turns in one MjData: what the next step follows from is
+    put into it before a call, and every bound field is read from it after.
     """
 
-    STATE = frozenset({"time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied"})
+    STATE = ("time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied")
 
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0) -> None:
-        self.nsim, self._models = nsim, [model] * nsim
-        self._data = [mujoco.MjData(model) for _ in range(nsim)]
+        self.nsim, self._model, self._data = nsim, copy.copy(model), mujoco.MjData(model)
         self._bound: dict[str, Array] = {}
         self._expanded: dict[str, Array] = {}
+        for name in self.STATE:
+            self.bind(name)
 
     def bind(self, name: str) -> Array:
         """A field of MjData, (nsim, …)."""
         if name not in self._bound:
-            self._bound[name] = np.array([getattr(data, name) for data in self._data])
+            self._bound[name] = np.array([getattr(self._data, name)] * self.nsim)
         return self._bound[name]
 
     def expand(self, name: str) -> Array:
         """A field of MjModel, or opt.NAME of its options, to be given a value for each simulation, (nsim, …)."""
-        if not self._expanded:
-            self._models = [copy.copy(model) for model in self._models]
         if name not in self._expanded:
-            self._expanded[name] = np.array([_field(model, name) for model in self._models])
+            self._expanded[name] = np.array([_field(self._model, name)] * self.nsim)
         return self._expanded[name]
 
     def expanded(self, name: str) -> Array | None:
@@ -60,17 +60,17 @@ class OneByOne:
         self._call(ids, mujoco.mj_step1)
 
     def get_data(self, i: int) -> mujoco.MjData:
-        """A copy of one simulation."""
-        self._call(np.array([i]), lambda model, data: None)
-        return copy.copy(self._data[i])
+        """A copy of one simulation, with what follows from its positions and velocities."""
+        self._call(np.array([i]), mujoco.mj_step1)
+        return copy.copy(self._data)
 
     def _call(self, ids: Array | None, function: Callable[[mujoco.MjModel, mujoco.MjData], None]) -> None:
+        model, data = self._model, self._data
         for i in np.arange(self.nsim)[slice(None) if ids is None else ids]:
-            model, data = self._models[i], self._data[i]
             for name, x in self._expanded.items():
-                owner, name = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
-                setattr(owner, name, x[i])
-            for name in self.STATE & self._bound.keys():
+                owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
+                setattr(owner, field, x[i])
+            for name in self.STATE:
                 setattr(data, name, self._bound[name][i])
             function(model, data)
             for name, x in self._bound.items():
