@@ -248,7 +248,7 @@ def train(
 ) -> GapModel:
     """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
 
-    Ctrl-C ends training and leaves a usable run.
+    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model (training/ranks.py).
 
     Args:
         dataset: Recordings.
@@ -269,15 +269,20 @@ def train(
         DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
     from gaponet.files import writing
+    from gaponet.training import ranks
     from gaponet.training.budget import Budget
     from gaponet.training.config import TrainConfig
     from gaponet.training.run import Trainer
 
-    data, spec = open_dataset(dataset, robot)
     config = config or TrainConfig()
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
-    with bar(f"training {config.model.kind}") as update, writing(Path(out), "run"):
-        show = lambda status: update(status.fraction, 1.0, status.note)  # noqa: E731
+    with (
+        ranks.joined(config.device),
+        ranks.on_first(writing(Path(out), "run")),
+        ranks.on_first(bar(f"training {config.model.kind}")) as update,
+    ):
+        data, spec = open_dataset(dataset, robot)
+        show = lambda status: update and update(status.fraction, 1.0, status.note)  # noqa: E731
         return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
 
 

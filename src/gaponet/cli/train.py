@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +11,7 @@ import tyro
 from gaponet import api
 from gaponet.cli.gap import show_methods
 from gaponet.cli.options import Data, Flag, Folder, Json, Motions, Robot, Run, like
-from gaponet.cli.out import Out, writes
+from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 from gaponet.model.config import Kind
 from gaponet.progress import bar
@@ -18,7 +19,6 @@ from gaponet.training.config import TrainConfig
 from gaponet.training.config import fast as fast_preset
 
 
-@writes("run")
 @like(api.train)
 def train(
     dataset: Data,
@@ -35,7 +35,7 @@ def train(
 ) -> None:
     """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
 
-    Ctrl-C ends training and leaves a usable run.
+    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
     Args:
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
@@ -47,6 +47,8 @@ def train(
     screen = Out(json)
     config = fast_preset(config) if fast else config
     trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
+    if os.environ.get("RANK", "0") != "0":  # torchrun's first process says it for all
+        return
     card = trained.card
     val = card["val_mpjae"]
     screen.say(

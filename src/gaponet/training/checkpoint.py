@@ -21,6 +21,7 @@ from gaponet.training.env import DeltaEnv
 from gaponet.training.warm_start import WarmStart
 
 StateDict = dict[str, Any]
+SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
 ROWS = ("row", "first", "last", "now", "elapsed")  # of each environment
 
 
@@ -30,6 +31,24 @@ def write_state(path: Path, state: StateDict) -> None:
     torch.save(state, content)
     with whole(path) as temporary:
         temporary.write_bytes(content.getbuffer())
+
+
+def own(state: Any) -> Any:
+    """What of a state is a rank's own, on the CPU: all but networks and their optimisers."""
+    if isinstance(state, dict):
+        return {name: own(x) for name, x in state.items() if name not in SHARED}
+    if isinstance(state, list):
+        return [own(x) for x in state]
+    return state.cpu() if isinstance(state, torch.Tensor) else state
+
+
+def with_own(state: Any, mine: Any) -> Any:
+    """The first rank's state with another one's `own` in the place of its own."""
+    if isinstance(mine, dict):
+        return (state or {}) | {name: with_own((state or {}).get(name), x) for name, x in mine.items()}
+    if isinstance(mine, list):
+        return [with_own(x, y) for x, y in zip(state, mine, strict=True)]
+    return mine
 
 
 def rng_text(rng: np.random.Generator) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval
@@ -13,6 +15,8 @@ from gaponet.model.config import Layers, ModelConfig
 
 if TYPE_CHECKING:
     from gaponet.family.draw import Family
+    from gaponet.robot import RobotSpec
+    from gaponet.training.budget import Budget
 
 
 @dataclass(frozen=True)
@@ -179,3 +183,16 @@ def options(config: dict[str, Any], default: dict[str, Any] | None = None, prefi
             option = "--model" if prefix + name == "--model.kind" else prefix + name
             words += [option, *map(str, value if isinstance(value, tuple) else [value])]
     return words
+
+
+def command(
+    dataset: Path, out: Path, budget: Budget, config: TrainConfig, robot: RobotSpec, holdout_units: tuple[str, ...],
+    processes: int,
+) -> str:  # fmt: skip
+    """What a shell needs to train the same again."""
+    limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"
+    several = ["torchrun", "--nproc-per-node", str(processes), "-m"] if processes > 1 else []
+    words = [*several, "gaponet", "train", str(dataset), "--out", str(out), "--budget", limit]
+    words += ["--robot", str(robot.folder)] if robot.nominal is not None else []
+    words += ["--holdout-units", *holdout_units] if holdout_units else []
+    return shlex.join(words + options(asdict(config)))

@@ -12,7 +12,8 @@ import torch
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text
 from gaponet.model.layers import DeltaNet
-from gaponet.training.checkpoint import StateDict, write_state
+from gaponet.training import ranks
+from gaponet.training.checkpoint import StateDict, own, with_own, write_state
 from gaponet.training.sensor_fit import Report
 
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
@@ -47,9 +48,13 @@ class Kept:
     """Hash of its recordings."""
 
     def write(self, out: Path, net: DeltaNet) -> None:
-        """Write the checkpoint, and progress.jsonl beside it."""
-        write_state(out / CHECKPOINT, vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()})
-        self.write_progress(out)
+        """Write the checkpoint, and progress.jsonl beside it; of all ranks, whose networks must be equal, the first."""
+        ranks.require_equal(net.state_dict(), self.learner["critic"] if self.learner else {})
+        state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
+        others = ranks.gathered(own({name: state[name] for name in ("rng", "env", "learner", "warm")}))[1:]
+        if not ranks.rank():
+            write_state(out / CHECKPOINT, state | {"others": others})
+            self.write_progress(out)
 
     def write_progress(self, out: Path) -> None:
         """Write progress.jsonl anew."""
@@ -64,17 +69,23 @@ class Kept:
 
         Raises:
             ModelError: Damaged, or of another network.
-            UsageError: Trained on other recordings.
+            UsageError: Trained on other recordings, or by another number of ranks.
         """
         try:
             state = torch.load(out / CHECKPOINT, weights_only=True, map_location="cpu")
             net.load_state_dict(state.pop("net"))
+            others = state.pop("others", [])
+            if 0 < ranks.rank() <= len(others):
+                state = with_own(state, others[ranks.rank() - 1])
             rng = state.pop("rng")
             kept = cls(**state)
             torch.set_rng_state(rng)
         except Exception as error:  # torch and its unpickler raise of every kind
             reason = next(iter(str(error).splitlines()), type(error).__name__)
             raise ModelError(f"{out / CHECKPOINT}: does not fit this model or is damaged ({reason})") from None
+        if len(others) + 1 != ranks.world():
+            n = len(others) + 1
+            raise UsageError(f"{out}: was trained by {n} processes; resume with torchrun --nproc-per-node {n}")
         if kept.dataset not in ("", dataset):
             raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
         return kept, rng

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gaponet.model.layers import DeltaNet, Standardise, dense
+from gaponet.training import ranks
 from gaponet.training.config import PPOConfig
 from gaponet.training.env import DeltaEnv
 
@@ -74,6 +75,7 @@ class Learner:
         observed = env.get_observations()
         seen = observed["critic"]
         self.critic = Critic(net.features.dim, seen.shape[1], config.critic_hidden, env.num_actions).to(seen.device)
+        ranks.spread(self.critic)
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
         held = env.robot.dt * env.config.delta_hold
@@ -121,16 +123,17 @@ class Learner:
         x, seen = observed["actor"], observed["critic"]
         if not self.updates and not self.critic.standardise.mean.any():
             self.critic.standardise.fit(seen)
+            ranks.pool(self.critic)
         prepared, features = self.net.prepare(x), self.net.features(x)
         return {"prepared": prepared, "features": features, "seen": seen, "mean": self.net.correct(prepared),
                 "value": self.critic(features, seen)}  # fmt: skip
 
     def _measure(self, seen: dict[str, Tensor]) -> None:
         left = (seen["returns"] - seen["value"]).flatten(0, 1).var(0) / seen["returns"].flatten(0, 1).var(0)
-        found = self.found = Update(
-            explained_variance=1 - float(left.mean()), mean_delta=float(seen["mean"].abs().mean())
+        explained, delta, reward = ranks.mean(
+            1 - float(left.mean()), float(seen["mean"].abs().mean()), self.env.mean_reward()
         )
-        found.reward = self.env.mean_reward()
+        found = self.found = Update(explained_variance=explained, mean_delta=delta, reward=reward)
         self.ready |= self.updates >= self.config.critic_warmup and found.explained_variance >= self.config.explained
 
     def learn(self, batch: Batch) -> None:
@@ -157,7 +160,7 @@ class Learner:
         clipped = ratio.clamp(1 - self.config.clip, 1 + self.config.clip)
         advantage = batch.advantage[rows]
         self._descend(self.optimiser, -(weight * torch.minimum(ratio * advantage, clipped * advantage)).sum())
-        kl = float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.spread**2)
+        kl = ranks.mean(float((weight * (mean.detach() - old) ** 2).sum()) / (2 * self.spread**2))[0]
         for group in self.optimiser.param_groups:
             if kl > 2 * self.config.desired_kl:
                 group["lr"] = max(LOWEST, group["lr"] / FACTOR)
@@ -169,7 +172,9 @@ class Learner:
     def _descend(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
         optimiser.zero_grad()
         loss.backward()
-        nn.utils.clip_grad_norm_([p for group in optimiser.param_groups for p in group["params"]], 1.0)
+        parameters = [p for group in optimiser.param_groups for p in group["params"]]
+        ranks.average(*(p.grad for p in parameters if p.grad is not None))
+        nn.utils.clip_grad_norm_(parameters, 1.0)
         optimiser.step()
 
     def state(self) -> dict[str, Any]:

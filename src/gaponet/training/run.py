@@ -14,7 +14,6 @@ import copy
 import json
 import os
 import platform
-import shlex
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -42,16 +41,10 @@ from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import model_hash
 from gaponet.structure import validated
+from gaponet.training import ranks
 from gaponet.training.budget import Budget, Status
-from gaponet.training.checkpoint import (
-    StateDict,
-    env_state,
-    restore_env,
-    restore_warm,
-    round_state,
-    warm_state,
-)
-from gaponet.training.config import TrainConfig, options
+from gaponet.training.checkpoint import StateDict, env_state, restore_env, restore_warm, round_state, warm_state
+from gaponet.training.config import TrainConfig, command
 from gaponet.training.env import DeltaEnv
 from gaponet.training.gain import choose_gain
 from gaponet.training.inverse import labels_of
@@ -90,7 +83,7 @@ class Trainer:
         if resume and keeps_robot(out) and model_hash(kept_robot(out, robot.name)) != model_hash(robot):
             raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / KEPT}")
         self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
-        self.budget, self.show = budget, show
+        self.budget, self.show, self.own = budget, show, ranks.share(config)
         rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
         self.parts = parts_of(dataset, config.split, *rule)
         if not config.mixed_gains:
@@ -106,20 +99,23 @@ class Trainer:
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
         self.n, self.family = len(robot.operated), config.drawn
         torch.manual_seed(config.seed)
-        torch.set_num_threads(config.learner_threads)
+        torch.set_num_threads(self.own.learner_threads)
         self.net = build_network(config.model, self.n)
+        if ranks.rank():  # the same network, other noise
+            torch.manual_seed(ranks.seed(config.seed))
         self.untrained = copy.deepcopy(self.net.state_dict())
         self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
         self.nominal, self.found = float("nan"), Update()
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
-        with writing(out, "run"):
+        with ranks.on_first(writing(out, "run")):
             if resume:
                 self.kept, self.rng = Kept.read(out, self.net, self.kept.dataset)
-            self._write_config(holdout_units, resume)
+            if not ranks.rank():
+                self._write_config(holdout_units, resume)
         self.net.to(config.network_device())
-        self.loggers = Loggers(log, out, asdict(config))
+        self.loggers = Loggers(() if ranks.rank() else log, out, asdict(config))
 
     def run(self) -> GapModel:
         """Train until the budget is out or Ctrl-C; returns the exported best model.
@@ -127,14 +123,12 @@ class Trainer:
         Raises:
             FolderError: Another process writes into the run.
         """
-        with writing(self.out, "run"):
+        with ranks.on_first(writing(self.out, "run")):
             return self._run()
 
     def _run(self) -> GapModel:
+        ranks.once(self._fit_baseline)
         self.nominal = self.validate(None)
-        if self.baseline is None:
-            self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.config.threads)
-        write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
         try:
             if not np.isfinite(self.kept.best):
                 self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
@@ -156,12 +150,17 @@ class Trainer:
 
     # ---- stages
 
+    def _fit_baseline(self) -> None:
+        if self.baseline is None:
+            self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.own.threads)
+        write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
+
     def _warm_start(self) -> None:
-        config = recipe(self.config)
+        config = recipe(self.own)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         limit = 0.99 * self.config.model.delta_max
         labels = labels_of(self.train_set, self.robot, limit, env.drawn)
-        warm = WarmStart(self.net, env, labels, config, self.config.seed, self.config.threads)
+        warm = WarmStart(self.net, env, labels, config, ranks.seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
         rounds: list[StateDict] = []
         if self.kept.rounds_done == 0:
@@ -173,6 +172,7 @@ class Trainer:
             rounds = self.kept.warm["rounds"]
             restore_warm(warm, self.kept.warm)
             torch.set_rng_state(self.rng)
+        ranks.meet()
         while (
             warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
         ):
@@ -181,22 +181,22 @@ class Trainer:
             self.kept.sensor_r2 = warm.report
             rounds.append(before)
             self.kept.rounds_done, self.kept.warm = warm.done, warm_state(warm, rounds)
-            self.kept.steps += config.num_envs * config.steps
+            self.kept.steps += ranks.world() * config.num_envs * config.steps
             self._consider(None, **fit)
 
     def _cold_start(self) -> None:
         """PPO alone also needs the statistics of its inputs, and sensors that answer."""
         self.stage = "sensors"
         self._tick()
-        env = self._env(self.config.warm_start.num_envs, 10**9, self.config.seed)
+        env = self._env(self.own.warm_start.num_envs, 10**9, self.config.seed)
         x = env.get_observations()["actor"]
         self.kept.sensor_r2 = fit_inputs(
-            self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.config.threads
+            self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.own.threads
         )
         self.kept.trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
-        ppo = self.config.ppo
+        ppo = self.own.ppo
         if self._spent() >= 1 or self.config.model.kind == "inverse":
             return
         self.stage = "ppo"
@@ -214,7 +214,7 @@ class Trainer:
         while self._spent() < 1:
             self.found = learner.update()
             self.kept.updates += 1
-            self.kept.steps += ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
+            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
             self._tick()
             if self.kept.updates % self.config.validate_every == 0:
                 self.kept.learner, self.kept.env = learner.state(), env_state(env)
@@ -251,17 +251,22 @@ class Trainer:
         """Export the best model and write its card."""
         self.stage = "export"
         self._tick()
+        ranks.once(self._export)
+        return GapModel.load(self.out)
+
+    def _export(self) -> None:
         net = build_network(self.config.model, self.n)
         net.load_state_dict(self.kept.best_state)
         net.eval()
         env = self._env(max(64, len(self._conditions())), 10, 0, "cpu")
         self.loggers.close()
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
-        return GapModel.load(self.out)
 
     def _env(self, num_envs: int, episode_steps: int, seed: int, device: str | None = None) -> DeltaEnv:
-        c = self.config
-        how = c.reward, seed, c.threads, self._members(num_envs, c.seed), device or c.device
+        """num_envs of this rank, which in a family are others than those of the other ranks."""
+        c, first, members = self.own, ranks.rank() * num_envs, self._members(ranks.world() * num_envs, self.config.seed)
+        members = members and members[first : first + num_envs]
+        how = c.reward, ranks.seed(seed), c.threads, members, device or c.device
         return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
 
     def _members(self, num: int, seed: int) -> Members | None:
@@ -275,10 +280,14 @@ class Trainer:
         Nominal is the simulator before identification, also where training starts from an identified one. With a
         family both are means over members that no environment is.
         """
-        what = self.config.model, net, self.config.threads
+        what = self.config.model, net, self.own.threads
         if (members := self._members(PAIRS, self.config.seed + 1)) is not None:
-            return in_members(self.val_set, self.robot, *what, members)
-        return mean_error(self.val_set, self.robot if net is not None else self.robot.nominal or self.robot, *what)
+            pairs = [(self.val_set[i % len(self.val_set)], i) for i in range(PAIRS)]
+            return ranks.mean_over(
+                pairs, lambda own: in_members([s for s, _ in own], self.robot, *what, members[[i for _, i in own]])
+            )
+        robot = self.robot if net is not None else self.robot.nominal or self.robot
+        return ranks.mean_over(self.val_set, lambda own: mean_error(own, robot, *what))
 
     def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
@@ -304,7 +313,7 @@ class Trainer:
         return self.kept.seconds + time.monotonic() - self.began
 
     def _spent(self) -> float:
-        return self.budget.spent(self.seconds(), self.kept.steps)
+        return ranks.decided(self.budget.spent(self.seconds(), self.kept.steps))
 
     def _tick(self) -> float:
         """Show where the run stands; returns the share of the budget spent."""
@@ -314,9 +323,10 @@ class Trainer:
         return spent
 
     def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
+        what = self.dataset.path, self.out, self.budget, self.config, self.robot, holdout_units, ranks.world()
         config = asdict(self.config) | {
             "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
-            "command": self._command(holdout_units),
+            "command": command(*what),
             "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
@@ -326,14 +336,6 @@ class Trainer:
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
         self.kept.write_progress(self.out)
-
-    def _command(self, holdout_units: tuple[str, ...]) -> str:
-        """What a shell needs to train the same again."""
-        limit = str(self.budget.steps) if self.budget.seconds is None else f"{self.budget.seconds:g}s"
-        words = ["gaponet", "train", str(self.dataset.path), "--out", str(self.out), "--budget", limit]
-        words += ["--robot", str(self.robot.folder)] if self.robot.nominal is not None else []
-        words += ["--holdout-units", *holdout_units] if holdout_units else []
-        return shlex.join(words + options(asdict(self.config)))
 
     def _conditions(self) -> set[Condition]:
         return {Condition.of(s, self.robot) for s in self.train_set}

@@ -18,6 +18,7 @@ import torch
 from gaponet.arrays import Array, copy_of, host, indices
 from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
+from gaponet.training import ranks
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.inverse import MemberLabels
@@ -59,8 +60,8 @@ class WarmStart:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
         self.pool_y: list[torch.Tensor] = []
-        trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
-        self.optimiser = torch.optim.AdamW(trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self.trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
+        self.optimiser = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.done = 0
 
     def begin(self) -> None:
@@ -136,6 +137,7 @@ class WarmStart:
             loss = ((net(x[batch]) - y[batch]) ** 2).mean()
             self.optimiser.zero_grad()
             loss.backward()
+            ranks.average(*(p.grad for p in self.trained if p.grad is not None))
             self.optimiser.step()
             losses[step] = loss.item()
             spent = tick()
@@ -148,7 +150,7 @@ class WarmStart:
 
 
 def _rms(losses: Array) -> float:
-    return float(np.sqrt(losses.mean())) if len(losses) else float("nan")
+    return float(np.sqrt(ranks.mean(losses.mean())[0])) if len(losses) else float("nan")
 
 
 def held_labels(labels: Array, hold: int) -> Array:
@@ -170,7 +172,12 @@ def fit_inputs(
         Its R² on held-out states; None for a network without one.
     """
     net.cpu().fit_inputs(x.cpu())  # the sensors to be predicted are C MuJoCo's answers
-    report = fit_sensors(net, env, states, seed, nthread) if net.predictor is not None else None
+    ranks.pool(net)
+    report = None
+    if net.predictor is not None:
+        report = ranks.once(lambda: fit_sensors(net, env, states, seed, nthread))
+        net.predictor.requires_grad_(False)
+        ranks.spread(net.predictor)
     net.to(x.device)
     return report
 
