@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -43,11 +42,12 @@ def train(
         config: Everything else.
     """
     from gaponet.model.artifact import how_trained
+    from gaponet.training.ranks import started
 
     screen = Out(json)
     config = fast_preset(config) if fast else config
     trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
-    if os.environ.get("RANK", "0") != "0":  # torchrun's first process says it for all
+    if started():  # the first rank says it for all
         return
     card = trained.card
     val = card["val_mpjae"]

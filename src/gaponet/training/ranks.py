@@ -36,13 +36,18 @@ _interrupted = False
 
 
 def world() -> int:
-    """How many ranks there are."""
-    return dist.get_world_size() if dist.is_initialized() else 1
+    """How many ranks have met."""
+    return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
 
 def rank() -> int:
     """Which of them this process is, from 0."""
-    return dist.get_rank() if dist.is_initialized() else 0
+    return dist.get_rank() if world() > 1 else 0
+
+
+def started() -> int:
+    """As which rank torchrun started this process; 0 where it did not."""
+    return int(os.environ["RANK"]) if dist.is_available() and dist.is_torchelastic_launched() else 0
 
 
 def on_first(what: AbstractContextManager[T]) -> AbstractContextManager[T | None]:
@@ -60,7 +65,7 @@ def joined(device: str) -> Iterator[None]:
         ModelError: Another rank failed, or was silent for SILENCE.
     """
     global _patient
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or dist.is_initialized():
+    if not dist.is_available() or not dist.is_torchelastic_launched() or dist.is_initialized():
         yield
         return
     if device == "cuda":
