@@ -6,7 +6,7 @@ An arm trains three seeds: warm, in the nominal simulator from six rounds of the
 the identified simulator from the untrained operator on. Virtual: the fleet `hard` of virtual_h1_2.py, tested on a unit
 never seen. Curves are of validation motions at gain 1; test motions are played once, by the best on validation.
 
-Writes docs/results/ppo.{md,json,csv,svg,png}. What is found in WORK is kept.
+Writes docs/results/ppo.{md,json,csv,svg,png}; arms of another time have a --page of their own. What is in WORK is kept.
 """
 
 from __future__ import annotations
@@ -191,14 +191,14 @@ def virtual(args: argparse.Namespace) -> Study:
     return replace(study, identified=bench.identified(DEFAULT_TERMS))
 
 
-def result(found: ListOf[Arm], failed: ListOf[str]) -> Result:
+def result(found: ListOf[Arm], failed: ListOf[str], name: str) -> Result:
     """A row and a panel per arm."""
-    table = Table("ppo", HEAD, tuple(a.row() for a in found), CAPTION)
+    table = Table(name, HEAD, tuple(a.row() for a in found), CAPTION)
     figure = lines([a.panel() for a in found], ("million control steps of PPO", "validation MPJAE, mrad"))
     said = [f"{a.name}: {a.study.data.path.name}, {a.study.seeds} seeds" for a in found]
     repeat = facts(found[0].study.data, steps=found[0].steps, arms=said)
     whose = "SO-101: recordings of a real robot. H1-2: VIRTUAL, which says nothing about real hardware."
-    return Result("ppo", "PPO by joint: error against steps", whose, repeat, (table,), {"ppo": figure}, tuple(failed))
+    return Result(name, "PPO by joint: error against steps", whose, repeat, (table,), {name: figure}, tuple(failed))
 
 
 def main() -> None:
@@ -210,10 +210,11 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2_000_000)
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--arms", nargs="+", default=ARMS, help="ARM or ARM:SEEDS")
+    parser.add_argument("--page", default="ppo", help="name of the results page")
     args = parser.parse_args()
     found = arms(args)
     failed = [sentence for arm in found for sentence in arm.train()]
-    publish(result(found, failed), args.work / "results")
+    publish(result(found, failed, args.page), args.work / "results")
 
 
 if __name__ == "__main__":
