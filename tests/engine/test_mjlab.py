@@ -100,9 +100,10 @@ def test_a_trained_model_moves_mjlab_as_it_moves_alignedsim(python, tmp_path):
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
     recipe = ["--robot", "h1_2", "--fleet", "easy", "--recipe", "demo", "--units", "virtual-1", "--nproc", "1"]
     assert main(["collect", "--out", data, *recipe]) == 0
-    assert main(["train", data, "--out", run, "--budget", "3m"]) == 0
+    start = ["--warm-start.num-envs", "64", "--warm-start.steps", "100", "--warm-start.rounds", "4"]
+    assert main(["train", data, "--out", run, "--budget", "25600", *start]) == 0
     model = GapModel.load(run)
-    compare(python, model, 2.0, tmp_path, "H1-2, trained for 3 minutes, 2 kg per hand")
+    compare(python, model, 2.0, tmp_path, "H1-2, trained on virtual robots (25,600 steps), 2 kg per hand")
 
 
 def test_identified_servos_move_in_mjlab_as_here(python, tmp_path):
