@@ -60,9 +60,11 @@ FUZZ ?=
 fuzz: setup
 	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m fuzzing $(FUZZ)
 
-# Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root.
+# Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root. Then ranks
+# of torchrun killed and frozen: five minutes.
 kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks --only kills
 
 # LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.
 LEROBOT ?= $(HOME)/.cache/gaponet/lerobot-0.6.1

@@ -127,7 +127,8 @@ class DeltaEnv:
         if device != "cpu":
             from gaponet.sim.warp import WarpSim
 
-            self.sim = WarpSim(sim, device.removeprefix("warp-"))
+            # torch's GPU: of several processes each has its own
+            self.sim = WarpSim(sim, "cpu" if device == "warp-cpu" else f"cuda:{torch.cuda.current_device()}")
         place, num = self.sim.array, self.num_envs
         for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features"):
             setattr(self, name, place(getattr(self, name)))

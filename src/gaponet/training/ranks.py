@@ -33,6 +33,7 @@ APART = 1_000_003  # between the seeds of two ranks; the seeds of a study are ne
 
 _patient: Any = None  # the group in which the others wait for the first rank
 _interrupted = False
+_parent = os.getppid()  # torchrun
 
 
 def world() -> int:
@@ -63,14 +64,18 @@ def joined(device: str) -> Iterator[None]:
 
     Raises:
         ModelError: Another rank failed, or was silent for SILENCE.
+        UsageError: There are not so many GPUs.
     """
     global _patient
     if not dist.is_available() or not dist.is_torchelastic_launched() or dist.is_initialized():
         yield
         return
-    if device == "cuda":
-        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-    dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo", timeout=SILENCE)
+    local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count() if device == "cuda" else 0
+    if 0 < gpus <= local:
+        raise UsageError(f"--device cuda: torchrun --nproc-per-node asks for more than the {gpus} GPUs of this machine")
+    if gpus:
+        torch.cuda.set_device(local)
+    dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=SILENCE)
     _patient = dist.new_group(timeout=ALONE, backend="gloo")
     before = signal.signal(signal.SIGINT, signal.SIG_IGN if rank() else _interrupt)
     try:
@@ -92,7 +97,7 @@ def _together() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        reason = next(iter(str(error).splitlines()), "")
+        reason = str(error).partition(". ")[0]
         raise ModelError(
             f"rank {rank()}: another rank has failed or is silent ({reason}); the run goes on from its last checkpoint "
             "with --resume"
@@ -103,16 +108,16 @@ def decided(spent: float) -> float:
     """The first rank's answer, on all of them: by clocks of their own they would not end at the same step.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C, on every rank at once.
+        KeyboardInterrupt: Ctrl-C, or torchrun is gone; on every rank at once.
     """
-    global _interrupted
+    global _interrupted, _parent
     if world() == 1:
         return spent
-    told = torch.tensor([spent, _interrupted], dtype=torch.float64)
+    told = torch.tensor([spent, _interrupted or os.getppid() != _parent], dtype=torch.float64)
     with _together():
         dist.broadcast(told, 0)
     if told[1]:
-        _interrupted = False
+        _interrupted, _parent = False, os.getppid()
         raise KeyboardInterrupt
     return told[0].item()
 
