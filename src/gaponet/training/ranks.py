@@ -134,7 +134,9 @@ def once(work: Callable[[], T]) -> T:
 
 def meet() -> None:
     """Wait for all ranks, as long as it takes: after work that may take one of them far longer than another."""
-    once(lambda: None)
+    if world() > 1:
+        with _together():
+            dist.barrier(_patient)
 
 
 def gathered(own: T) -> list[T]:
