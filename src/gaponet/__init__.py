@@ -27,6 +27,7 @@ _HOMES = {  # name → module
         ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "calibrate"), "gaponet.api"
     ),
     "Dataset": "gaponet.data.store",
+    "open_dataset": "gaponet.share.stream",
     "load_robot": "gaponet.robot",
     "RobotSpec": "gaponet.robot",
     "GapModel": "gaponet.model.artifact",

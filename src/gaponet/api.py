@@ -73,7 +73,7 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
     """Look through a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
 
     Args:
-        dataset: Recordings.
+        dataset: Recordings; also the address of a dataset that was pushed to a bucket.
         robot: Another robot than the one that the dataset keeps.
 
     Returns:
@@ -83,10 +83,11 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import diagnose
+    from gaponet.share import stream
     from gaponet.sim.dynamics import gravity_of
     from gaponet.sim.touching import tip_heights
 
-    data, spec = open_dataset(dataset, robot)
+    data, spec = stream.open_dataset(dataset, robot)
     with bar("examining") as update:
         heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
         return diagnose(data, spec, update, gravity_of(spec), heights)
@@ -122,7 +123,7 @@ def gap(
     """Measure how far the nominal simulator is from the robot, in whole-motion free run, and with a run, why.
 
     Args:
-        dataset: Sequences without a twin are replayed first.
+        dataset: Sequences without a twin are replayed first. Also the address of one that was pushed to a bucket.
         robot: Another robot than the one that the dataset keeps.
         motions: Only these.
         run: A run of train: what delay, offset, each cause that was identified and the model remove, and the floor, on
@@ -133,18 +134,19 @@ def gap(
         dataset, sequences, hours, virtual, robot, simulator_hash. With a run: as eval.gap.gap_by_step.
     """
     from gaponet.metrics import runs, summary
+    from gaponet.share import stream
     from gaponet.sim.model import model_hash
 
     if run is not None:
         from gaponet.eval.gap import gap_by_step
         from gaponet.eval.gap_figure import write_gap
 
-        data, spec = open_dataset(dataset, robot, folder := _run(run))
+        data, spec = stream.open_dataset(dataset, robot, folder := _run(run))
         with bar("gap") as update:
             found = gap_by_step(folder, data, spec, motions, update)
         write_gap(found, folder)
         return found
-    data, spec = open_dataset(dataset, robot)
+    data, spec = stream.open_dataset(dataset, robot)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
     pairs = [data.pair(e, simulator) for e in entries]

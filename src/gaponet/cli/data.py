@@ -7,11 +7,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.cli.options import Data, Json, Robot
+from gaponet.cli.options import Data, Json, Robot, Source
 from gaponet.cli.out import Out
 from gaponet.data.checks.finding import some
-from gaponet.data.store import Dataset, open_dataset
+from gaponet.data.store import Dataset
 from gaponet.progress import bar
+from gaponet.share.stream import open_dataset
 
 
 def card(
@@ -74,7 +75,7 @@ def split(
 
 
 def figures(
-    dataset: Data,
+    dataset: Source,
     out: Path,
     robot: Robot = None,
     json: Json = False,
@@ -100,7 +101,7 @@ def figures(
 
 
 def export(
-    dataset: Data,
+    dataset: Source,
     out: Path,
     to: Literal["lerobot", "sage", "npz", "asap", "mcap"] = "lerobot",
     robot: Robot = None,

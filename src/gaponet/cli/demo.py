@@ -49,7 +49,7 @@ def demo(
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
         holdout = _make_dataset(out / "dataset", data, robot, screen)
         dataset = Dataset(out / "dataset")
-        gap(out / "dataset", robot=robot)
+        gap(str(out / "dataset"), robot=robot)
     for model, limit in ((ModelConfig(), budget), (ModelConfig(kind="mlp"), mlp_budget)):
         run, resume = out / model.kind, (out / model.kind / "checkpoint.pt").is_file()
         config = TrainConfig(model, warm_start=QUICK)

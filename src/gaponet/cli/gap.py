@@ -6,19 +6,21 @@ from pathlib import Path
 from typing import Any
 
 from gaponet import api
-from gaponet.cli.options import Data, Json, Motions, Robot, like
+from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
-from gaponet.data.store import open_dataset
 from gaponet.eval.tables import by_group, mrad, totals
 from gaponet.plot.methods import title
 from gaponet.plot.table import Table
+from gaponet.share.stream import open_dataset
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
 SHOWN = 8  # columns of the totals that a screen has room for
 
 
 @like(api.gap)
-def gap(dataset: Data, run: Path | None = None, motions: Motions = (), robot: Robot = None, json: Json = False) -> None:
+def gap(
+    dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, json: Json = False
+) -> None:
     """How far the simulator is from the robot, by joint, payload, …; with --run what each step up to its model removes.
 
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.

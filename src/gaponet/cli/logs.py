@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from gaponet import api
-from gaponet.cli.options import Data, Flag, Folder, Json, like
+from gaponet.cli.options import Flag, Folder, Json, Source, like
 from gaponet.cli.out import Out, show_findings
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
@@ -85,7 +85,7 @@ def import_logs(
 
 
 def doctor(
-    dataset: Data, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
+    dataset: Source, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
 ) -> None:
     """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque, payload.
 
@@ -96,9 +96,10 @@ def doctor(
     """
     from gaponet.data.checks.finding import proposal
     from gaponet.data.doctor import inventory
+    from gaponet.share.stream import open_dataset
 
     out = Out(json)
-    data, spec = api.open_dataset(dataset, robot)
+    data, spec = open_dataset(dataset, robot)
     diagnosis = api.doctor(data, spec)
     out.say(f", {inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)

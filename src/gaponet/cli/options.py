@@ -14,6 +14,10 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 Folder = tyro.conf.Positional[Path]
 Flag = tyro.conf.FlagCreatePairsOff[bool]
 Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.")]
+Source = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(help="Dataset folder, or the address (s3://, gs://, file://) of one that was pushed."),
+]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.")]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these.")]
 Robot = Annotated[

@@ -86,7 +86,9 @@ class Dataset:
         self.path = Path(path)
         header = self.path / "dataset.json"
         if not header.is_file():
-            raise DatasetError(f"{self.path}: not a dataset (no dataset.json); make one with gaponet import or collect")
+            raise DatasetError(
+                f"{self.path}: not a dataset (no dataset.json); make one with gaponet import, collect or pull"
+            )
         self.header: dict[str, Any] = {**read_format(Header, header, FORMAT, DatasetError, MEND)}
         self.robot_name: str = self.header["robot"]
         self.joint_names: tuple[str, ...] = self.header["joint_names"]
@@ -188,9 +190,8 @@ class Dataset:
                 "(same samples, unit and payload); nothing to add"
             )
         m = sequence.meta
-        name = f"{m.motion}-{m.unit_id}-{m.payload_mass:g}kg-r{m.repetition}"
         entry = Entry(
-            id=re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:150] + f"-{digest[:8]}",
+            id=entry_id(m, digest),
             hash=digest,
             dt=sequence.dt,
             rows=len(sequence),
@@ -272,6 +273,12 @@ class Dataset:
             if listed.setdefault(entry.hash, entry.id) != entry.id or len(listed) < number:
                 raise DatasetError(f"{where}: '{listed[entry.hash]}' is listed already; delete this line")
             yield entry
+
+
+def entry_id(meta: SequenceMeta, digest: str) -> str:
+    """A sequence's name in its dataset: what it is, as letters that any disk takes, and how its content hash begins."""
+    name = f"{meta.motion}-{meta.unit_id}-{meta.payload_mass:g}kg-r{meta.repetition}"
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", name)[:150] + f"-{digest[:8]}"
 
 
 def dataset_hash(entries: list[Entry]) -> str:

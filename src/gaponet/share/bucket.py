@@ -8,14 +8,20 @@ No object is renamed or appended to. What an earlier push left and no index name
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gaponet.errors import RemoteError
 from gaponet.share.target import BLOCK, INDEX, LARGEST_INDEX, Kind, Part, part_of, reaching
 
+if TYPE_CHECKING:
+    from pyarrow import NativeFile
+
 OBJECTS = "sha256"
+PATIENCE = 20  # s that a request to gs:// is tried again; 15 minutes where nobody says, s3:// gives up after 6
 
 
 class Bucket:
@@ -29,7 +35,10 @@ class Bucket:
         from pyarrow import ArrowException
         from pyarrow.fs import FileSystem
 
-        self.address, self._errors = address.partition("?")[0], (ArrowException, ValueError)
+        self.address = re.sub("//[^/@]*@", "//", address.partition("?")[0])  # without keys, if there are any
+        self._errors = (ArrowException, ValueError)
+        if address.startswith(("gs:", "gcs:")) and "retry_limit_seconds=" not in address:
+            address += f"{'&' if '?' in address else '?'}retry_limit_seconds={PATIENCE}"
         with reaching(self.address, *self._errors):
             self.files, self.root = FileSystem.from_uri(address)
         self.root = self.root.rstrip("/")
@@ -45,6 +54,9 @@ class Bucket:
                     raise RemoteError(f"{self.address}: {INDEX} has more than {LARGEST_INDEX >> 20} MiB")
                 with self.files.open_input_stream(place) as content:
                     return bytes(content.read(LARGEST_INDEX))
+            bucket, inside, _ = self.root.partition("/")
+            if inside and bucket and self.files.get_file_info(bucket).type == FileType.NotFound:
+                raise RemoteError(f"{self.address}: no bucket '{bucket}' there; make it first, by the provider's tools")
             there = self.files.get_file_info(FileSelector(self.root, allow_not_found=True))
         strangers = sorted(one.base_name for one in there if one.base_name != OBJECTS)
         if strangers:
@@ -73,6 +85,18 @@ class Bucket:
                 while left and (block := content.read(min(BLOCK, left))):
                     file.write(block)
                     left -= len(block)
+
+    def open(self, path: str, part: Part) -> NativeFile:
+        """A file of the index, to read pieces of it.
+
+        Raises:
+            RemoteError: It is not there with that size.
+        """
+        with reaching(self.address, *self._errors):
+            file = self.files.open_input_file(self._object(part))
+            if file.size() != part.size:
+                raise RemoteError(f"{self.address}: {path} has another size than {INDEX} says; push it again")
+        return file
 
     def _object(self, part: Part) -> str:
         return f"{self.root}/{OBJECTS}/{part.sha256}"

@@ -63,8 +63,7 @@ def take_in(folder: Path, index: Index, out: Path, progress: Progress) -> dict[s
         RemoteError: Sequences are missing, or are not those that were pushed.
         GAPONetError: A file is not what it should be.
     """
-    robot = _robot(folder / BESIDE / KEPT)
-    source = folder / BESIDE / COLLECTED
+    robot = pushed_robot(folder)
     import_logs(
         folder, robot, None, None, out, fmt="lerobot", gravity=gravity_of(robot), simulator=model_hash(robot),
         progress=progress,
@@ -74,19 +73,26 @@ def take_in(folder: Path, index: Index, out: Path, progress: Progress) -> dict[s
     if found != set(index.contents):
         odd = len(found ^ set(index.contents))
         raise RemoteError(f"{odd} sequences are not those that were pushed, by their content hashes; push them again")
-    if source.is_file():
-        shutil.copyfile(source, out / COLLECTED)
-    for split in sorted((folder / BESIDE / "splits").glob("*.json")):
-        read_split(split, dataset)
-        (out / "splits").mkdir(exist_ok=True)
-        shutil.copyfile(split, out / "splits" / split.name)
+    bring_beside(folder, dataset)
     card = make_card(dataset)
     write_card(dataset, card, card_text(card))
     return {"sequences": len(dataset), "hours": dataset.hours(), "licence": card.get("licence", NOT_STATED)}
 
 
-def _robot(folder: Path) -> RobotSpec:
-    """A stranger's robot, which may name no file outside its folder."""
+def bring_beside(folder: Path, dataset: Dataset) -> None:
+    """Take splits and recipe out of what was downloaded into a dataset."""
+    source = folder / BESIDE / COLLECTED
+    if source.is_file():
+        shutil.copyfile(source, dataset.path / COLLECTED)
+    for split in sorted((folder / BESIDE / "splits").glob("*.json")):
+        read_split(split, dataset)
+        (dataset.path / "splits").mkdir(exist_ok=True)
+        shutil.copyfile(split, dataset.path / "splits" / split.name)
+
+
+def pushed_robot(folder: Path) -> RobotSpec:
+    """The robot in what was downloaded: a stranger's, which may name no file outside its folder."""
+    folder = folder / BESIDE / KEPT
     if not (folder / "robot.toml").is_file():
         raise DatasetError(f"{BESIDE}/{KEPT}: no robot.toml; push the dataset again")
     require_bare(folder)

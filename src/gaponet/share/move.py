@@ -57,7 +57,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
     path = Path(path).resolve()
     kind = _kind(path)
     target = open_target(address)
-    there = _read(target, kind)
+    there = read_index(target, kind)
     with _beside(path, "push") as folder, bar("reading") as update:
         _empty(folder)  # of a push that was killed
         if kind == "dataset":
@@ -89,11 +89,11 @@ def pull(address: str, out: str | Path) -> Moved:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not an empty folder; choose a new one")
     target = open_target(address)
-    index = _read(target, None)
+    index = read_index(target, None)
     if index is None:
         raise RemoteError(f"{address}: nothing was pushed there")
     with _beside(out.absolute(), "pull") as folder:
-        _download(target, index, folder / "files")
+        download(target, index, folder / "files")
         made = folder / "made"
         if made.exists():
             shutil.rmtree(made)
@@ -122,7 +122,7 @@ def _kind(path: Path) -> Kind:
     raise UsageError(f"{path}: neither a dataset (dataset.json) nor a run of gaponet train (split.json, config.json)")
 
 
-def _read(target: Target, kind: Kind | None) -> Index | None:
+def read_index(target: Target, kind: Kind | None) -> Index | None:
     """What is there, checked; None where nothing is."""
     content = target.index(kind)
     if content is None:
@@ -148,7 +148,7 @@ def _require_newer(there: Index, kind: Kind, contents: tuple[str, ...], address:
         )
 
 
-def _download(target: Target, index: Index, folder: Path) -> None:
+def download(target: Target, index: Index, folder: Path) -> None:
     """All files of the index below the folder; those that are there with the right hash stay."""
     folder.mkdir(exist_ok=True)
     missing = [(place, part) for place, part in index.files.items() if not _is(folder / place, part)]

@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,9 @@ from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stat
 from gaponet.data.log import Channel, Log
 from gaponet.errors import JointMismatchError, LogError, UsageError
 from gaponet.robot import RobotSpec
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 OPTIONS = ("position_unit", "joints")
 EXTRA = ""
@@ -73,6 +76,11 @@ def read(
             yield _motion(episode, tasks), partial(table.episode, episode)
 
 
+def read_episode(part: Set, episode: dict[str, Any], robot: RobotSpec, table: pa.Table) -> Log:
+    """The Log of one episode of what gaponet exported, from rows of its data file that were read elsewhere."""
+    return _Frames(part, part.data_file(episode), robot, None, _unit(part, None), None, table).episode(episode)
+
+
 def _unit(part: Set, given: str | None) -> str:
     """The unit of positions: stated by an export, else by the user."""
     stated = [(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
@@ -95,7 +103,7 @@ class _Frames:
 
     def __init__(
         self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
-        joints: list[str] | None,
+        joints: list[str] | None, table: pa.Table | None = None,
     ) -> None:  # fmt: skip
         self.part, self.file, self.robot, self.given = part, file, robot, joints
         features = part.features
@@ -115,7 +123,7 @@ class _Frames:
                     f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
                 )
         self.units = [self._joint_unit(j, unit) for j in self.joints]
-        table = read_table(file, (*present.values(), *INDEX))
+        table = read_table(file, (*present.values(), *INDEX), table=table)
         self.columns = {
             c: _matrix(file, table, f, len(self.joints))[:, [names[c].index(j) for j in self.joints]]
             for c, f in present.items()

@@ -6,7 +6,7 @@ import os.path
 import re
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, cast
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
 
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
@@ -14,6 +14,9 @@ from typing_extensions import TypedDict
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import LogError
 from gaponet.structure import parse_json, read_json, validated
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 VERSION = "v3.0"
 FEATURES = {
@@ -149,7 +152,7 @@ def _open(file: Path) -> Set:
 def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     said = STATED if ours else ()
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = read_table(file, (*NEEDED, *said), ("tasks",), hint)
+    table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash"), hint)
     rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
@@ -187,20 +190,26 @@ def tasks_of(part: Set) -> dict[int, str]:
     return {row["index"]: row["text"] for row in rows}
 
 
-def read_table(file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN) -> Any:
-    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file."""
+def read_table(
+    file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN, table: pa.Table | None = None
+) -> Any:
+    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file.
+
+    Args:
+        table: What was read of the file elsewhere, instead of all of it.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        parquet = pq.ParquetFile(file)
-        there = parquet.schema_arrow.names
+        source = pq.ParquetFile(file) if table is None else table
+        there = (source.schema_arrow if table is None else source.schema).names
         for name in need:
             if there.count(name) != 1:
                 text = "is missing" if name not in there else "stands twice"
                 raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
         wanted = [*need, *(name for name in also if there.count(name) == 1)]
-        return parquet.read(columns=wanted).select(wanted)
+        return (source.read(columns=wanted) if table is None else source).select(wanted)
     except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
         reason = str(error).split("\n")[0].rstrip(".")
         raise LogError(f"{file}: not a readable Parquet file ({reason}); {AGAIN}") from None
