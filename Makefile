@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults live peers engines browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -44,6 +44,10 @@ peers: setup
 # mjlab (in an environment of its own in ~/.cache/gaponet, some GB) plays exports beside AlignedSim: minutes.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/engine
+
+# SeaweedFS (S3) and a stand-in of GCS (in an environment of their own in ~/.cache/gaponet) take pushes and pulls: minutes.
+buckets: setup
+	$(BIN)/python -m pytest -m peers -s tests/share
 
 # Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup
