@@ -18,6 +18,7 @@ from gaponet.data.split import make_split, write_split
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import DatasetError, RemoteError, UsageError
 from gaponet.model.artifact import GapModel
+from gaponet.share.bucket import Bucket
 from gaponet.share.move import pull, push
 from gaponet.share.target import part_of
 
@@ -175,6 +176,11 @@ def test_a_pull_that_was_killed_left_nothing_under_its_name_and_goes_on(hub, dat
     pull("me/arm", tmp_path / "back")
     assert not arrived & hub.got.keys()
     same(dataset, Dataset(tmp_path / "back"))
+
+
+def test_keys_in_an_address_stand_in_no_error_and_no_card():
+    assert Bucket("s3://KEY:SECRET@robots/arm?region=us-east-1").address == "s3://robots/arm"
+    assert Bucket("gs://anonymous@robots/arm?scheme=http").address == "gs://robots/arm"
 
 
 def test_a_push_to_a_disk_that_was_cut_short_is_mended(dataset, tmp_path):

@@ -61,13 +61,13 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
     with _beside(path, "push") as folder, bar("reading") as update:
         _empty(folder)  # of a push that was killed
         if kind == "dataset":
-            contents = datasets.lay_out(path, folder / "files", address, update)
+            contents = datasets.lay_out(path, folder / "files", target.address, update)
             files = {f.relative_to(folder / "files").as_posix(): f for f in sorted((folder / "files").rglob("*"))
                      if f.is_file()}  # fmt: skip
         else:
-            files, contents = runs.lay_out(path, folder, address)
+            files, contents = runs.lay_out(path, folder, target.address)
         if there is not None and not replace:
-            _require_newer(there, kind, contents, address)
+            _require_newer(there, kind, contents, target.address)
         index = Index(FORMAT, kind, path.name, contents, {place: part_of(file) for place, file in files.items()})
         target.store(kind, files, (json.dumps(asdict(index), indent=1) + "\n").encode(), private)
     return Moved(kind, address, path, len(files), index.size, {})
@@ -91,7 +91,7 @@ def pull(address: str, out: str | Path) -> Moved:
     target = open_target(address)
     index = read_index(target, None)
     if index is None:
-        raise RemoteError(f"{address}: nothing was pushed there")
+        raise RemoteError(f"{target.address}: nothing was pushed there")
     with _beside(out.absolute(), "pull") as folder:
         download(target, index, folder / "files")
         made = folder / "made"
@@ -106,7 +106,7 @@ def pull(address: str, out: str | Path) -> Moved:
                     facts = runs.take_in(folder / "files", index, made)
         except GAPONetError as error:
             _empty(folder)  # whatever it is, it is not to be gone on with
-            raise RemoteError(f"{address}: {str(error).replace(str(folder), '')}") from None
+            raise RemoteError(f"{target.address}: {str(error).replace(str(folder), '')}") from None
         if out.exists():
             out.rmdir()
         made.rename(out)
