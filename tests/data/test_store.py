@@ -130,7 +130,7 @@ def test_a_newer_format_asks_for_an_upgrade(dataset):
 
 def test_a_folder_that_is_no_dataset_says_how_to_make_one(tmp_path):
     with pytest.raises(
-        DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import or collect"
+        DatasetError, match=r"not a dataset \(no dataset.json\); make one with gaponet import, collect or pull"
     ):
         Dataset(tmp_path)
 
