@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz kills lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz kills workers lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -70,6 +70,11 @@ kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks --only kills
 
+# A worker killed in the middle of collect, gap and a study, on local processes, Ray, Dask and submitit: ten minutes.
+workers: setup
+	$(BIN)/pip install -q -e ".[dev,ray,dask,submitit]"
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kill_workers.py workers_work
+
 # LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.
 LEROBOT ?= $(HOME)/.cache/gaponet/lerobot-0.6.1
 lerobot: $(LEROBOT)/.done
@@ -118,4 +123,4 @@ site: setup
 	$(BIN)/zensical build --strict --clean
 
 clean:
-	rm -rf $(VENV) .tools .ends dist site demo_run kills_work lerobot_work .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) .tools .ends dist site demo_run kills_work workers_work lerobot_work .pytest_cache .ruff_cache .mypy_cache

@@ -110,7 +110,7 @@ def played_without(bench: Bench, fleet: Fleet, change: Callable[[Physics], Physi
         Take(s.meta.motion, UNIT, s.meta.payload_mass, float(round(1 / s.dt)), s.meta.repetition) for s in bench.test
     )
     other = replace(fleet, units={UNIT: change(fleet.unit(UNIT))})
-    return play(Job(bench.nominal, other, load_recipe(RECIPE), 0, takes))
+    return play(Job(bench.nominal, other, load_recipe(RECIPE), (), 0, takes))
 
 
 def cell(values: Array) -> str:

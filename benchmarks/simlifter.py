@@ -29,7 +29,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.collect import collect, load_recipe
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.eval import dataset_figures
@@ -40,6 +39,7 @@ from gaponet.plot.style import save
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
+from gaponet.virtual.collect import collect, load_recipe
 from gaponet.virtual.fleet import load_fleet
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"

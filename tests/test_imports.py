@@ -11,7 +11,7 @@ SOURCE = Path(gaponet.__file__).parent
 # A module may import from its own rank or a lower one, also inside functions. The ground floor: plot and all modules of
 # the top folder that are not named here.
 RANKS = [
-    {"data"}, {"metrics"}, {"sim"}, {"family"}, {"motion"}, {"virtual", "collect"}, {"model"},
+    {"data"}, {"metrics"}, {"sim"}, {"family"}, {"motion"}, {"virtual"}, {"model"},
     {"training", "deploy", "engine"}, {"eval"}, {"study", "view", "bench", "share"}, {"api"}, {"cli"},
 ]  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")

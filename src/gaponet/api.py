@@ -6,6 +6,7 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 from __future__ import annotations
 
 import time
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import DatasetError, UsageError
-from gaponet.progress import bar
+from gaponet.progress import bar, noted
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import MOVE_KEPT
 
@@ -93,12 +94,13 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         return diagnose(data, spec, update, gravity_of(spec), heights)
 
 
-def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> int:
+def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, executor: str | Executor = "local") -> int:
     """Replay every sequence in the nominal simulator and keep the twin beside it; twins already there stay.
 
     Args:
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
+        executor: Where they are replayed: local, ray, dask or submitit (docs/scale.md), or one of concurrent.futures.
 
     Returns:
         How many twins were made.
@@ -108,10 +110,8 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> in
     """
     from gaponet.sim.replay import pair_dataset
 
-    data, spec = open_dataset(dataset, robot)
-    data.require_robot(spec)
     with bar("replaying") as update:
-        return pair_dataset(data, spec, lambda done, total: update(done, total, "control steps"))
+        return pair_dataset(*open_dataset(dataset, robot), noted(update, "control steps"), executor=executor)
 
 
 def gap(

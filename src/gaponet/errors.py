@@ -43,6 +43,10 @@ class RemoteError(GAPONetError):
     """A place on the network cannot be reached, or does not hold what it says."""
 
 
+class WorkerError(GAPONetError):
+    """The processes that worked on something died of it, one after the other."""
+
+
 class UsageError(GAPONetError):
     """Options contradict each other or are out of range."""
 
@@ -54,6 +58,7 @@ EXTRAS = {
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
     "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "tensorboard": "tensorboard", "wandb": "wandb",
     "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp",
+    "ray": "ray", "distributed": "dask", "dask": "dask", "submitit": "submitit",
 }  # fmt: skip
 
 

@@ -7,9 +7,12 @@ by writing such a folder; no code is needed.
 
 from __future__ import annotations
 
+import atexit
 import dataclasses
 import difflib
 import functools
+import shutil
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -133,6 +136,18 @@ class RobotSpec:
                 "choose a timestep that divides the control period"
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """With its files: another process may be on a machine that has not this folder."""
+        files = [self.mjcf, *self.folder.glob("*.toml")]
+        return vars(self) | {"files": {file.name: file.read_bytes() for file in files if file.is_file()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        files: dict[str, bytes] = state.pop("files")
+        vars(self).update(state)
+        if {f.name: f.read_bytes() for f in map(self.mjcf.parent.joinpath, files) if f.is_file()} != files:
+            folder = _unpacked(tuple(sorted(files.items())))
+            vars(self).update(folder=folder, mjcf=folder / self.mjcf.name)
+
     @property
     def decimation(self) -> int:
         """Physics steps per control period of dt."""
@@ -225,6 +240,16 @@ class RobotSpec:
             f"{where} names joint '{name}', but robot '{self.name}' has: {', '.join(self.joint_names)}. "
             f"Map it with --map {name}={hint}"
         )
+
+
+@functools.cache
+def _unpacked(files: tuple[tuple[str, bytes], ...]) -> Path:
+    """A folder with these files until this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="gaponet-robot-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for name, content in files:
+        (folder / name).write_bytes(content)
+    return folder
 
 
 def available() -> list[str]:

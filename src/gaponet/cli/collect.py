@@ -19,6 +19,7 @@ def collect(
     units: tuple[str, ...] = (),
     seed: int = 0,
     nproc: int = 0,
+    executor: str = "local",
     json: Json = False,
 ) -> None:
     """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset, each with its nominal twin.
@@ -33,9 +34,10 @@ def collect(
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.
         seed: Seed of motions, noise and start states.
-        nproc: Processes; 0 for one per core.
+        nproc: Processes, or jobs at a time; 0 for one per core.
+        executor: Where it is played: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md).
     """
-    import gaponet.collect as recording
+    import gaponet.virtual.collect as recording
     from gaponet.robot import load_robot
     from gaponet.virtual.fleet import load_fleet
 
@@ -51,6 +53,7 @@ def collect(
             seed,
             nproc,
             update,
+            executor=executor,
         )
     screen.table(
         f"VIRTUAL recordings, fleet {fleet}",

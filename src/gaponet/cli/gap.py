@@ -9,6 +9,7 @@ from gaponet import api
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import by_group, mrad, totals
+from gaponet.executor import LOCAL
 from gaponet.plot.methods import title
 from gaponet.plot.table import Table
 from gaponet.share.stream import open_dataset
@@ -19,14 +20,20 @@ SHOWN = 8  # columns of the totals that a screen has room for
 
 @like(api.gap)
 def gap(
-    dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, json: Json = False
-) -> None:
+    dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
+    json: Json = False,
+) -> None:  # fmt: skip
     """How far the simulator is from the robot, by joint, payload, …; with --run what each step up to its model removes.
 
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
+
+    Args:
+        executor: Where they are replayed: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md).
     """
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)
+    if executor != LOCAL:
+        api.pair(data, spec, executor)
     found = api.gap(data, spec, motions, run)
     if run is None:
         show_methods(out, found)

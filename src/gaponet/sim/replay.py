@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +14,7 @@ import numpy as np
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
+from gaponet.executor import LOCAL, opened
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints, loosen_friction, model_hash
@@ -147,10 +151,11 @@ def pair_dataset(
     progress: Progress | None = None,
     entries: list[Entry] | None = None,
     lock_idle: bool = False,
+    executor: str | Executor = LOCAL,
 ) -> int:
     """Replay the sequences that have no twin for this simulator yet, and store the twins; returns how many.
 
-    All sequences, or only some; `lock_idle` as in replay.
+    All sequences, or only some; `lock_idle` as in replay. Locally on threads of this process, else on an executor.
     Twins are kept per simulator hash: changing a gain makes new ones and leaves the old.
     """
     dataset.require_robot(robot)
@@ -159,20 +164,28 @@ def pair_dataset(
     if not todo:
         return 0
     with dataset.writing():
-        _pair(dataset, robot, todo, progress, lock_idle)
+        _pair(dataset, robot, todo, progress or (lambda done, total: None), lock_idle, executor)
     return len(todo)
 
 
-def _pair(dataset: Dataset, robot: RobotSpec, todo: list[Entry], progress: Progress | None, lock_idle: bool) -> None:
+def _pair(
+    dataset: Dataset, robot: RobotSpec, todo: list[Entry], progress: Progress, lock_idle: bool,
+    executor: str | Executor,
+) -> None:  # fmt: skip
     total, done = sum(e.rows - 1 for e in todo), 0
-    for start in range(0, len(todo), BATCH):
-        part = todo[start : start + BATCH]
-
-        def tell(k: int, of: int, before: int = done) -> None:
-            if progress is not None:
-                progress(before + k, total)
-
-        twins = replay(dataset.sequences(part), robot, progress=tell, lock_idle=lock_idle)
-        for entry, twin in zip(part, twins, strict=True):
-            dataset.write_twin(entry, twin)
-        done += sum(e.rows - 1 for e in part)
+    parts = [todo[start : start + BATCH] for start in range(0, len(todo), BATCH)]
+    sequences = map(dataset.sequences, parts)
+    work = partial(replay, robot=robot, lock_idle=lock_idle)
+    with ExitStack() as stack:
+        if executor == LOCAL:
+            replayed: Iterator[list[Twin]] = (
+                work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
+            )
+        else:
+            pool = stack.enter_context(opened(executor, 0, 1, dataset.path))
+            replayed = pool.map(partial(work, nthread=1), sequences)
+        for part, twins in zip(parts, replayed, strict=True):
+            for entry, twin in zip(part, twins, strict=True):
+                dataset.write_twin(entry, twin)
+            done += sum(e.rows - 1 for e in part)
+            progress(done, total)

@@ -13,6 +13,7 @@ from gaponet.data.json_file import read_kept, write_json
 from gaponet.errors import ModelError
 from gaponet.eval.evaluate import split_of_run
 from gaponet.eval.whose import label
+from gaponet.executor import opened
 from gaponet.plot.table import Spread, Table
 from gaponet.progress import Running
 from gaponet.sim.model import model_hash
@@ -114,7 +115,10 @@ def train_all(cells: ListOf[Cell], study: Study, show: Show) -> list[str]:
         ModelError: Nothing came out at all.
     """
     todo = [c for c in cells if not c.done]
-    failed = run_cells(todo, train_and_evaluate, study.processes, show) if todo else {}
+    failed = dict[str, str]()
+    if todo:
+        with opened(study.executor, study.workers, study.threads, study.out) as pool:
+            failed = run_cells(todo, train_and_evaluate, pool, show)
     if not any(c.done for c in cells):
         raise ModelError(f"{study.out}: every training failed; the first: {next(iter(failed.values()))}")
     return [f"{name} failed and is not in these numbers: {reason}" for name, reason in failed.items()]

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import tyro
 
+from gaponet.executor import LOCAL
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 
 # Small rounds, fitted until labels are (progress.jsonl: label_rmse); of 200 gradient steps a product has the advantage.
@@ -32,6 +33,8 @@ class Options:
     """How long each training takes: time such as 90s or 10m, or control steps; 76800, with --quick 2560."""
     workers: int = 0
     """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
+    executor: str = LOCAL
+    """Where they run: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md)."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """A rehearsal in minutes: a slice of the dataset, a budget that teaches nothing, numbers that mean nothing."""
     robot: str | None = None

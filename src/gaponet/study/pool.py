@@ -1,4 +1,4 @@
-"""Cells of a comparison: every (model, seed) in a process of its own, as many at once as there are cores.
+"""Cells of a comparison: every (model, seed) a job, as many at once as there are cores, or on a cluster.
 
 Each cell simulates and learns on one thread. Cells that share a thread pool wait for each other: two trainings at once
 with two threads each took three times as long as one after the other (docs/log.md).
@@ -9,23 +9,20 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError, missing_extra
-from gaponet.files import write_text, writing
+from gaponet.executor import BEAT, Pool
+from gaponet.files import MARK, write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.progress import Running
 from gaponet.robot import RobotSpec
@@ -37,8 +34,7 @@ from gaponet.training.config import TrainConfig
 Tell = Callable[[float, str], None]  # share done, what is going on
 
 SETUP, RESULT = "setup.json", "cell.json"
-POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-TELL_EVERY = 0.3  # s
+LOST = 180.0  # s without a sign of the parent; what a shared folder shows may be a minute old
 PATIENCE = 60.0  # s; the cells of a comparison that was killed notice it at their next step
 
 
@@ -180,102 +176,110 @@ def _card(folder: Path) -> dict[str, Any]:
     return read_kept(file) if file.is_file() else {}
 
 
+@dataclass
+class _Post:
+    """How a cell tells its parent how far it is, and learns that nobody waits for it: two files that both can see.
+
+    The parent touches `alive` all the time and removes it when it goes.
+    """
+
+    said: Path
+    alive: Path
+    last: float = 0.0
+    beat: float = 0.0
+    heard: float = 0.0
+
+    def __call__(self, share: float, note: str) -> None:
+        now = time.monotonic()
+        if now - self.last < BEAT:
+            return
+        self.last = now
+        try:
+            beat = self.alive.stat().st_mtime
+        except FileNotFoundError:
+            raise KeyboardInterrupt from None
+        if beat != self.beat:
+            self.beat, self.heard = beat, now
+        elif now - self.heard > LOST:
+            raise KeyboardInterrupt
+        self.said.write_text(json.dumps([share, note]), encoding="utf-8")
+
+
 def run_cells(
     cells: ListOf[Cell],
     work: Callable[[Cell, Tell], None],
-    workers: int,
+    pool: Pool,
     show: Callable[[Running, int], None] = lambda running, done: None,
 ) -> dict[str, str]:
-    """Do the work of each cell in a process of its own; returns the failures, name → reason.
+    """Do the work of each cell somewhere; returns the failures, name → reason.
 
     Args:
-        work: What to do with one; a module's function, since processes are spawned.
-        show: Called with the running cells and how many are done, whenever something changes.
+        work: What to do with one; a module's function.
+        pool: Its workers see the cells' folders and the dataset under the same paths.
+        show: Called with the running cells and how many are done, all the time.
 
     Raises:
         KeyboardInterrupt: After every running cell has kept what it reached.
     """
-    waiting, failed, context = list(cells), dict[str, str](), get_context("spawn")
-    running: dict[Connection, tuple[Cell, BaseProcess]] = {}
-    state: Running = {}
+    failed, done, own = dict[str, str](), 0, f"{MARK}-{os.getpid()}-"
+    cells = [replace(c, folder=c.folder.absolute()) for c in cells]
+    shown: tuple[Running, int] = {}, 0
+    alive = cells[0].folder.with_name(f"{own}alive")
+    posts = {c.name: _Post(c.folder.with_name(own + c.folder.name), alive) for c in cells}
+
+    def look() -> None:
+        nonlocal shown
+        os.utime(alive)
+        now = {name: told for name, post in posts.items() if (told := _told(post.said))}, done
+        if now != shown:
+            shown = now
+            show(*now)
+
+    def stop(job: tuple[Cell, _Post]) -> bool:
+        alive.unlink(missing_ok=True)
+        return job[1].said.exists()
+
+    for cell in cells:
+        cell.folder.parent.mkdir(parents=True, exist_ok=True)
+    alive.touch()
     try:
-        while waiting or running:
-            while waiting and len(running) < workers:
-                cell, (here, there) = waiting.pop(0), context.Pipe(duplex=False)
-                process: BaseProcess = context.Process(
-                    target=_child, args=(cell, work, there, os.getpid()), daemon=True
-                )
-                with _one_thread_each(cell.threads):
-                    process.start()
-                there.close()
-                running[here], state[cell.name] = (cell, process), (0.0, "starting")
-            for pipe in wait(list(running)):
-                assert isinstance(pipe, Connection)
-                cell, worker = running[pipe]
-                try:
-                    message = pipe.recv()
-                    if isinstance(message, str):
-                        failed[cell.name] = message
-                    else:
-                        state[cell.name] = message
-                except EOFError:
-                    worker.join()
-                    pipe.close()
-                    del running[pipe], state[cell.name]
-                    if worker.exitcode and cell.name not in failed:
-                        failed[cell.name] = f"its process ended with {worker.exitcode}; out of memory?"
-            show(dict(state), len(cells) - len(waiting) - len(running))
+        for outcome in pool.run(partial(_cell, work), ((c, posts[c.name]) for c in cells), look, stop):
+            cell, post = outcome.job
+            reason = outcome.value if outcome.error is None else str(outcome.error)
+            failed |= {cell.name: reason} if reason else {}
+            post.said.unlink(missing_ok=True)
+            done += 1
+            look()
     finally:
-        for _, worker in running.values():
-            worker.terminate()
-        for _, worker in running.values():
-            worker.join()
+        for file in (alive, *(post.said for post in posts.values())):
+            file.unlink(missing_ok=True)
     return failed
 
 
-def _child(cell: Cell, work: Callable[[Cell, Tell], None], pipe: Connection, parent: int) -> None:
-    """A cell's process. Ctrl-C in the terminal reaches parent and children: the parent tells the children, once."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    last = 0.0
+def _told(file: Path) -> tuple[float, str] | None:
+    """What a running cell said last."""
+    try:
+        share, note = json.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):  # not yet, or just being written
+        return None
+    return float(share), str(note)
 
-    def tell(share: float, note: str) -> None:
-        nonlocal last
-        if time.monotonic() - last < TELL_EVERY:
-            return
-        last = time.monotonic()
-        if os.getppid() != parent:
-            raise KeyboardInterrupt  # nobody waits for this cell any more
-        pipe.send((share, note))
 
+def _cell(work: Callable[[Cell, Tell], None], job: tuple[Cell, _Post]) -> str | None:
+    """A cell in its worker; returns why it failed."""
+    cell, tell = job
     file = cell.folder.with_name(cell.folder.name + ".error.txt")
     try:
+        tell(0.0, "starting")
         file.unlink(missing_ok=True)
         work(cell, tell)
     except KeyboardInterrupt:
-        os._exit(130)
+        return "nobody waited for it any more; what it reached is kept"
     except (GAPONetError, OSError) as error:  # a full disk is no bug
-        pipe.send(str(error))
+        return str(error)
     except Exception as error:
         missing = missing_extra(error) if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None:
-            pipe.send(missing)
-            return
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_text(file, traceback.format_exc())
-        pipe.send(f"{type(error).__name__}: {error} (see {file})")
-
-
-@contextmanager
-def _one_thread_each(threads: int) -> Iterator[None]:
-    """What libraries read from the environment when a process starts."""
-    before = {name: os.environ.get(name) for name in POOLS}
-    os.environ.update(dict.fromkeys(POOLS, str(threads)))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        if missing is None:
+            write_text(file, traceback.format_exc())
+        return missing or f"{type(error).__name__}: {error} (see {file})"
+    return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.eval.whose import who
+from gaponet.executor import LOCAL, MOST_WORKERS, cores
 from gaponet.plot.methods import IDENTIFIED
 from gaponet.robot import RobotSpec
 from gaponet.study.options import (
@@ -50,7 +50,9 @@ class Study:
     """How many seeds, counted from config.seed."""
     holdout_units: tuple[str, ...] = ()
     workers: int = 0
-    """Processes at once; 0 for as many as there are cores."""
+    """Trainings at once; 0 for as many as there are cores."""
+    executor: str = LOCAL
+    """Where they run (gaponet.executor)."""
     rehearsal: bool = False
     """Whether its numbers mean nothing."""
     identified: RobotSpec | None = None
@@ -85,7 +87,7 @@ class Study:
         return cls(
             data, robot, out, config, options.budget or (QUICK_BUDGET if quick else BUDGET),
             options.seeds if options.seeds is not None else QUICK_SEEDS if quick else SEEDS,
-            holdout_units, options.workers, quick,
+            holdout_units, options.workers, options.executor, quick,
         )  # fmt: skip
 
     @property
@@ -94,9 +96,14 @@ class Study:
         return who(self.data.entries) + (", REHEARSAL" if self.rehearsal else "")
 
     @property
-    def processes(self) -> int:
-        """At once."""
-        return self.workers or max(1, (os.cpu_count() or 1) // (self.config.threads or 1))
+    def threads(self) -> int:
+        """Of one training."""
+        return self.config.threads or 1
+
+    @property
+    def at_once(self) -> int:
+        """Trainings, as far as is known before a cluster is asked."""
+        return self.workers or (cores(self.threads) if self.executor == LOCAL else MOST_WORKERS)
 
     def variant(self, word: str) -> Variant:
         """A model as written, on this configuration."""
@@ -113,7 +120,7 @@ class Study:
         variants = [self.variant(w) for w in words]
         return plan(
             self.data, variants, numbers, self._simulator, self.out / into, self.budget, self.holdout_units,
-            self.config.threads or 1,
+            self.threads,
         )  # fmt: skip
 
     def _simulator(self, variant: Variant) -> RobotSpec:
@@ -131,7 +138,7 @@ def expected_s(cells: ListOf[Cell], study: Study) -> float:
     taken = [read_kept(c.folder / RESULT)["seconds"] for c in done]
     factor = sum(taken) / sum(_cost(c) for c in done) if done else REHEARSAL if study.rehearsal else 1.0
     todo = [_cost(c) * factor for c in cells if not c.done]
-    return max(sum(todo) / study.processes, max(todo, default=0.0))
+    return max(sum(todo) / study.at_once, max(todo, default=0.0))
 
 
 def _cost(cell: Cell) -> float:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.motion.files import read_motion
 from gaponet.motion.library import Library
 from gaponet.motion.motion import Motion
 from gaponet.motion.recipe import Recipe, Take
@@ -29,6 +28,8 @@ class Job:
     robot: RobotSpec
     fleet: Fleet
     recipe: Recipe
+    files: tuple[Motion, ...]
+    """The motions of the recipe's files."""
     seed: int
     takes: tuple[Take, ...]
 
@@ -36,20 +37,20 @@ class Job:
 _LIBRARIES: dict[tuple[str, int, float, tuple[str, ...]], Library] = {}  # of this process: what they found is kept
 
 
-def library(robot: RobotSpec, seed: int, recipe: Recipe) -> Library:
+def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ...]) -> Library:
     """The motions that a recipe chooses from."""
     key = (str(robot.mjcf), seed, max(recipe.payloads), recipe.files)
     if key not in _LIBRARIES:
         motions = Library(robot, seed, max(recipe.payloads))
-        for file in recipe.files:
-            motions.add(read_motion(file, robot))
+        for motion in files:
+            motions.add(motion)
         _LIBRARIES[key] = motions
     return _LIBRARIES[key]
 
 
 def play(job: Job) -> list[Sequence]:
     """Record the takes of a job, in order."""
-    source = library(job.robot, job.seed, job.recipe)
+    source = library(job.robot, job.seed, job.recipe, job.files)
     motions = {name: source.make(name) for name in dict.fromkeys(t.motion for t in job.takes)}
     locked = {name: _standing(job.robot, motion) for name, motion in motions.items()}
     done: dict[Take, Sequence] = {}

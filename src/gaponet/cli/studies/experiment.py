@@ -55,7 +55,7 @@ def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
     rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
     screen.say(
         f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
-        + (f"; the others take {rest}, {study.processes} at a time" if todo else "")
+        + (f"; the others take {rest}, {study.at_once} at a time" if todo else "")
     )
     return bars("trainings", todo)
 

@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gaponet.collect import fleet_of
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.eval.whose import label
@@ -20,6 +19,7 @@ from gaponet.study.options import Options
 from gaponet.study.played.trained import Trained, load_trained
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
+from gaponet.virtual.collect import fleet_of
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.collect import fleet_of
 from gaponet.data.sequence import Sequence
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.payload import PayloadEstimate
@@ -27,6 +26,7 @@ from gaponet.study.found import Found
 from gaponet.study.played.play import WARMTH
 from gaponet.study.played.simulators import errors, recorded
 from gaponet.study.study import Study
+from gaponet.virtual.collect import fleet_of
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.unit import VirtualRobot
 

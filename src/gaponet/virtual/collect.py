@@ -7,16 +7,11 @@ interrupted is continued by running it again, and ends with the same samples as 
 from __future__ import annotations
 
 import json
-import os
-import signal
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +19,9 @@ from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
 from gaponet.errors import DatasetError, UsageError
+from gaponet.executor import LOCAL, MOST_WORKERS, cores, opened
 from gaponet.files import write_text, writing
+from gaponet.motion.files import read_motion
 from gaponet.motion.recipe import Recipe, Take, load_recipe, takes
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
@@ -38,7 +35,6 @@ from gaponet.virtual.play import Job, library, play
 __all__ = ["Collected", "Recipe", "collect", "load_recipe"]
 
 CLAIM, HARD = "collect.json", "hard"
-MOST_PROCESSES = 1024
 ROWS = (36, 144)  # takes recorded together: enough to make numpy's share small, few enough to lose little when killed
 
 
@@ -65,6 +61,7 @@ def collect(
     nproc: int = 0,
     progress: Progress = silent,
     twins: bool = True,
+    executor: str | Executor = LOCAL,
 ) -> Collected:
     """Record every take of a recipe that the dataset at `out` does not hold yet.
 
@@ -73,6 +70,7 @@ def collect(
         nproc: Processes; 0 for one per core, 1 for none beside this one. More than one starts fresh interpreters: a
             script that calls this needs `if __name__ == "__main__":`.
         twins: Store the nominal twin of each sequence beside it, limbs that stand still locked in both.
+        executor: Where it is played (gaponet.executor); recordings come back by themselves, no folder is shared.
 
     Raises:
         UsageError: The recipe names a motion, unit or file that does not exist.
@@ -81,13 +79,14 @@ def collect(
     """
     start = time.monotonic()
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)  # options may have changed it
-    if not 0 <= nproc <= MOST_PROCESSES or not 0 <= seed < 2**63:
+    if not 0 <= nproc <= MOST_WORKERS or not 0 <= seed < 2**63:
         raise UsageError(
-            f"--nproc {nproc}, --seed {seed}: up to {MOST_PROCESSES} processes, 0 for one per core; seed ≥ 0"
+            f"--nproc {nproc}, --seed {seed}: up to {MOST_WORKERS} processes, 0 for one per core; seed ≥ 0"
         )
     for unit in recipe.units:
         fleet.unit(unit)
-    wanted = takes(recipe, library(robot, seed, recipe).names(recipe.variants))
+    files = tuple(read_motion(file, robot) for file in recipe.files)
+    wanted = takes(recipe, library(robot, seed, recipe, files).names(recipe.variants))
     with writing(Path(out), KIND):
         dataset = Dataset.create(out, robot)
         require_kept(dataset.path, robot, DatasetError, MOVE_KEPT)
@@ -97,11 +96,10 @@ def collect(
         }
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
         written, seconds = 0, 0.0
-        nproc = nproc or os.cpu_count() or 1
-        jobs = [Job(robot, fleet, recipe, seed, tuple(part)) for part in _parts(missing, nproc)]
+        jobs = [Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _parts(missing, nproc or cores(1))]
         if twins:
             pair_dataset(dataset, robot, lock_idle=True)  # those that a killed run had no time for
-        for sequence, twin in _record(jobs, nproc, twins):
+        for sequence, twin in _record(jobs, nproc, twins, executor, dataset.path):
             entry = dataset.append(sequence)
             if twin is not None:
                 dataset.write_twin(entry, twin)
@@ -171,30 +169,18 @@ def _parts(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
             left -= len(part)
 
 
-def _record(jobs: list[Job], nproc: int, twins: bool) -> Iterator[tuple[Sequence, Twin | None]]:
-    """Sequences in the jobs' order, whichever process is first."""
-    if nproc == 1 or len(jobs) < 2:
+def _record(
+    jobs: list[Job], nproc: int, twins: bool, executor: str | Executor, folder: Path
+) -> Iterator[tuple[Sequence, Twin | None]]:
+    """Sequences in the jobs' order, whichever worker is first."""
+    work = partial(_played, twins=twins)
+    if executor == LOCAL and (len(jobs) < 2 or (nproc or cores(1)) == 1):
         for job in jobs:
-            yield from _played(job, twins)
+            yield from work(job)
         return
-    with ProcessPoolExecutor(min(nproc, len(jobs)), get_context("spawn"), _leave_with, (os.getpid(),)) as pool:
-        with _ctrl_c_for_us_alone():
-            parts = pool.map(partial(_played, twins=twins), jobs)
-        for played in parts:
+    with opened(executor, nproc, 1, folder) as pool:
+        for played in pool.map(work, jobs):
             yield from played
-
-
-@contextmanager
-def _ctrl_c_for_us_alone() -> Iterator[None]:
-    """Processes started here ignore it: they end their part, or with this process."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _played(job: Job, twins: bool) -> list[tuple[Sequence, Twin | None]]:
@@ -203,14 +189,3 @@ def _played(job: Job, twins: bool) -> list[tuple[Sequence, Twin | None]]:
     if not twins:
         return [(s, None) for s in sequences]
     return list(zip(sequences, replay(sequences, job.robot, nthread=1, lock_idle=True), strict=True))
-
-
-def _leave_with(parent: int) -> None:
-    """A worker whose parent was killed would wait for work forever: it ends itself instead."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.collect import Recipe, collect, load_recipe
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, FolderError, UsageError
 from gaponet.files import writing
@@ -21,6 +20,7 @@ from gaponet.motion.library import Library
 from gaponet.motion.recipe import takes
 from gaponet.robot import load_robot
 from gaponet.sim.model import model_hash
+from gaponet.virtual.collect import Recipe, collect, load_recipe
 from gaponet.virtual.fleet import load_fleet
 from gaponet.virtual.physics import Physics
 
@@ -127,12 +127,12 @@ def test_collecting_again_adds_nothing_and_a_larger_recipe_adds_the_rest(whole, 
 
 CHILD = """
 import sys
-import gaponet.collect
-from gaponet.collect import Recipe, collect
+import gaponet.virtual.collect
+from gaponet.virtual.collect import Recipe, collect
 from gaponet.robot import load_robot
 from gaponet.virtual.fleet import load_fleet
 if __name__ == "__main__":
-    gaponet.collect.ROWS = (4, 4)  # four jobs: the last two are still being played when the first two are written
+    gaponet.virtual.collect.ROWS = (4, 4)  # four jobs: two are still being played when two are written
     robot = load_robot(sys.argv[1])
     recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
     collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
