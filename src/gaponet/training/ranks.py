@@ -12,6 +12,8 @@ from __future__ import annotations
 import hashlib
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
@@ -27,11 +29,11 @@ from gaponet.model.layers import Standardise
 from gaponet.training.config import TrainConfig
 
 T = TypeVar("T")
-SILENCE = timedelta(seconds=45)  # of a rank, at a step that all take: it has failed
-ALONE = timedelta(hours=24)  # for what one rank does while the others wait
+BEAT, SILENCE = 2.0, 25.0  # s between two signs of life of a rank; without one it is frozen, or its machine is gone
+START = 300.0  # s until the first of them
+ALONE = timedelta(hours=24)  # for what one rank does while the others wait: who is busy is not silent
 APART = 1_000_003  # between the seeds of two ranks; the seeds of a study are neighbours
 
-_patient: Any = None  # the group in which the others wait for the first rank
 _interrupted = False
 _parent = os.getppid()  # torchrun
 
@@ -63,10 +65,9 @@ def joined(device: str) -> Iterator[None]:
     Ctrl-C meanwhile ends all of them at the same step (`decided`).
 
     Raises:
-        ModelError: Another rank failed, or was silent for SILENCE.
+        ModelError: Another rank failed.
         UsageError: There are not so many GPUs.
     """
-    global _patient
     if not dist.is_available() or not dist.is_torchelastic_launched() or dist.is_initialized():
         yield
         return
@@ -75,14 +76,34 @@ def joined(device: str) -> Iterator[None]:
         raise UsageError(f"--device cuda: torchrun --nproc-per-node asks for more than the {gpus} GPUs of this machine")
     if gpus:
         torch.cuda.set_device(local)
-    dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=SILENCE)
-    _patient = dist.new_group(timeout=ALONE, backend="gloo")
+    left = threading.Event()
+    threading.Thread(target=_watch, args=(started(), int(os.environ["WORLD_SIZE"]), left), daemon=True).start()
+    dist.init_process_group("cpu:gloo,cuda:nccl" if gpus else "gloo", timeout=ALONE)
     before = signal.signal(signal.SIGINT, signal.SIG_IGN if rank() else _interrupt)
     try:
         yield
     finally:
+        left.set()
         signal.signal(signal.SIGINT, before)
         dist.destroy_process_group()
+
+
+def _watch(here: int, ranks: int, left: threading.Event) -> None:
+    """Give signs of life, and end this process where another rank gives none."""
+    store = dist.TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False)
+    beats, since = [0] * ranks, [time.monotonic() + START - SILENCE] * ranks
+    while not left.wait(BEAT):
+        try:
+            store.add(f"gaponet/{here}", 1)
+            heard = [store.add(f"gaponet/{other}", 0) for other in range(ranks)]
+        except RuntimeError:  # torchrun is gone: `decided` ends the training
+            return
+        since = [t if now == old else time.monotonic() for t, now, old in zip(since, heard, beats, strict=True)]
+        beats = heard
+        if not left.is_set() and (silent := time.monotonic() - min(since)) > SILENCE:
+            who = since.index(min(since))
+            os.write(2, f"rank {here}: rank {who} has been silent for {silent:.0f} s; --resume goes on\n".encode())
+            os._exit(1)
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -99,8 +120,7 @@ def _together() -> Iterator[None]:
     except RuntimeError as error:
         reason = str(error).partition(". ")[0]
         raise ModelError(
-            f"rank {rank()}: another rank has failed or is silent ({reason}); the run goes on from its last checkpoint "
-            "with --resume"
+            f"rank {rank()}: another rank has failed ({reason}); the run goes on from its last checkpoint with --resume"
         ) from None
 
 
@@ -128,15 +148,8 @@ def once(work: Callable[[], T]) -> T:
         return work()
     said = [None if rank() else work()]
     with _together():
-        dist.broadcast_object_list(said, 0, group=_patient)
+        dist.broadcast_object_list(said, 0)
     return said[0]  # type: ignore[return-value]
-
-
-def meet() -> None:
-    """Wait for all ranks, as long as it takes: after work that may take one of them far longer than another."""
-    if world() > 1:
-        with _together():
-            dist.barrier(_patient)
 
 
 def gathered(own: T) -> list[T]:

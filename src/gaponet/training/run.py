@@ -172,7 +172,6 @@ class Trainer:
             rounds = self.kept.warm["rounds"]
             restore_warm(warm, self.kept.warm)
             torch.set_rng_state(self.rng)
-        ranks.meet()
         while (
             warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
         ):
