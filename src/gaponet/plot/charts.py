@@ -239,9 +239,9 @@ def lines(
             ax.minorticks_off()
         if ticks:
             ax.set_xticks([x for x, _ in ticks], [t for _, t in ticks])
-        ax.set_ylim(bottom=0)
         ax.set_xlabel(axes[0])
         ax.set_title(title)
+    fig.axes[0].set_ylim(bottom=0)  # shared, and from now on no longer found from what is drawn
     fig.axes[0].set_ylabel(axes[1])
     legend(fig)
     return fig
