@@ -1,6 +1,6 @@
 """Proof that a worker killed with kill -9 changes no result: collect, gap and a study, on each executor.
 
-    python benchmarks/kill_workers.py WORK [--executors local ray dask submitit] [--seed 0]
+    python benchmarks/kill_workers.py WORK [--executors local ray dask submitit] [--only collect gap study] [--seed 0]
 
 Collects a small VIRTUAL SO-101 set, pairs it and trains two cells of a study, undisturbed on local processes, then on
 each executor with kill -9 of a worker in the middle of its job. Compared are hashes of the recordings and twins, hashes
@@ -59,7 +59,7 @@ def busiest(sign: str, command: int) -> int | None:
             try:
                 if int(place.name) != command and f"{SIGN}={sign}".encode() in (place / "environ").read_bytes():
                     line = (place / "cmdline").read_bytes()
-                    if b"python" in line or line.startswith(b"ray::_call"):
+                    if b"spawn_main" in line or b"submitit.core._submit" in line or line.startswith(b"ray::_call"):
                         found[int(place.name)] = int((place / "stat").read_text().rpartition(")")[2].split()[11])
             except OSError:
                 continue
@@ -79,8 +79,8 @@ def playing(out: Path, sign: str, command: int) -> int | None:
 
 
 def pairing(out: Path, sign: str, command: int) -> int | None:
-    """A worker that replays."""
-    return busiest(sign, command)
+    """A worker that replays, once some twins were written."""
+    return busiest(sign, command) if any(out.rglob("twins/**/*.parquet")) else None
 
 
 def training(out: Path, sign: str, command: int) -> int | None:
@@ -123,9 +123,10 @@ def disturbed(
                 time.sleep(wait)
                 told["listens"] = listening(sign)
                 try:
+                    name = Path(f"/proc/{worker}/cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
                     os.kill(worker, signal.SIGKILL)
-                    told |= {"killed": 1, "after_s": round(time.monotonic() - began, 1)}
-                except ProcessLookupError:
+                    told |= {"killed": 1, "victim": name[-70:], "after_s": round(time.monotonic() - began, 1)}
+                except (ProcessLookupError, FileNotFoundError):
                     continue
             time.sleep(0.05)
         if child.poll() is None:
@@ -138,6 +139,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--executors", nargs="+", default=["local", "ray", "dask", "submitit"])
+    parser.add_argument("--only", nargs="+", default=["collect", "gap", "study"])
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()
     work, rng, found, wrong = args.work.resolve(), np.random.default_rng(args.seed), {}, []
@@ -162,6 +164,8 @@ def main() -> int:
             ready = out.with_suffix(".done")
             if executor == "whole" and ready.exists():
                 continue
+            if executor != "whole" and (name not in args.only or (name, executor) == ("gap", "local")):
+                continue  # the latter: threads of the command itself
             shutil.rmtree(out, ignore_errors=True)
             if name == "gap":
                 shutil.copytree(data, out, ignore=shutil.ignore_patterns("twins"))
@@ -171,8 +175,6 @@ def main() -> int:
                     return 1
                 ready.touch()
                 continue
-            if name == "gap" and executor == "local":
-                continue  # threads of the command itself
             told = disturbed(command(name, out, executor), out, victim, rng.uniform(0, wait))
             told["same"] = not told["exit"] and content(out) == content(work / "whole" / name)
             found[f"{executor} {name}"] = told
