@@ -90,13 +90,16 @@ def joined(device: str) -> Iterator[None]:
 
 def _watch(here: int, ranks: int, left: threading.Event) -> None:
     """Give signs of life, and end this process where another rank gives none."""
-    store = dist.TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False)
+    store: Any = None
     beats, since = [0] * ranks, [time.monotonic() + START - SILENCE] * ranks
     while not left.wait(BEAT):
         try:
+            store = store or dist.TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False)
             store.add(f"gaponet/{here}", 1)
             heard = [store.add(f"gaponet/{other}", 0) for other in range(ranks)]
-        except RuntimeError:  # torchrun is gone: `decided` ends the training
+        except RuntimeError:  # torchrun is gone: `decided` ends the training, if it has begun
+            if not dist.is_initialized():
+                os._exit(1)
             return
         since = [t if now == old else time.monotonic() for t, now, old in zip(since, heard, beats, strict=True)]
         beats = heard
