@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import signal
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Union
 
@@ -109,6 +111,8 @@ def _command(kind: type[Any]) -> Any:
     usual = DEFAULTS.get(kind, Options())
 
     def ask(dataset: Any, out: Any, question: Any, options: Any = usual) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # options are understood (__main__.py)
         _ask(kind, dataset, out, question, options)
 
     place = Folder
