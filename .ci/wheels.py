@@ -38,6 +38,7 @@ TRIES = {
     "gym": [GYM],
     "ros": ["data export data --to mcap --out bags", "import bags --robot so101 --out again"],
     "hdf5": ["formats"],
+    "dask": ["collect --robot so101 --recipe recipe.toml --out data2 --nproc 1 --executor dask"],
     "deploy,view": ["view data --model run --duration 1 --render film.gif"],
 }  # fmt: skip
 
