@@ -90,17 +90,24 @@ def joined(device: str) -> Iterator[None]:
 
 def _watch(here: int, ranks: int, left: threading.Event) -> None:
     """Give signs of life, and end this process where another rank gives none."""
-    store: Any = None
+    store, met = None, time.monotonic()
     beats, since = [0] * ranks, [time.monotonic() + START - SILENCE] * ranks
     while not left.wait(BEAT):
         try:
-            store = store or dist.TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), is_master=False)
+            if store is None:
+                host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+                store = dist.TCPStore(host, port, is_master=False, timeout=timedelta(seconds=BEAT))
             store.add(f"gaponet/{here}", 1)
             heard = [store.add(f"gaponet/{other}", 0) for other in range(ranks)]
-        except RuntimeError:  # torchrun is gone: `decided` ends the training, if it has begun
-            if not dist.is_initialized():
+        except RuntimeError:  # torchrun, whose store it is, is gone
+            if dist.is_initialized():
+                return  # `decided` ends the training
+            if time.monotonic() - met > SILENCE:
+                os.write(2, f"rank {here}: torchrun does not answer at {host}:{port}\n".encode())
                 os._exit(1)
-            return
+            store = None
+            continue
+        met = time.monotonic()
         since = [t if now == old else time.monotonic() for t, now, old in zip(since, heard, beats, strict=True)]
         beats = heard
         if not left.is_set() and (silent := time.monotonic() - min(since)) > SILENCE:
