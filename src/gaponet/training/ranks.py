@@ -30,7 +30,7 @@ from gaponet.training.config import TrainConfig
 
 T = TypeVar("T")
 BEAT, SILENCE = 2.0, 25.0  # s between two signs of life of a rank; without one it is frozen, or its machine is gone
-START = 300.0  # s until the first of them
+START = 120.0  # s until the first of them
 ALONE = timedelta(hours=24)  # for what one rank does while the others wait: who is busy is not silent
 APART = 1_000_003  # between the seeds of two ranks; the seeds of a study are neighbours
 
