@@ -115,4 +115,10 @@ def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypat
             moved.append([*seen, bias.copy()])
         np.testing.assert_array_equal(sim.data(1).qpos, sim.qpos[1])
         assert isinstance(sim.batch, OneByOne) == one_by_one
+        if one_by_one:  # a look at what follows from a state leaves each simulation the torque of its own step
+            sim.step(targets[0])
+            torque = sim.torque.copy()
+            sim.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
+            np.testing.assert_array_equal(sim.torque, torque)
+            assert len(np.unique(torque, axis=0)) == 3
     np.testing.assert_array_equal(np.array(moved[:20]), np.array(moved[20:]))

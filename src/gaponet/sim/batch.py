@@ -22,8 +22,8 @@ Array = np.ndarray
 class OneByOne:
     """The part of mujoco.batch.Batch that gaponet uses, where MuJoCo has none: one simulation after another, slower.
 
-    Bound fields are live (nsim, …) arrays as there. All take turns in one MjData: what the next step follows from is
-    put into it before a call, and every bound field is read from it after.
+    Bound fields are live (nsim, …) arrays as there. All take turns in one MjData: every bound field, so all that the
+    next step follows from, is put into it before a call and read from it after.
     """
 
     STATE = ("time", "qpos", "qvel", "history", "qacc_warmstart", "ctrl", "qfrc_applied")
@@ -70,8 +70,8 @@ class OneByOne:
             for name, x in self._expanded.items():
                 owner, field = (model.opt, name[4:]) if name.startswith("opt.") else (model, name)
                 setattr(owner, field, x[i])
-            for name in self.STATE:
-                setattr(data, name, self._bound[name][i])
+            for name, x in self._bound.items():
+                setattr(data, name, x[i])
             function(model, data)
             for name, x in self._bound.items():
                 x[i] = getattr(data, name)
