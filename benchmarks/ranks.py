@@ -1,12 +1,13 @@
 """Two processes of torchrun beside one: ranks killed, frozen or orphaned at random moments; validation and speed.
 
-    python benchmarks/ranks.py WORK [--kills 6] [--seeds 3] [--only kills,seeds] [--seed 0]
+    python benchmarks/ranks.py WORK [--kills 6] [--seeds 3] [--only kills,seeds,speed] [--seed 0]
 
 On the VIRTUAL SO-101 set of benchmarks/kills.py. `kills` starts again what was killed and compares its end with
 a run that was not. A frozen rank is missed after 25 s (120 where it had not begun), and torchrun gives it 30 s more.
 `seeds` trains with one
-process on two threads and with two processes on one each, in turns: the same options, so the same total batch. Prints
-one JSON object; exits with 1 where a run differs, a rank lives on, or a step budget is not met.
+process on two threads and with two processes on one each, in turns: the same options, so the same total batch. `speed`
+does so with the default recipe, half of the steps PPO's, for a machine that is otherwise idle. Prints one JSON object;
+exits with 1 where a run differs, a rank lives on, or a step budget is not met.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ TINY = ["--model.history", "2", "--model.sensors", "off", "--warm-start.num-envs
 SMALL = ["--model.history", "2", "--model.sensors", "off", "--warm-start.num-envs", "64", "--warm-start.steps", "50",
          "--warm-start.rounds", "2", "--warm-start.gradient-steps", "100", "--warm-start.batch-size", "256",
          "--ppo.num-envs", "64", "--ppo.num-steps", "16", "--ppo.epochs", "2", "--ppo.explained", "0.2"]  # fmt: skip
+USUAL = ["--warm-start.rounds", "3", "--ppo.explained", "-1000000"]
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m"]
 MINUTE = 60.0
 LIMITS = {"rank frozen": 160.0}  # s; before its first sign of life it is waited for two minutes
@@ -103,13 +105,13 @@ def adversity(data: Path, work: Path, wanted: int, rng: np.random.Generator) -> 
     }
 
 
-def compared(data: Path, work: Path, seeds: int, steps: int) -> dict[str, Any]:
+def compared(data: Path, work: Path, seeds: int, steps: int, recipe: list[str]) -> dict[str, Any]:
     """Validation error, wall time of training and CPU time of everything, by number of processes."""
     rows = []
     for seed in range(seeds):
-        for ranks in (1, 2):
+        for ranks in (1, 2) if seed % 2 == 0 else (2, 1):
             out = work / f"{ranks}-{seed}"
-            options = [*SMALL, "--seed", str(seed), "--threads", str(3 - ranks)]
+            options = [*recipe, "--seed", str(seed), "--threads", str(3 - ranks)]
             with (work / f"{ranks}-{seed}.txt").open("w") as log:
                 before = os.times()
                 subprocess.run(command(data, out, steps, options, ranks), stdout=log, stderr=log, check=True)
@@ -143,7 +145,10 @@ def main() -> int:
         found["kills"] = adversity(data, work / "kills", args.kills, np.random.default_rng(args.seed))
     if "seeds" in args.only:
         (work / "seeds").mkdir()
-        found["seeds"] = compared(data, work / "seeds", args.seeds, args.steps)
+        found["seeds"] = compared(data, work / "seeds", args.seeds, args.steps, SMALL)
+    if "speed" in args.only:
+        (work / "speed").mkdir()
+        found["speed"] = compared(data, work / "speed", args.seeds, 462848, USUAL)
     print(json.dumps(found))
     return int(any(part["wrong"] for part in found.values()))
 

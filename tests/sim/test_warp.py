@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.errors import UsageError
 from gaponet.robot import available, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
@@ -45,7 +44,7 @@ class Both:
 
     def __init__(self, robot, **how):
         self.ours = worlds(robot, **how)
-        self.theirs, self.apart = WarpSim(self.ours, "cpu"), 0.0
+        self.theirs, self.apart = WarpSim(self.ours, "warp-cpu"), 0.0
         low, high = np.clip(self.ours.range.T, -3, 3)
         home, inside = robot.qpos_home[robot.index(self.ours.joint_names)], 0.1 * (high - low)
         self.at = np.clip(home, low + inside, high - inside)
@@ -93,7 +92,7 @@ def test_holding_for_ten_seconds_is_mujocos(name):
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
 def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
     robot = replace(write_arm(tmp_path), delay=[0.03, 0.0])
-    sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), "cpu")
+    sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), "warp-cpu")
     sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=np.zeros((3, 4, 2)))
     for _ in range(3):
         sim.step(np.ones((3, 2)), np.array([0, 2]))
@@ -107,7 +106,35 @@ def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
     assert (paths[0] == paths[1]).all()
 
 
-def test_what_a_gpu_cannot_simulate_is_refused(tmp_path):
-    sim = BatchSim(replace(write_arm(tmp_path), stribeck=0.1), [Condition(0.0, "both", 0.02)], 1)
-    with pytest.raises(UsageError, match="law"):
-        WarpSim(sim, "cpu")
+@pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
+@pytest.mark.parametrize("delay", [0.0, 0.03])
+def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
+    law = {"stribeck": 0.05, "stribeck_speed": 0.2, "friction_motor": 0.1, "friction_external": 0.1}
+    robot = replace(write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law)
+    robot = robot.with_servos({"elbow": {"offset": 0.1}})
+    ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
+    for x in ours.law.values.values():
+        x *= np.array([[1.0], [0.5], [2.0]])
+    theirs, apart, still = WarpSim(ours, "warp-cpu"), 0.0, 0.0
+    plain = BatchSim(replace(robot, encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)), [(0.0, "both", 0.02)])
+    at = np.full((3, 2), 0.3)
+
+    def put(ids):
+        for sim in (ours, theirs):
+            sim.reset(ids, at[ids], np.zeros_like(at[ids]), past=at[ids][:, None])
+
+    put(slice(None))
+    plain.reset(slice(None), at[:1], 0 * at[:1], past=at[:1, None])
+    for t in range(PERIODS):
+        if t == PERIODS // 2:
+            put(np.array([0, 2]))
+        target = at + 0.2 * np.sin(0.1 * t)
+        for sim in (ours, theirs):
+            sim.step(target, np.array([0, 1]) if t < 5 else None)
+        plain.step(target[:1])
+        still = max(still, np.abs(plain.qpos[0] - ours.qpos[1]).max())
+        apart = np.maximum(apart, np.abs(ours.qpos - theirs.qpos.numpy()))
+    assert apart.max() <= STOPPED
+    assert still > 10 * STOPPED  # without the law they are elsewhere
+    for name, x in ours.state().items():
+        assert theirs.state()[name].shape == x.shape

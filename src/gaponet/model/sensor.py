@@ -7,14 +7,15 @@ points; the oracle really steps the simulator, the predictor (model/deeponet.py)
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, library, like, single, zeros_like
 from gaponet.family.draw import Members
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import BatchSim, Condition, placed
 
 
 def probe_offsets(config: ModelConfig, n: int) -> Array:
@@ -40,23 +41,25 @@ class ProbeOracle:
         locked: tuple[str, ...] = (),
         whole: bool = False,
         members: Members | None = None,
+        device: str = "cpu",
     ) -> None:
         """One state slot per entry of `conditions`, and of `members`, if any; states are of the joints that are not
-        locked, or, where whole, of all."""
+        locked, or, where whole, of all. On another device than "cpu" they and the answers are tensors there."""
         self.offsets = probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
         own = conditions if members is None else members.conditions(conditions)
-        self.sim = BatchSim(prompt, [c for c in own for _ in range(m)], nthread, locked)
+        sim = BatchSim(prompt, [c for c in own for _ in range(m)], nthread, locked)
         if members is not None:
-            members[np.repeat(np.arange(len(own)), m)].put(self.sim, prompt)
-        self.free = robot.index(self.sim.joint_names) if whole else slice(None)
-        self.target = np.zeros((self.sim.num_envs, self.sim.n))
+            members[np.repeat(np.arange(len(own)), m)].put(sim, prompt)
+        self.free = robot.index(sim.joint_names) if whole else slice(None)
         self.absolute = config.sensor_target == "absolute"
-        self.operated = np.array([self.sim.joint_names.index(name) for name in robot.operated])
+        self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
+        self.sim = placed(sim, device)
+        self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
 
-    def __call__(self, qpos: Array, qvel: Array, offsets: Array | None = None, ids: Array | None = None) -> Array:
+    def __call__(self, qpos: Any, qvel: Any, offsets: Any = None, ids: Array | None = None) -> Any:
         """Sensor values.
 
         Args:
@@ -67,17 +70,17 @@ class ProbeOracle:
         Returns:
             (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] where sensor_target is absolute.
         """
-        m, op = len(self.offsets), self.operated
-        slots = np.arange(len(self.dt)) if ids is None else ids
-        rows = (slots[:, None] * m + np.arange(m)).ravel()
-        q, v = (np.repeat(x[:, self.free], m, axis=0) for x in (qpos, qvel))
-        target = q.copy()
-        target[:, op] += np.tile(self.offsets, (len(qpos), 1)) if offsets is None else offsets.reshape(-1, len(op))
-        self.sim.reset(rows, q, v, past=target[:, None])
+        k, m, op, sim = len(qpos), len(self.offsets), self.operated, self.sim
+        slots = np.arange(k) if ids is None else ids
+        rows, each = (slots[:, None] * m + np.arange(m)).ravel(), np.repeat(np.arange(k), m)
+        q, v = (sim.array(x)[:, self.free][each] for x in (qpos, qvel))
+        target, asked = q + 0.0, sim.array(self.offsets[None] if offsets is None else offsets)
+        target[:, op] += (asked + zeros_like(asked, k, 1, 1)).reshape(-1, len(op))
+        sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
-        self.sim.step(self.target, None if ids is None else rows)
-        moved, sped = self.sim.qpos[rows][:, op], self.sim.qvel[rows][:, op]
+        sim.step(self.target, None if len(rows) == sim.num_envs else rows)
+        moved, sped = sim.qpos[rows][:, op], sim.qvel[rows][:, op]
         if not self.absolute:
             moved, sped = moved - q[:, op], sped - v[:, op]
-        sped = sped * np.repeat(self.dt[slots], m)[:, None]
-        return np.concatenate([moved, sped], axis=1).reshape(len(qpos), m, 2 * len(op)).astype(np.float32)
+        sped = sped * like(sped, self.dt[slots][each])[:, None]
+        return single(library(sped).concatenate([moved, sped], 1)).reshape(k, m, 2 * len(op))

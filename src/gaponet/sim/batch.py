@@ -171,7 +171,8 @@ class BatchSim:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.law is not None:
-            self.law.reset(ids, self.qpos[ids] if past is None else past[:, 0])
+            rows = np.arange(self.num_envs)[ids]
+            self.law.reset(rows, self.qpos[rows] if past is None else past[:, 0])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
         """Hold position targets for one control period.
@@ -240,6 +241,15 @@ class BatchSim:
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""
         return self.batch.get_data(env)
+
+
+def placed(sim: BatchSim, device: str) -> Any:
+    """The same simulations on a --device: themselves on "cpu", mujoco_warp's elsewhere."""
+    if device == "cpu":
+        return sim
+    from gaponet.sim.warp import WarpSim
+
+    return WarpSim(sim, device)
 
 
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:

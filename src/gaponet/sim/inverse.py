@@ -22,7 +22,7 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import LAW
 from gaponet.sim.batch import Batch, BatchSim
-from gaponet.sim.servo import friction_limit
+from gaponet.sim.servo import friction_limit, present
 
 PROBES = np.array([-0.4, -0.1, -0.02, 0.0, 0.02, 0.1, 0.4])  # rad, around the target of the period before
 ALIKE, TRIED = 1e-4, 32  # rad: two simulators are one where targets of so many motions differ by less
@@ -103,7 +103,8 @@ class ClosedForm:
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
         self.low, self.high = most_torque(model, joints, act)
         self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
-        self.law = dict(zip(LAW, model.actuator_user[act].T, strict=True)) if model.nuser_actuator == len(LAW) else None
+        user = model.actuator_user[act].T if model.nuser_actuator == len(LAW) else np.zeros((len(LAW), len(act)))
+        self.law = present(dict(zip(LAW, user, strict=True)))
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
@@ -166,10 +167,7 @@ class ClosedForm:
         self.batch.forward(stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         load = self.bias[:, self.dof]
         torque = load - self.passive[:, self.dof] + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
-        limit = self.frictionloss
-        if self.law is not None:
-            limit = friction_limit(self.law, limit, qvel, torque, load)
-        return torque + friction * limit
+        return torque + friction * friction_limit(self.law, self.frictionloss, qvel, torque, load)
 
 
 def alike(one: ClosedForm, other: ClosedForm, limits: Array) -> bool:

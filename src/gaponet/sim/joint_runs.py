@@ -17,7 +17,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, servo_torque
+from gaponet.sim.servo import friction_limit, present, servo_torque
 
 Array = np.ndarray
 
@@ -90,7 +90,7 @@ class JointRuns:
         shape = (k, *self.qpos.shape[1:])
         # Every array has the shape of the state and its precision: broadcasting costs more than the sums.
         v = {name: _filled(x[:, None], shape) for name, x in values.items()}
-        law = {name: v.get(name, NONE) for name in LAW}
+        law = present({name: v[name] for name in LAW if name in v})
         kp, kd = v["kp"] * _filled(self.stiffer, shape), _filled(self.kd, shape)
         own, mass, offset, dry = v["damping"], v["armature"], v["offset"], v["frictionloss"]
         damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op], shape))
@@ -172,9 +172,6 @@ class Along:
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         return self.data.qfrc_bias.copy()
-
-
-NONE = np.zeros(1, np.float32)
 
 
 def _filled(x: Array, shape: tuple[int, ...]) -> Array:

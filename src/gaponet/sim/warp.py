@@ -6,6 +6,7 @@ identification and robots stay on C MuJoCo, from which these simulations part by
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -18,10 +19,12 @@ from torch import Tensor
 
 from gaponet.errors import UsageError
 from gaponet.sim.batch import BatchSim, CommandHistory
+from gaponet.sim.servo import ServoLaw
 
 CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
 LATE = {"history": "history", "time": "time"}
+LAW = {"servo_torque": "servo_torque", "servo_load": "servo_load"}
 
 
 class Worlds:
@@ -29,6 +32,7 @@ class Worlds:
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
         self.device, self.nstep, self._graph = warp.get_device(device), int(sim.nstep[rows[0]]), None
+        self.law: ServoLaw | None = None
         model = next(iter(sim.models.values()))
         own = {name: x[rows] for name in sorted(MODEL_FIELDS) if (x := sim.batch.expanded(name)) is not None}
         timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
@@ -45,38 +49,63 @@ class Worlds:
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
         for name, x in own.items():
-            view = warp.to_torch(getattr(self.model, name))
+            view = self.expand(name)
             view.copy_(torch.tensor(x).reshape(view.shape))
+        if sim.law is not None:
+            self.law = ServoLaw(self, model)
+            self.law.take(sim.law, rows)
 
     def bind(self, name: str) -> Tensor:
-        """A live view of a field of all worlds, (nworld, …)."""
+        """A live view of a field of all worlds, (nworld, …); of the law's state too."""
+        if name in LAW:
+            assert self.law
+            return self.law.torque if name == "servo_torque" else self.law.load
         return warp.to_torch(getattr(self.data, name))
+
+    def expand(self, name: str) -> Tensor:
+        """A live view of a field of the model, (nworld, …) where the BatchSim's was expanded."""
+        return warp.to_torch(getattr(self.model, name))
+
+    def forward(self, ids: Any = None, stage: int = 0) -> None:
+        """Compute what follows from positions and velocities, of all worlds."""
+        stream = warp.stream_from_torch(torch.cuda.current_stream()) if self.device.is_cuda else None
+        with warp.ScopedDevice(self.device), warp.ScopedStream(stream):
+            mujoco_warp.step1(self.model, self.data)
 
     def step(self) -> None:
         """Advance by a control period."""
+        if self.law is None:
+            self._launch(self.nstep)
+            return
+        for _ in range(self.nstep):
+            self.law.before()
+            self._launch(1)
+            self.law.after()
+
+    def _launch(self, count: int) -> None:
         if self.device.is_cuda:
-            self._graph = self._graph or self._captured()
+            self._graph = self._graph or self._captured(count)
             warp.capture_launch(self._graph, warp.stream_from_torch(torch.cuda.current_stream()))
         else:
-            self._steps()
+            self._steps(count)
 
-    def _steps(self) -> None:
+    def _steps(self, count: int) -> None:
         with warp.ScopedDevice(self.device):
-            for _ in range(self.nstep):
+            for _ in range(count):
                 mujoco_warp.step(self.model, self.data)
 
-    def _captured(self) -> Any:
-        """The kernels of a control period as one CUDA graph; they are compiled by stepping once, which is undone."""
+    def _captured(self, count: int) -> Any:
+        """The kernels of so many physics steps as one CUDA graph; compiled by stepping once, which is undone."""
         moved = [self.bind(name) for name in (*STATE, *LATE) if getattr(self.data, name).size]
         before = [x.clone() for x in moved]
         torch.cuda.synchronize()
-        self._steps()
+        self._steps(count)
         warp.synchronize_device(self.device)
         for x, old in zip(moved, before, strict=True):
             x.copy_(old)
         torch.cuda.synchronize()
         with warp.ScopedCapture(self.device) as capture:
-            self._steps()
+            self._steps(count)
         return capture.graph
 
 
@@ -88,14 +117,13 @@ class WarpSim:
     """
 
     def __init__(self, sim: BatchSim, device: str = "cuda") -> None:
-        """device: "cuda", "cuda:1", … or "cpu", Warp's.
+        """device: "cuda", torch's present GPU (of several processes each has its own), or "warp-cpu", Warp's CPU.
 
         Raises:
-            UsageError: No such device, or servos with a law (sim/servo.py).
+            UsageError: No such device.
         """
-        if sim.law is not None:
-            raise UsageError(f"{sim.robot.name}: its servos have a law, which a GPU cannot step; use --device cpu")
-        warp.config.quiet = True
+        warp.config.log_level = warp.LOG_WARNING if device == "cuda" else warp.LOG_ERROR
+        device = f"cuda:{torch.cuda.current_device()}" if device == "cuda" else "cpu"
         try:
             warp.get_device(device)
         except (ValueError, RuntimeError) as error:
@@ -107,7 +135,8 @@ class WarpSim:
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
-        names = [*STATE, *(LATE if self._late else ()), "ctrl", "actuator_force"]
+        self._kept = STATE | (LATE if self._late else {}) | ({} if sim.law is None else LAW)
+        names = [*self._kept, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
             self._all = self._views[0]
@@ -138,20 +167,33 @@ class WarpSim:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
+        if LAW.keys() <= self._kept.keys():
+            put, target = torch.zeros_like(self.nstep, dtype=torch.bool), self.qpos.clone()
+            put[ids] = True
+            if past is not None:
+                target[ids] = self.array(past)[:, 0]
+            for worlds, rows in self._in_turn():
+                assert worlds.law
+                mine = put[rows].nonzero()[:, 0]
+                worlds.law.reset(mine, target[rows[mine]])
+
+    def _in_turn(self) -> Iterator[tuple[Worlds, Tensor]]:
+        """The worlds of each rate with their simulations' state, which is taken back."""
+        for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
+            if views is not self._all:
+                for name, x in views.items():
+                    x.copy_(self._all[name][rows])
+            yield worlds, rows
+            if views is not self._all:
+                for name, x in views.items():
+                    self._all[name][rows] = x
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """As BatchSim.step; all are stepped, and those that should not move are put back."""
         torch.clamp(self.array(ctrl), self._low, self._high, out=self.ctrl)
         before = {} if ids is None else self.state()
-        for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
-            if views is self._all:
-                worlds.step()
-                continue
-            for name, x in views.items():
-                x.copy_(self._all[name][rows])
+        for worlds, _ in self._in_turn():
             worlds.step()
-            for name, x in views.items():
-                self._all[name][rows] = x
         if self._late:  # a float32 tells physics steps apart for minutes only, so the clock starts again
             self._commands.times -= self._commands.time[:, None, None]
             self._commands.time.zero_()
@@ -171,4 +213,4 @@ class WarpSim:
             x.copy_(self.array(state[name]))
 
     def _state(self) -> dict[str, Tensor]:
-        return {name: self._all[field] for field, name in (STATE | (LATE if self._late else {})).items()}
+        return {name: self._all[field] for field, name in self._kept.items()}

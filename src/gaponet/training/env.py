@@ -18,7 +18,7 @@ from gaponet.model.loop import Ask, DeltaLoop
 from gaponet.model.observation import frames_before
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.batch import BatchSim, Condition, placed
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
 
@@ -56,8 +56,6 @@ class DeltaEnv:
         """
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
-        if device != "cpu" and config.asks_simulator:
-            raise UsageError(f"--device {device}: sensors = {config.sensors} ask C MuJoCo; use --device cpu")
         self.robot, self.config, self.reward_config = robot, config, reward
         self.num_envs = num_envs
         self.num_actions = len(robot.operated)
@@ -74,7 +72,7 @@ class DeltaEnv:
         if config.context != "none":
             told = context(config.context, robot.nominal or robot, robot, conditions, members, nthread)
         self._place(sim, device)
-        ask = self._simulator(conditions, nthread) if config.asks_simulator else None
+        ask = self._simulator(conditions, nthread, device) if config.asks_simulator else None
         self.loop = DeltaLoop(config, sim.range[self.op], num_envs, ask=ask, context=told, of=self.now)
         shortest = min(c[2] for c in self.conditions)
         under_way = 1 + int(
@@ -123,12 +121,7 @@ class DeltaEnv:
 
     def _place(self, sim: BatchSim, device: str) -> None:
         """Put the simulations, and all that a step looks up or writes, on the device; in numpy nothing is copied."""
-        self.sim: Any = sim
-        if device != "cpu":
-            from gaponet.sim.warp import WarpSim
-
-            # torch's GPU: of several processes each has its own
-            self.sim = WarpSim(sim, "cpu" if device == "warp-cpu" else f"cuda:{torch.cuda.current_device()}")
+        self.sim: Any = placed(sim, device)
         place, num = self.sim.array, self.num_envs
         for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features"):
             setattr(self, name, place(getattr(self, name)))
@@ -141,8 +134,8 @@ class DeltaEnv:
         self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
 
-    def _simulator(self, conditions: list[Condition], nthread: int) -> Ask:
-        oracle = ProbeOracle(self.robot, self.config, conditions, nthread, self.locked)
+    def _simulator(self, conditions: list[Condition], nthread: int, device: str) -> Ask:
+        oracle = ProbeOracle(self.robot, self.config, conditions, nthread, self.locked, device=device)
         return lambda ids, offsets: oracle(self.sim.qpos[ids], self.sim.qvel[ids], offsets, ids)
 
     def reset(self, ids: Array | None = None) -> None:

@@ -155,13 +155,14 @@ def explained(net: DeltaNet, asked: Answers, joints: tuple[str, ...]) -> Report:
 
 
 def points_of(net: DeltaNet) -> Infer | None:
-    """x → offsets of a network that learns where to ask, else None."""
+    """x → offsets, arrays of one kind, of a network that learns where to ask; else None."""
     if not net.config.learns_points:
         return None
 
-    def infer(x: Array) -> Array:
+    def infer(x: Any) -> Any:
         with torch.inference_mode():
-            return net.offsets(torch.from_numpy(x)).numpy()  # type: ignore[operator]
+            offsets = net.offsets(torch.as_tensor(x))  # type: ignore[operator]
+            return offsets.numpy() if isinstance(x, np.ndarray) else offsets
 
     return infer
 
