@@ -1,15 +1,13 @@
-"""The virtual SimLifter dataset: how fast it is made, how large it is, and how its gap grows with the payload.
+"""The virtual SimLifter dataset, whole: how fast it is made, how large it is, how quick it is, and its gap.
 
-    python benchmarks/simlifter.py [--motions 16] [--nproc 2]
+    python benchmarks/simlifter.py WORK [--nproc 2]
 
-1. Speed and size. Plays some motions of the simlifter recipe with their twins (joint, upper body, whole body in the
-   recipe's own shares, all payloads, units, rates and repetitions; 16 motions: a tenth of it). On a machine that does
-   other work too, look at the figure per CPU second, which holds for each core that is free, and at mj_step_us, a plain
-   MuJoCo loop on one core just before and after: how fast the machine was at the time.
-2. Gap. Units 1 to 4, every payload, motions spread over the recipe: mean |q_sim − q_robot| by joint in free run of the
-   nominal simulator, and the spread over repetitions beside it.
+Collects all of the simlifter recipe with its twins into WORK/data (11,448 sequences, 30.6 h, 5.5 GB; where that was
+interrupted, it goes on and its time is not told), then runs what people run on it, each in a process of its own: the
+card, the figures, opening it, reading sequences at random, and batches of a training environment that holds all of its
+training motions. The gap is that of the twins: mean |q_sim − q_robot| by joint in free run of the nominal simulator.
 
-Writes docs/results/simlifter.{json,md,svg,png}. Every number in it is from VIRTUAL robots.
+Writes docs/results/simlifter.{json,md} and the figures. Every number in it is from VIRTUAL robots.
 """
 
 from __future__ import annotations
@@ -17,197 +15,209 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
-import tempfile
+import shutil
+import subprocess
+import sys
 import time
 from collections import defaultdict
-from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
-from gaponet.data.sequence import Sequence
+from gaponet.data.json_file import read_kept, write_json
+from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.eval import dataset_figures
-from gaponet.metrics import metrics, runs
-from gaponet.motion.library import Library
-from gaponet.motion.recipe import takes
-from gaponet.plot.style import save
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.sim.model import build_model
-from gaponet.sim.replay import replay
-from gaponet.virtual.collect import collect, load_recipe
-from gaponet.virtual.fleet import load_fleet
+from gaponet.model.config import ModelConfig
+from gaponet.robot import load_robot
+from gaponet.sim.model import model_hash
+from gaponet.training.config import RewardConfig
+from gaponet.training.env import DeltaEnv
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"
-UNITS = ("virtual-1", "virtual-2", "virtual-3", "virtual-4")
+FIGURES = ("composition", "joint_ranges", "torque_temperature", "real_and_twin", "gap_by_payload")
+COMMANDS, TIMES = ("card", "figures"), ("wall_s", "cpu_s", "peak_gb")
+SEQUENCES, BATCHES, ENVS = 400, 50, 1024  # read at random; and their size
 
 
-def cpu_s() -> float:
-    """CPU seconds of this process and of its ended children."""
-    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(r.ru_utime + r.ru_stime for r in spent)
+def measured(*command: Any) -> dict[str, Any]:
+    """What a command printed as JSON, with its wall and CPU seconds (children included) and its peak memory in GB."""
+    start = time.perf_counter()
+    process = subprocess.Popen([sys.executable, *map(str, command)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout
+    out = process.stdout.read()
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(map(str, command))}: ended with {os.waitstatus_to_exitcode(status)}")
+    told = {"wall_s": time.perf_counter() - start, "cpu_s": used.ru_utime + used.ru_stime}
+    return json.loads(out) | told | {"peak_gb": used.ru_maxrss * 1.024e-6}
 
 
-def memory_gib() -> float:
-    """Peak resident memory of this process and of its largest child."""
-    return sum(resource.getrusage(w).ru_maxrss for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 2**20
+def gaponet(*words: Any) -> dict[str, Any]:
+    """The same of a command of gaponet."""
+    return measured("-m", "gaponet", *words, "--json")
 
 
-def mj_step_us(seconds: float = 2.0) -> float:
-    """Microseconds of one mj_step of the nominal H1-2 with 3 kg and moving arms, one core."""
-    model = build_model(load_robot("h1_2"), 3.0)
-    data, speed = mujoco.MjData(model), np.random.default_rng(0).uniform(1, 3, model.nu)
-    start, count = time.perf_counter(), 0
-    while time.perf_counter() - start < seconds:
-        data.ctrl[:] = 0.3 * np.sin(speed * count * model.opt.timestep)
-        mujoco.mj_step(model, data, nstep=10)
-        count += 10
-    return (time.perf_counter() - start) / count * 1e6
+# ---- in a process of their own
 
 
-def spread(names: list[str], count: int) -> tuple[str, ...]:
-    """So many of them, evenly spaced."""
-    return tuple(names[i * len(names) // count] for i in range(count))
+def opening(path: Path) -> dict[str, Any]:
+    """Seconds to open, at best of three (files in the system's cache)."""
+    taken = []
+    for _ in range(3):
+        start = time.perf_counter()
+        dataset = Dataset(path)
+        taken.append(time.perf_counter() - start)
+    frames = sum(e.rows for e in dataset.entries)
+    return {"open_s": min(taken), "sequences": len(dataset), "hours": dataset.hours(), "frames": frames}
 
 
-def speed(robot: RobotSpec, names: list[str], count: int, nproc: int) -> dict[str, Any]:
-    """Collect `count` motions of the recipe and replay the twins."""
-    recipe, library = load_recipe("simlifter"), Library(robot)
-    load, yardstick, cpu = os.getloadavg()[0], [mj_step_us()], [cpu_s()]
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "data"
-        part = replace(recipe, motions=spread(names, count))
-        done = collect(robot, load_fleet("easy", robot), part, out, nproc=nproc)
-        cpu.append(cpu_s())
-        size, twins_size = (sum(f.stat().st_size for f in (out / d).rglob("*.parquet")) for d in (".", "twins"))
-        channels = sorted(set.intersection(*(set(e.channels) for e in Dataset(out).entries)))
-    recorded_s = done.hours * 3600
-    length = {name: library.make(name).duration for name in names}
-    hours = sum(length[t.motion] for t in takes(recipe, names)) / 3600
+def reading(path: Path) -> dict[str, Any]:
+    """Milliseconds to read all channels of a sequence drawn at random."""
+    dataset, rng, taken = Dataset(path), np.random.default_rng(1), []
+    for i in rng.integers(len(dataset), size=SEQUENCES):
+        start = time.perf_counter()
+        dataset.read(dataset.entries[i])
+        taken.append((time.perf_counter() - start) * 1e3)
+    return {"sequence_ms": float(np.median(taken)), "sequence_p95_ms": float(np.percentile(taken, 95))}
+
+
+def batches(path: Path) -> dict[str, Any]:
+    """Seconds until a training environment holds all training motions, and ms to put it at frames drawn at random."""
+    dataset, start = Dataset(path), time.perf_counter()
+    train = dataset.sequences(split_entries(dataset)["train"], optional=False)
+    env = DeltaEnv(train, load_robot("h1_2"), ModelConfig(), ENVS, 1000, RewardConfig(), nthread=1)
+    loaded, taken = time.perf_counter() - start, []
+    for _ in range(BATCHES):
+        start = time.perf_counter()
+        env.reset()
+        env.get_observations()
+        taken.append((time.perf_counter() - start) * 1e3)
+    return {"load_s": loaded, "train_sequences": len(train), "train_rows": len(env.track),
+            "batch_ms": float(np.median(taken)), "batch_p95_ms": float(np.percentile(taken, 95))}  # fmt: skip
+
+
+def gap(path: Path) -> dict[str, Any]:
+    """MPJAE of the twins by payload, joint and unit, of operated joints, rad; each row counts as much."""
+    dataset, robot = Dataset(path), load_robot("h1_2")
+    model, op, zero = model_hash(robot), robot.operated_index, (np.zeros(len(robot.operated)), 0)
+    sums: dict[tuple[float, str], tuple[np.ndarray, int]] = defaultdict(lambda: zero)
+    for entry in dataset.entries:
+        pair, key = dataset.pair(entry, model), (entry.meta.payload_mass, entry.meta.unit_id)
+        error = np.abs(pair.sim.qpos - pair.real.qpos)[:, op].sum(axis=0)
+        sums[key] = sums[key][0] + error, sums[key][1] + entry.rows
+
+    def mean(*keys: tuple[float, str]) -> np.ndarray:
+        errors, rows = zip(*(sums[key] for key in keys), strict=True)
+        return np.asarray(np.sum(errors, axis=0) / sum(rows))
+
+    payloads, units = (sorted({key[i] for key in sums}) for i in (0, 1))
+    by_joint = {f"{p:g}": mean(*((p, u) for u in units)).tolist() for p in payloads}
     return {
-        "motions": part.motions,
-        "sequences": done.written,
-        "hours": done.hours,
-        "channels": channels,
-        "times_real_time": done.times_real_time,
-        "recorded_s_per_cpu_s": recorded_s / (cpu[1] - cpu[0]),
-        "load_average_before": load,
-        "mj_step_us": [*yardstick, mj_step_us()],
-        "peak_memory_gib": memory_gib(),
-        "bytes_on_disk": size,
-        "bytes_of_twins": twins_size,
-        "simlifter_sequences": len(takes(recipe, names)),
-        "simlifter_hours": hours,
-        "simlifter_wall_minutes": hours * 60 / done.times_real_time,
-        "simlifter_gb": size / recorded_s * hours * 3.6e-6,
+        "by_joint": {p: dict(zip(robot.operated, values, strict=True)) for p, values in by_joint.items()},
+        "by_unit": {f"{p:g}": {u: float(mean((p, u)).mean()) for u in units} for p in payloads},
+        "mean": float(mean(*sums).mean()),
     }
 
 
-def gap(robot: RobotSpec, names: list[str], nproc: int) -> tuple[dict[str, Any], dict[float, np.ndarray]]:
-    """MPJAE by payload, unit and joint, and the spread over repetitions, rad."""
-    upper = [n for n in names if "-all-" not in n]
-    recipe = replace(
-        load_recipe("simlifter"), motions=spread(upper, 12), units=UNITS, rates=(50.0,), repetitions=2
-    )  # fmt: skip
-    with tempfile.TemporaryDirectory() as folder:
-        collect(robot, load_fleet("easy", robot), recipe, Path(folder) / "data", nproc=nproc, twins=False)
-        sequences = Dataset(Path(folder) / "data").sequences()
-    twins = replay(sequences, robot, nthread=nproc, lock_idle=True)
-    both = runs(sequences, [t.qpos for t in twins], robot)
-    by: dict[str, Any] = {}
-    drawn: dict[float, np.ndarray] = {}
-    for payload in recipe.payloads:
-        part = [r for r in both if r.real.meta.payload_mass == payload]
-        drawn[payload] = np.array([np.abs(r.error).mean(axis=0) for r in part])
-        by[f"{payload:g}"] = {
-            "mpjae": metrics(part)["mpjae"],
-            "by_joint": dict(zip(robot.operated, drawn[payload].mean(axis=0).tolist(), strict=True)),
-            "by_unit": {u: metrics([r for r in part if r.real.meta.unit_id == u])["mpjae"] for u in UNITS},
-        }
-    return {"motions": recipe.motions, "by_payload": by, "repeatability": repeatability(sequences, robot)}, drawn
+ALONE = {"opening": opening, "reading": reading, "batches": batches, "gap": gap}
 
 
-def repeatability(sequences: list[Sequence], robot: RobotSpec) -> float:
-    """Mean |difference| between two repetitions of the same take over √2, rad."""
-    takes_of: dict[Any, list[Sequence]] = defaultdict(list)
-    for s in sequences:
-        takes_of[s.meta.motion, s.meta.unit_id, s.meta.payload_mass].append(s)
-    op = robot.operated_index
-    return float(np.mean([np.abs(a.qpos[:, op] - b.qpos[:, op]).mean() / np.sqrt(2) for a, b in takes_of.values()]))
+# ---- the page
 
 
-def page(result: dict[str, Any]) -> str:
+def page(found: dict[str, Any]) -> str:
     """The results as Markdown."""
-    s, g = result["speed"], result["gap"]
-    payloads = list(g["by_payload"])
-    head = "| " + " | ".join(["joint", *(f"{p} kg" for p in payloads)]) + " |"
-    rule = "| --- |" + " ---: |" * len(payloads)
+    c, o, r, b, g = (found[name] for name in ("collect", "opening", "reading", "batches", "gap"))
+    payloads = list(g["by_joint"])
     row = lambda name, values: "| " + " | ".join([name, *(f"{1e3 * v:.1f}" for v in values)]) + " |"  # noqa: E731
-    by = g["by_payload"].values()
-    joints = [row(j, [p["by_joint"][j] for p in by]) for j in next(iter(by))["by_joint"]]
-    units = [row(u, [p["by_unit"][u] for p in by]) for u in UNITS]
-    yard = " and ".join(f"{x:.0f}" for x in s["mj_step_us"])
+    head = lambda what: row(what, []).removesuffix(" |") + " | " + " | ".join(f"{p} kg" for p in payloads) + " |"  # noqa: E731
+    rule = "| --- |" + " ---: |" * len(payloads)
+    joints = [row(j, [g["by_joint"][p][j] for p in payloads]) for j in g["by_joint"][payloads[0]]]
+    units = [row(u, [g["by_unit"][p][u] for p in payloads]) for u in g["by_unit"][payloads[0]]]
+    mean = row("**mean**", [float(np.mean(list(g["by_joint"][p].values()))) for p in payloads])
+    lines = [
+        ("collecting, robots and twins" + ("" if c["whole"] else " (interrupted)"), c),
+        ("`gaponet data card`", found["card"]), ("`gaponet data figures`", found["figures"]),
+    ]  # fmt: skip
+    table = [f"| {n} | {x['wall_s']:.0f} s | {x['cpu_s']:.0f} s | {x['peak_gb']:.2f} |" for n, x in lines]
+    table += [
+        f"| opening | {o['open_s']:.2f} s | | {o['peak_gb']:.2f} |",
+        f"| a sequence at random, all channels | {r['sequence_ms']:.1f} ({r['sequence_p95_ms']:.1f}) ms | "
+        f"| {r['peak_gb']:.2f} |",
+        f"| all {b['train_rows'] / 1e6:.1f} million training rows into an environment | {b['load_s']:.0f} s | "
+        f"| {b['peak_gb']:.2f} |",
+        f"| a batch of it: {ENVS} simulations at frames drawn at random, with past and observation | "
+        f"{b['batch_ms']:.1f} ({b['batch_p95_ms']:.1f}) ms | | |",
+    ]  # fmt: skip
     return f"""# The virtual SimLifter dataset
 
-**Every number on this page is from virtual H1-2 robots (fleet `easy`).** {date.today()}, 2 cores, no GPU.
-Regenerate: `python benchmarks/simlifter.py`.
+**Every number on this page is from VIRTUAL H1-2 robots (fleet `hard`).** {date.today()}, 2 cores, no GPU.
+Regenerate: `python benchmarks/simlifter.py WORK`. What it holds: [its card](simlifter_card.md).
 
 ## Speed and size
 
-A tenth of the `simlifter` recipe: {s["sequences"]} sequences, {s["hours"]:.2f} h, with
-{", ".join(f"`{c}`" for c in s["channels"])}.
+The whole `simlifter` recipe: {o["sequences"]:,} sequences, {o["hours"]:.2f} h, {o["frames"] / 1e6:.2f} million
+frames of 27 joints, {c["bytes"] / 1e9:.2f} GB on disk, {c["bytes_of_twins"] / 1e9:.2f} of them twins. Recorded at
+**{o["hours"] * 3600 / c["wall_s"]:.0f} × real time**, {o["hours"] * 3600 / c["cpu_s"]:.0f} s per CPU second.
 
-Robots and twins together: **{s["times_real_time"]:.1f} × real time**, {s["recorded_s_per_cpu_s"]:.1f} s recorded
-per CPU second. The machine at the time: one mj_step of the nominal H1-2 took {yard} µs before and after. Peak memory
-{s["peak_memory_gib"]:.2f} GiB, {s["bytes_on_disk"] / 1e6:.0f} MB on disk, {s["bytes_of_twins"] / 1e6:.0f} of them
-twins. The whole recipe at this rate: {s["simlifter_sequences"]} sequences, {s["simlifter_hours"]:.1f} h,
-{s["simlifter_wall_minutes"]:.0f} minutes, {s["simlifter_gb"]:.1f} GB.
+| | wall time | CPU time | peak memory of a process, GB |
+| --- | ---: | ---: | ---: |
+{chr(10).join(table)}
+
+Files in the system's cache; short times are medians, 95th percentiles in brackets.
 
 ## Gap of the nominal simulator, mrad
 
-Free run over whole motions, units 1 to 4, {len(g["motions"])} motions, 50 Hz. Spread over repetitions:
-{1e3 * g["repeatability"]:.2f} mrad.
+Free run over whole motions, the twins of all sequences; each row counts as much. Mean {1e3 * g["mean"]:.1f}.
 
-{head}
+{head("joint")}
 {rule}
 {chr(10).join(joints)}
-{row("**mean**", [p["mpjae"] for p in by])}
+{mean}
 
-{head.replace("joint", "unit")}
+{head("unit")}
 {rule}
 {chr(10).join(units)}
 
-![](simlifter.svg)
+{chr(10).join(f"![](simlifter-{name}.svg)" for name in FIGURES)}
 """
 
 
-def main() -> int:
+def collected(data: Path, note: Path, nproc: int) -> dict[str, Any]:
+    """Collect it, or what is missing of it; the note is kept."""
+    if not note.is_file():
+        done = gaponet("collect", "--recipe", "simlifter", "--out", data, "--nproc", nproc)
+        sizes = [sum(f.stat().st_size for f in (data / d).rglob("*.parquet")) for d in (".", "twins")]
+        write_json(note, done | {"whole": not done["present"], "bytes": sizes[0], "bytes_of_twins": sizes[1]})
+    return read_kept(note)
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--motions", type=int, default=16, help="how many of the recipe's")
-    parser.add_argument("--nproc", type=int, default=os.cpu_count())
-    parser.add_argument("--speed-only", action="store_true", help="print the speed and write nothing")
-    parser.add_argument("--out", type=Path, default=DOCS)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--nproc", type=int, default=0)
+    parser.add_argument("--only", choices=tuple(ALONE), help="one measurement, in this process")
     args = parser.parse_args()
-    robot, recipe = load_robot("h1_2"), load_recipe("simlifter")
-    names = list(dict.fromkeys(t.motion for t in takes(recipe, Library(robot).names(recipe.variants))))
-    measured = speed(robot, names, args.motions, args.nproc)
-    if args.speed_only:
-        print(json.dumps(measured, indent=1))
-        return 0
-    found, drawn = gap(robot, names, args.nproc)
-    result = {"virtual": True, "speed": measured, "gap": found}
-    args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "simlifter.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    (args.out / "simlifter.md").write_text(page(result), encoding="utf-8")
-    save(dataset_figures.gap_by_payload(drawn, list(robot.operated), "VIRTUAL h1_2, units 1 to 4: gap to the nominal "
-         "simulator, free run"), args.out / "simlifter")  # fmt: skip
-    print(page(result))
-    return 0
+    data, pictures = args.work / "data", args.work / "figures"
+    if args.only:
+        print(json.dumps(ALONE[args.only](data)))
+        return
+    found = {"collect": collected(data, args.work / "collected.json", args.nproc)}
+    found["card"] = gaponet("data", "card", data, "--source", "VIRTUAL H1-2, fleet hard, recipe simlifter")
+    found["figures"] = gaponet("data", "figures", data, "--out", pictures)
+    found |= {name: measured(__file__, args.work, "--only", name) for name in ALONE}
+    DOCS.mkdir(parents=True, exist_ok=True)
+    told = {name: {k: v for k, v in x.items() if k in TIMES} if name in COMMANDS else x for name, x in found.items()}
+    write_json(DOCS / "simlifter.json", {"virtual": True} | told)
+    (DOCS / "simlifter.md").write_text(page(found), encoding="utf-8")
+    shutil.copy(data / "CARD.md", DOCS / "simlifter_card.md")
+    for name in FIGURES:
+        for end in (".svg", ".png"):
+            shutil.copy(pictures / f"{name}{end}", DOCS / f"simlifter-{name}{end}")
+    print(page(found))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

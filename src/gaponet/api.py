@@ -133,7 +133,7 @@ def gap(
         methods → nominal → metrics (mpjae rad, …), and by_joint, by_payload, by_unit, by_motion, by_horizon the same;
         dataset, sequences, hours, virtual, robot, simulator_hash. With a run: as eval.gap.gap_by_step.
     """
-    from gaponet.metrics import runs, summary
+    from gaponet.metrics import Run, summary
     from gaponet.share import stream
     from gaponet.sim.model import model_hash
 
@@ -149,11 +149,11 @@ def gap(
     data, spec = stream.open_dataset(dataset, robot)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
-    pairs = [data.pair(e, simulator) for e in entries]
+    pairs = (data.pair(e, simulator) for e in entries)
     return {
-        "methods": {"nominal": summary(runs([p.real for p in pairs], [p.sim.qpos for p in pairs], spec), spec)},
+        "methods": {"nominal": summary([Run.of(p.real, p.sim.qpos, spec) for p in pairs], spec)},
         "dataset": data.path.name,
-        "sequences": len(pairs),
+        "sequences": len(entries),
         "hours": sum(e.rows * e.dt for e in entries) / 3600,
         "virtual": any(e.meta.virtual for e in entries),
         "robot": spec.name,

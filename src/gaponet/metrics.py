@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.sequence import Sequence
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot import RobotSpec
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
@@ -31,9 +31,16 @@ def standard_error(values: Array) -> float:
 class Run:
     """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""
 
-    real: Sequence
+    meta: SequenceMeta
+    dt: float
     qpos_real: Array
     qpos_sim: Array
+
+    @classmethod
+    def of(cls, real: Sequence, simulated: Array, robot: RobotSpec) -> Run:
+        """A recording and simulated positions of all joints, (T, n_all) rad; keeps neither."""
+        op = robot.operated_index
+        return cls(real.meta, real.dt, real.qpos[:, op], np.asarray(simulated)[:, op])
 
     @property
     def error(self) -> Array:
@@ -43,8 +50,7 @@ class Run:
 
 def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec) -> list[Run]:
     """Put recordings and simulated positions (T, n_all) together, operated joints only."""
-    op = robot.operated_index
-    return [Run(s, s.qpos[:, op], np.asarray(q)[:, op]) for s, q in zip(sequences, simulated, strict=True)]
+    return [Run.of(s, q, robot) for s, q in zip(sequences, simulated, strict=True)]
 
 
 def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
@@ -55,9 +61,9 @@ def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
     total = metrics(part) | {"mpjae_no_wrist": metrics(part, no_wrist)["mpjae"] if no_wrist else float("nan")}
     return total | {
         "by_joint": {j: metrics(part, c) for j, c in columns.items()},
-        "by_motion": by(lambda r: r.real.meta.motion),
-        "by_payload": by(lambda r: f"{r.real.meta.payload_mass:g}"),
-        "by_unit": by(lambda r: r.real.meta.unit_id),
+        "by_motion": by(lambda r: r.meta.motion),
+        "by_payload": by(lambda r: f"{r.meta.payload_mass:g}"),
+        "by_unit": by(lambda r: r.meta.unit_id),
         "by_horizon": horizon(part),
     }
 
@@ -84,7 +90,7 @@ def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
     out = {
         "mpjae": size.mean(),
         "rmse": np.sqrt((error**2).mean(axis=0)).mean(),
-        "q_dis": (size.sum(axis=0) * run.real.dt).mean(),
+        "q_dis": (size.sum(axis=0) * run.dt).mean(),
         "static": np.abs(bias).mean(),
         "dynamic": np.abs(error - bias).mean(),
         "iqr": (high - low).mean(),
@@ -114,7 +120,7 @@ def horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
     for seconds in HORIZONS_S:
         values = []
         for run in part:
-            last = max(round(seconds / run.real.dt), 1)
+            last = max(round(seconds / run.dt), 1)
             if len(run.error) >= last:
                 values.append(np.abs(run.error[last // 2 : last]).mean())
         if values:

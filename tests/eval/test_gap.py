@@ -87,8 +87,9 @@ def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
 
 
 def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
-    sequences = recordings(write_arm(tmp_path / "arm"), 3, rows=50)
-    off = lambda sizes: [Run(s, s.qpos, s.qpos + x) for s, x in zip(sequences, sizes, strict=True)]  # noqa: E731
+    robot = write_arm(tmp_path / "arm")
+    sequences = recordings(robot, 3, rows=50)
+    off = lambda sizes: [Run.of(s, s.qpos + x, robot) for s, x in zip(sequences, sizes, strict=True)]  # noqa: E731
     done = {"nominal": off([0.03, 0.02, 0.01]), "gain": off([0.02, 0.01, 0.0])}
     assert removed(done)["gain"] == pytest.approx([0.01, 0.0], abs=1e-6)
     less, error = removed({"nominal": off([0.03, 0.03, 0.03]), "gain": off([0.0, 0.01, 0.02])})["gain"]

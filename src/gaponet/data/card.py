@@ -51,7 +51,7 @@ def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
             done += 1
             progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
-            repeated.append(repetitions)
+            repeated.append(repetitions.result())
     return _identity(dataset) | {
         "total": count(dataset.entries),
         "shares": {name: shares(dataset.entries, key) for name, key in SHARES.items()},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,19 @@ SAME_COMMAND = 1e-3  # rad; repetitions whose commands differ by more somewhere 
 SHORTEST = 0.5  # s: of a period
 MOVED = 0.02  # rad; joints commanded to move by less say nothing
 REPEATED = ("qpos", "qvel", "tau", "temperature")
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """What came of the repetitions of a motion; nothing as long as it."""
+
+    count: int
+    others: int
+    """Repetitions with another command."""
+    moved: Array
+    """Which joints were commanded to move, (n)."""
+    variance: dict[str, Array]
+    """Of each channel over repetitions, averaged over rows, (n)."""
 
 
 class Repetitions:
@@ -48,15 +62,10 @@ class Repetitions:
             self._mean[name] = mean + step / self.count
             self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
 
-    @property
-    def moved(self) -> Array:
-        """Which joints were commanded to move, (n)."""
-        return np.ptp(self._ctrl, axis=0) > MOVED
-
-    def variance(self, channel: str) -> Array | None:
-        """Over repetitions, averaged over rows, (n); None where the channel was not recorded."""
-        squares = self._squares.get(channel)
-        return None if squares is None else squares.mean(axis=0) / (self.count - 1)
+    def result(self) -> Repeated:
+        """Of two repetitions or more."""
+        variance = {c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()}
+        return Repeated(self.count, self.others, np.ptp(self._ctrl, axis=0) > MOVED, variance)
 
 
 def periods(sequence: Sequence) -> list[Sequence]:
@@ -73,22 +82,20 @@ def periods(sequence: Sequence) -> list[Sequence]:
     return [sequence.rows(slice(a, a + period)) for a in starts]
 
 
-def summary(groups: list[Repetitions], joint_names: tuple[str, ...]) -> dict[str, Any]:
+def summary(groups: list[Repeated], joint_names: tuple[str, ...]) -> dict[str, Any]:
     """Root-mean-square standard deviation over repetitions, by channel and joint.
 
     Args:
-        groups: Groups of 2 repetitions or more each.
+        groups: A motion's each.
         joint_names: (n).
 
     Returns:
         groups, sequences, and channels {name: {unit, mean over joints that moved, joints {name: value}}}; a joint that
         no group moved is left out.
     """
-    moved = np.array([g.moved for g in groups]).reshape(-1, len(joint_names))
     channels = {}
     for name in REPEATED:
-        variances = [(g.variance(name), m) for g, m in zip(groups, moved, strict=True)]
-        found = [(np.where(m, v, np.nan)) for v, m in variances if v is not None]
+        found = [np.where(g.moved, g.variance[name], np.nan) for g in groups if name in g.variance]
         values = {}
         for j, joint in enumerate(joint_names):
             column = np.array([v[j] for v in found])

@@ -34,7 +34,7 @@ from typing_extensions import TypedDict
 from gaponet.data.commands import Sketch, sketch
 from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, Twin
-from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta
+from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
 from gaponet.files import require_ours, sync, whole, write_text, writing
 from gaponet.robot import RobotSpec, load_robot
@@ -216,17 +216,18 @@ class Dataset:
         self._by_hash[digest] = entry
         return entry
 
-    def read(self, entry: Entry) -> Sequence:
-        """Load one sequence."""
-        return Sequence(entry.meta, self.joint_names, entry.dt, **self.channels(entry, entry.channels))
+    def read(self, entry: Entry, optional: bool = True) -> Sequence:
+        """Load one sequence, without its optional channels where they are not asked for."""
+        names = tuple(c for c in entry.channels if optional or c not in OPTIONAL)
+        return Sequence(entry.meta, self.joint_names, entry.dt, **self.channels(entry, names))
 
     def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Some channels of one sequence, (T, n) float32 each, without reading the others."""
         return _read_table(self._file(entry), names, entry.rows, len(self.joint_names))
 
-    def sequences(self, entries: list[Entry] | None = None) -> list[Sequence]:
-        """Load sequences, all by default."""
-        return [self.read(e) for e in (self.entries if entries is None else entries)]
+    def sequences(self, entries: list[Entry] | None = None, optional: bool = True) -> list[Sequence]:
+        """Load sequences, all by default; each as `read`."""
+        return [self.read(e, optional) for e in (self.entries if entries is None else entries)]
 
     def has_twin(self, entry: Entry, model: str) -> bool:
         """Whether the sequence has been paired with the simulator of this model hash."""

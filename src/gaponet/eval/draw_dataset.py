@@ -84,10 +84,9 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
         raise _Nothing("no operated joint is commanded to move")
     positions = {joint: np.concatenate(kept[joint]) for joint in robot.operated if joint in kept}
     limits = {j: tuple(robot.qpos_range[robot.joint_names.index(j)]) for j in positions}
-    count = (
-        f"{len(entries)} of {len(dataset)} sequences" if len(entries) < len(dataset) else f"{len(dataset)} sequences"
-    )
-    return draw.joint_ranges(positions, limits, f"{who(entries)}: where joints were while commanded to move, {count}")
+    part = f"{len(entries)} of " if len(entries) < len(dataset) else ""
+    title = f"{who(entries)}: where joints were while commanded to move, {part}{len(dataset):,} sequences"
+    return draw.joint_ranges(positions, limits, title)
 
 
 def composition(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:

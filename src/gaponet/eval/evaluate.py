@@ -209,11 +209,11 @@ def save(evaluation: Evaluation, run: Path) -> None:
     """metrics.json and trajectories.npz in the run folder: the newest evaluation, all that the report needs."""
     reals = evaluation.runs["nominal"]
     picked = evenly(list(range(len(reals))), SHOWN)
-    shown = [reals[i].real.meta for i in picked]
+    shown = [reals[i].meta for i in picked]
     result = evaluation.result | {
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "shown": [
-            {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].real.dt}
+            {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
             for i, m in zip(picked, shown, strict=True)
         ],
     }

@@ -91,7 +91,7 @@ def gap_by_step(
         },
         "by_payload": {
             f"{p:g}": {
-                n: metrics([r for r in part if r.real.meta.payload_mass == p])["mpjae"] for n, part in done.items()
+                n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()
             }
             for p in payloads
         },
@@ -156,7 +156,7 @@ def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str
         groups[same].add(s)
         for period in periods(s):
             groups[*same, "period"].add(period)
-    repeated = [g for g in groups.values() if g.count > 1]
+    repeated = [g.result() for g in groups.values() if g.count > 1]
     spread = summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
     found: dict[str, dict[str, float | None]] = {}
     for i, joint in enumerate(robot.operated):

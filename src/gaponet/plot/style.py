@@ -35,7 +35,7 @@ STYLE: dict[Any, Any] = {
 }
 DASHED = (0, (4, 1.5))
 DOTTED = (0, (1, 1))
-ENTRY = 1.9  # inches that a legend's entry takes
+ENTRY, LETTER = 1.9, 0.09  # inches that a legend's entry takes at most, and a letter of it
 LONGEST, LABEL = 120, 40  # letters of a line, and of one beside an axis or in a legend
 
 
@@ -86,9 +86,10 @@ def legend(fig: Figure, title: str = "") -> None:
     for ax in fig.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             found.setdefault(label, handle)
+    wide = min(ENTRY, 0.5 + LETTER * max(map(len, found), default=0))
     fig.legend(
         list(found.values()), list(found), loc="outside upper left",
-        ncols=max(1, min(len(found), int(fig.get_figwidth() / ENTRY))), columnspacing=1.1, handlelength=1.4,
+        ncols=max(1, min(len(found), int(fig.get_figwidth() / wide))), columnspacing=1.1, handlelength=1.4,
         title=title or None, alignment="left", title_fontproperties={"weight": "bold", "size": 9},
     )  # fmt: skip
 

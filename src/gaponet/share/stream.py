@@ -22,7 +22,7 @@ from gaponet.arrays import Array
 from gaponet.data import store
 from gaponet.data.formats.lerobot import read_episode
 from gaponet.data.formats.lerobot_set import FEATURES, Set, Stated, sets_under
-from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
+from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta, to_sequence
 from gaponet.data.store import Dataset, Entry, entry_id
 from gaponet.errors import DatasetError, GAPONetError, RemoteError
 from gaponet.robot import RobotSpec
@@ -89,8 +89,8 @@ class Streamed(Dataset):
                 raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
             datasets.bring_beside(self._files, self)
 
-    def read(self, entry: Entry) -> Sequence:
-        """Fetch one sequence.
+    def read(self, entry: Entry, optional: bool = True) -> Sequence:
+        """Fetch one sequence; all of it is fetched and checked.
 
         Raises:
             RemoteError: It cannot be reached, or is not the one that was pushed.
@@ -102,7 +102,8 @@ class Streamed(Dataset):
             sequence = replace(sequence, meta=entry.meta)  # how it was first recorded, not how it was read here
             if sequence.content_hash() != entry.hash:
                 raise RemoteError(f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}")
-        return sequence
+        none: dict[str, Any] = {} if optional else dict.fromkeys(OPTIONAL)
+        return replace(sequence, **none)
 
     def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
         """Some channels of one sequence, (T, n) float32 each."""

@@ -64,5 +64,5 @@ def _grouped(
     """{"known": summary, "new": summary of units held out, where there are any}."""
     twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
     done = runs(sequences, [t.qpos for t in twins], robot)
-    of: Callable[[bool], list[Run]] = lambda new: [r for r in done if (r.real.meta.unit_id in holdout) == new]  # noqa: E731
+    of: Callable[[bool], list[Run]] = lambda new: [r for r in done if (r.meta.unit_id in holdout) == new]  # noqa: E731
     return {name: summary(of(new), robot) for name, new in (("known", False), ("new", True)) if of(new)}

@@ -89,8 +89,8 @@ class Trainer:
         if not config.mixed_gains:
             together = (e.meta for part in self.parts.values() for e in part)
             require_same_gains(together, dataset.joint_names, robot.operated)
-        self.train_set = dataset.sequences(self.parts["train"])
-        self.val_set = dataset.sequences(spread(self.parts["val"], VALIDATION_RUNS))
+        self.train_set = dataset.sequences(self.parts["train"], optional=False)
+        self.val_set = dataset.sequences(spread(self.parts["val"], VALIDATION_RUNS), optional=False)
         if not config.mixed_gains and (other := next((c for c in self._conditions() if c.kp or c.kd), None)):
             raise UsageError(
                 f"the recordings were made with kp {other.kp} and kd {other.kd}, robot.toml says others: write there "
