@@ -29,7 +29,7 @@ from gaponet.plot.charts import lines
 from gaponet.plot.methods import METHODS, colour, shade
 from gaponet.plot.table import Spread, Table
 from gaponet.study.ablation import PAPER_SIZE
-from gaponet.study.found import Found, train_all
+from gaponet.study.found import baselines, train_all
 from gaponet.study.pool import RESULT, Cell
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
@@ -108,7 +108,7 @@ CAPTION = (
 def result(found: list[Arm], study: Study, failed: list[str]) -> Result:
     """A row per network and number of steps, and one panel of curves."""
     short = {a.name: a for a in found if a.times == 1}
-    levels = Found.of(found[0].cells, study).baselines(("identified+gaponet:warm_start.rounds=0", ""))
+    levels = baselines(next(c for c in found[0].cells if c.done), study)
     levels = {word: 1e3 * levels[word]["known"]["mpjae"] for word in ("nominal", "identified")}
     table = Table("steps", HEAD, tuple(row(a, short[a.name]) for a in found), CAPTION)
     series = {f"{a.title}": a.series() for a in found if a.times > 1}

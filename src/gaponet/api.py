@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.data.store import Dataset, open_dataset
+from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, UsageError
 from gaponet.progress import bar, noted
 from gaponet.robot import RobotSpec, load_robot
@@ -84,11 +84,10 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import diagnose
-    from gaponet.share import stream
     from gaponet.sim.dynamics import gravity_of
     from gaponet.sim.touching import tip_heights
 
-    data, spec = stream.open_dataset(dataset, robot)
+    data, spec = _opened(dataset, robot)
     with bar("examining") as update:
         heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
         return diagnose(data, spec, update, gravity_of(spec), heights)
@@ -111,7 +110,7 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, execu
     from gaponet.sim.replay import pair_dataset
 
     with bar("replaying") as update:
-        return pair_dataset(*open_dataset(dataset, robot), noted(update, "control steps"), executor=executor)
+        return pair_dataset(*_opened(dataset, robot), noted(update, "control steps"), executor=executor)
 
 
 def gap(
@@ -134,19 +133,18 @@ def gap(
         dataset, sequences, hours, virtual, robot, simulator_hash. With a run: as eval.gap.gap_by_step.
     """
     from gaponet.metrics import Run, summary
-    from gaponet.share import stream
     from gaponet.sim.model import model_hash
 
     if run is not None:
         from gaponet.eval.gap import gap_by_step
         from gaponet.eval.gap_figure import write_gap
 
-        data, spec = stream.open_dataset(dataset, robot, folder := _run(run))
+        data, spec = _opened(dataset, robot, folder := _run(run))
         with bar("gap") as update:
             found = gap_by_step(folder, data, spec, motions, update)
         write_gap(found, folder)
         return found
-    data, spec = stream.open_dataset(dataset, robot)
+    data, spec = _opened(dataset, robot)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
     pairs = (data.pair(e, simulator) for e in entries)
@@ -198,7 +196,7 @@ def identify(
     Recordings made with several gains are fitted together, each in a simulator of its own gains.
 
     Args:
-        dataset: Recordings.
+        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
         out: Robot folder to write; train(…, robot=out) starts from it.
         windows: Free runs of 8 s that are fitted, taken evenly from the training motions.
         robot: Where to start, if not from the one that the dataset keeps.
@@ -218,7 +216,7 @@ def identify(
     from gaponet.sim.identify import identify as fit
     from gaponet.sim.replay import replay
 
-    data, spec = open_dataset(dataset, robot)
+    data, spec = _opened(dataset, robot)
     data.require_robot(spec)
     held = {e.meta.unit_id for e in data.entries}
     if set(units) - held:
@@ -253,7 +251,7 @@ def train(
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model (training/ranks.py).
 
     Args:
-        dataset: Recordings.
+        dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else (training.config); default TrainConfig().
@@ -283,7 +281,7 @@ def train(
         ranks.on_first(writing(Path(out), "run")),
         ranks.on_first(bar(f"training {config.model.kind}")) as update,
     ):
-        data, spec = open_dataset(dataset, robot)
+        data, spec = _opened(dataset, robot)
         show = lambda status: update and update(status.fraction, 1.0, status.note)  # noqa: E731
         return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
 
@@ -314,7 +312,7 @@ def evaluate(
     from gaponet.sim.model import model_hash
 
     folder = _run(run)
-    data, spec = open_dataset(dataset, robot, folder)
+    data, spec = _opened(dataset, robot, folder)
     target, kept = None, kept_robot(folder, spec.name) if robot is not None and keeps_robot(folder) else spec
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
@@ -358,7 +356,7 @@ def calibrate(
     from gaponet.model.artifact import GapModel
 
     folder = _run(run)
-    data, spec = open_dataset(dataset, robot, folder)
+    data, spec = _opened(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
     entries = calibration.recordings(data, model, unit, motions)
@@ -371,6 +369,14 @@ def calibrate(
         )  # fmt: skip
     calibration.save(found, folder)
     return found
+
+
+def _opened(
+    dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
+) -> tuple[Dataset, RobotSpec]:
+    from gaponet.share.stream import open_dataset
+
+    return open_dataset(dataset, robot, run)
 
 
 def _run(run: GapModel | Place) -> Path:

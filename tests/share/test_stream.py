@@ -73,6 +73,32 @@ def test_doctor_gap_and_export_say_of_an_address_what_they_say_of_the_folder(dat
     assert {f: f.stat().st_mtime_ns for f in tmp_path.joinpath("bucket").rglob("*")} == before
 
 
+def test_a_model_trained_and_judged_from_afar_is_that_of_the_folder(arm, tmp_path, capsys):
+    data = Dataset.create(tmp_path / "arm_logs", arm)
+    for i in range(8):
+        ctrl = wave(60, 2, hertz=0.3 + 0.11 * i)
+        data.append(arm_sequence(arm, ctrl, late(ctrl, 2), f"wave {i}"))
+    address, found = f"file://{tmp_path}/bucket/arm", []
+    push(data.path, address)
+    small = "--budget 640 --model.history 2 --warm-start.rounds 1 --warm-start.num-envs 16".split()
+    small += "--warm-start.steps 40 --warm-start.gradient-steps 20".split()
+    study = ["experiment", "compare", "--models", "mlp", "--seeds", "1", "--workers", "1", *small]
+    for place in (str(data.path), address):
+        run = tmp_path / f"run{len(found)}"
+        assert main(["train", place, "--out", str(run), "--model", "mlp", *small]) == 0
+        assert main(["eval", str(run), place]) == 0
+        assert main(["identify", place, "--out", str(run / "identified"), "--windows", "2"]) == 0
+        assert main([*study, place, "--out", str(run / "study")]) == 0
+        card, config = (json.loads((run / name).read_text()) for name in ("model/card.json", "config.json"))
+        error = json.loads((run / "metrics.json").read_text())["methods"]["nominal"]["mpjae"]
+        kp = gp.load_robot(run / "identified").kp
+        cell = next((run / "study" / "cells").glob("*/cell.json"))
+        found.append([card["val_mpjae"], error, *kp, json.loads(cell.read_text())["weights"]])
+        assert config["dataset"] == (address if found[1:] else "../arm_logs")
+        capsys.readouterr()
+    assert found[0] == found[1]
+
+
 def test_the_folder_of_what_is_read_goes_with_it(address):
     far, _ = gp.open_dataset(address)
     folder = far.path

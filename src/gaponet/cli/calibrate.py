@@ -8,7 +8,7 @@ from typing import Literal
 
 from gaponet import api
 from gaponet.cli.identify import COLUMNS
-from gaponet.cli.options import Flag, Folder, Json, Robot, Run, like
+from gaponet.cli.options import Flag, Json, Robot, Run, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 
@@ -16,7 +16,7 @@ from gaponet.eval.tables import mrad
 @like(api.calibrate)
 def calibrate(
     run: Run,
-    dataset: Folder,
+    dataset: Source,
     unit: str = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,

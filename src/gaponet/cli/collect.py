@@ -30,7 +30,8 @@ def collect(
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
         fleet: Virtual units: hard, easy, shifted, or a .toml file.
-        recipe: demo (under a minute), small (about two), simlifter (a quarter of an hour), arm (any robot), or a .toml file.
+        recipe: demo (under a minute), small (about two), simlifter (30 h: a quarter of an hour), arm (any
+            robot), or a .toml file.
         payloads: kg per hand instead of the recipe's.
         units: Units of the fleet instead of the recipe's.
         seed: Seed of motions, noise and start states.

@@ -54,7 +54,7 @@ def demo(
         run, resume = out / model.kind, (out / model.kind / "checkpoint.pt").is_file()
         config = TrainConfig(model, warm_start=QUICK)
         api.train(dataset, run, limit, config, robot=robot, holdout_units=holdout, resume=resume)
-    evaluate(out / "gaponet", out / "dataset", also=(out / "mlp",), robot=robot, json=json)
+    evaluate(out / "gaponet", str(out / "dataset"), also=(out / "mlp",), robot=robot, json=json)
     with bar("report") as update:
         path = write_report(out / "gaponet", robot=robot, progress=update, picture=portrait)
     screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet import api
-from gaponet.cli.options import Data, Flag, Json, Robot, like
+from gaponet.cli.options import Flag, Json, Robot, Source, like
 from gaponet.cli.out import Out, writes
 from gaponet.eval.tables import mrad
 from gaponet.metrics import standard_error
@@ -43,7 +43,7 @@ WIDE = 4  # columns of a table
 @writes("robot")
 @like(api.identify)
 def identify(
-    dataset: Data,
+    dataset: Source,
     out: Path,
     windows: int = 40,
     terms: tuple[Literal["stribeck", "load", "limit", "external", "min_torque", "encoder"], ...] = ("stribeck", "load"),

@@ -9,7 +9,7 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.gap import show_methods
-from gaponet.cli.options import Data, Flag, Folder, Json, Motions, Robot, Run, like
+from gaponet.cli.options import Flag, Json, Motions, Robot, Run, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 from gaponet.model.config import Kind
@@ -20,7 +20,7 @@ from gaponet.training.config import fast as fast_preset
 
 @like(api.train)
 def train(
-    dataset: Data,
+    dataset: Source,
     out: Path,
     model: Kind = "gaponet",
     budget: str = "10m",
@@ -65,7 +65,7 @@ def train(
 @like(api.evaluate)
 def evaluate(
     run: Run,
-    dataset: Folder,
+    dataset: Source,
     also: tuple[Path, ...] = (),
     motions: Motions = (),
     robot: Robot = None,

@@ -77,6 +77,9 @@ class Entry:
 class Dataset:
     """A dataset folder opened for reading and appending. Opening reads the journal only, no samples."""
 
+    address = ""
+    """Of one that lies in a bucket (share/stream.py): what opens it again."""
+
     def __init__(self, path: str | Path) -> None:
         """Open an existing folder.
 

@@ -72,7 +72,10 @@ def _evaluate(
 ) -> None:
     from gaponet.eval.evaluate import evaluate, save
 
-    place = dataset or run / read_config(run)["dataset"]
+    kept = read_config(run)["dataset"]
+    if dataset is None and "://" in kept:
+        raise DatasetError(f"{run}: trained on {kept}; evaluate it first: gaponet eval {run} '{kept}'")
+    place = dataset or run / kept
     try:
         data = Dataset(place)
     except DatasetError as error:

@@ -6,6 +6,7 @@ points; the oracle really steps the simulator, the predictor (model/deeponet.py)
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,7 @@ from gaponet.arrays import Array, library, like, single, zeros_like
 from gaponet.family.draw import Members
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition, placed
+from gaponet.sim.batch import BatchSim, Condition
 
 
 def probe_offsets(config: ModelConfig, n: int) -> Array:
@@ -41,10 +42,10 @@ class ProbeOracle:
         locked: tuple[str, ...] = (),
         whole: bool = False,
         members: Members | None = None,
-        device: str = "cpu",
+        place: Callable[[BatchSim], Any] = lambda sim: sim,
     ) -> None:
         """One state slot per entry of `conditions`, and of `members`, if any; states are of the joints that are not
-        locked, or, where whole, of all. On another device than "cpu" they and the answers are tensors there."""
+        locked, or, where whole, of all. They and the answers are arrays of the simulator that place returns."""
         self.offsets = probe_offsets(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
@@ -56,7 +57,7 @@ class ProbeOracle:
         self.free = robot.index(sim.joint_names) if whole else slice(None)
         self.absolute = config.sensor_target == "absolute"
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
-        self.sim = placed(sim, device)
+        self.sim = place(sim)
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
 
     def __call__(self, qpos: Any, qvel: Any, offsets: Any = None, ids: Array | None = None) -> Any:

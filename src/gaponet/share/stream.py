@@ -51,9 +51,16 @@ def open_dataset(
     Raises:
         DatasetError, RemoteError: There is no dataset, it is damaged, or it cannot be reached.
     """
-    if isinstance(dataset, str) and "://" in dataset:
-        dataset = Streamed(dataset)
-    return store.open_dataset(dataset, robot, run)
+    return store.open_dataset(dataset if isinstance(dataset, Dataset) else opened(dataset), robot, run)
+
+
+def opened(place: str | Path) -> Dataset:
+    """A dataset folder, or one in a bucket.
+
+    Raises:
+        DatasetError, RemoteError: As open_dataset.
+    """
+    return Streamed(str(place)) if "://" in str(place) else Dataset(place)
 
 
 class Streamed(Dataset):
@@ -85,6 +92,7 @@ class Streamed(Dataset):
                     raise RemoteError(f"{part.path}: gaponet did not write this set")
                 made.state(**{k: str(v) for k, v in part.ours["dataset"].items() if k in Stated.__annotations__})
             super().__init__(made.path)
+            self.address = re.sub("//[^/@:]*:[^/@]*@", "//", address)  # without keys: those are in the environment
             if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
                 raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
             datasets.bring_beside(self._files, self)

@@ -243,15 +243,6 @@ class BatchSim:
         return self.batch.get_data(env)
 
 
-def placed(sim: BatchSim, device: str) -> Any:
-    """The same simulations on a --device: themselves on "cpu", mujoco_warp's elsewhere."""
-    if device == "cpu":
-        return sim
-    from gaponet.sim.warp import WarpSim
-
-    return WarpSim(sim, device)
-
-
 def expand_differences(batch: Batch, models: list[mujoco.MjModel]) -> dict[str, Array]:
     """Give every model field that differs between simulations its value for each; models (nsim), many the same.
 

@@ -18,6 +18,7 @@ from gaponet.metrics import Run, runs, summary
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
+from gaponet.share.stream import opened
 from gaponet.sim.replay import Corrector, replay
 from gaponet.study.pool import RESULT, Cell, Tell, train_cell
 
@@ -28,7 +29,7 @@ def train_and_evaluate(cell: Cell, tell: Tell) -> None:
     """Train a cell and write its cell.json."""
     told = train_cell(cell, tell)
     tell(1.0, "evaluation")
-    found = evaluate_model(cell.folder, Dataset(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
+    found = evaluate_model(cell.folder, opened(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
     start = "identified" if cell.robot.nominal is not None else "nominal"
     told |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
     write_json(cell.folder / RESULT, told | found)

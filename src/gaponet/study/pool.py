@@ -26,6 +26,7 @@ from gaponet.files import MARK, write_text, writing
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.progress import Running
 from gaponet.robot import RobotSpec
+from gaponet.share.stream import opened
 from gaponet.sim.model import model_hash
 from gaponet.study.variant import Variant
 from gaponet.training.budget import Budget
@@ -45,7 +46,8 @@ class Cell:
     variant: Variant
     seed: int
     folder: Path
-    dataset: Path
+    dataset: str
+    """Folder, or address."""
     robot: RobotSpec
     """The simulator corrected."""
     budget: str
@@ -91,8 +93,9 @@ def plan(
         raise UsageError(f"--models: '{max(names, key=names.count)}' is there twice; name each once, seeds repeat it")
     Budget.parse(budget)
     place = lambda v, seed: out / "cells" / f"{re.sub(r'[^A-Za-z0-9_.=+-]+', '_', v.name)}-{seed}"  # noqa: E731
+    data = dataset.address or str(dataset.path.resolve())
     cells = [
-        Cell(v, seed, place(v, seed), dataset.path.resolve(), robots(v), budget, holdout_units, threads)
+        Cell(v, seed, place(v, seed), data, robots(v), budget, holdout_units, threads)
         for seed in seeds
         for v in variants
     ]
@@ -133,7 +136,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)
     card = _card(cell.folder)
     if not card or card["interrupted"]:
-        data = Dataset(cell.dataset)
+        data = opened(cell.dataset)
 
         def show(s: Status) -> None:
             tell(s.fraction, s.note)

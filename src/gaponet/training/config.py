@@ -186,8 +186,8 @@ def options(config: dict[str, Any], default: dict[str, Any] | None = None, prefi
 
 
 def command(
-    dataset: Path, out: Path, budget: Budget, config: TrainConfig, robot: RobotSpec, holdout_units: tuple[str, ...],
-    processes: int,
+    dataset: Path | str, out: Path, budget: Budget, config: TrainConfig, robot: RobotSpec,
+    holdout_units: tuple[str, ...], processes: int,
 ) -> str:  # fmt: skip
     """What a shell needs to train the same again."""
     limit = str(budget.steps) if budget.seconds is None else f"{budget.seconds:g}s"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,20 @@ from gaponet.model.loop import Ask, DeltaLoop
 from gaponet.model.observation import frames_before
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition, placed
+from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
 
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
+
+
+def placed(sim: BatchSim, device: str) -> Any:
+    """The same simulations on a --device: themselves on "cpu", mujoco_warp's elsewhere."""
+    if device == "cpu":
+        return sim
+    from gaponet.sim.warp import WarpSim
+
+    return WarpSim(sim, device)
 
 
 class DeltaEnv:
@@ -135,7 +145,9 @@ class DeltaEnv:
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
 
     def _simulator(self, conditions: list[Condition], nthread: int, device: str) -> Ask:
-        oracle = ProbeOracle(self.robot, self.config, conditions, nthread, self.locked, device=device)
+        oracle = ProbeOracle(
+            self.robot, self.config, conditions, nthread, self.locked, place=partial(placed, device=device)
+        )
         return lambda ids, offsets: oracle(self.sim.qpos[ids], self.sim.qvel[ids], offsets, ids)
 
     def reset(self, ids: Array | None = None) -> None:

@@ -322,11 +322,12 @@ class Trainer:
         return spent
 
     def _write_config(self, holdout_units: tuple[str, ...], resume: bool) -> None:
-        what = self.dataset.path, self.out, self.budget, self.config, self.robot, holdout_units, ranks.world()
+        data = self.dataset
+        what = data.address or data.path, self.out, self.budget, self.config, self.robot, holdout_units, ranks.world()
         config = asdict(self.config) | {
             "budget": asdict(self.budget), "holdout_units": list(holdout_units), "robot": self.robot.name,
             "command": command(*what),
-            "dataset": os.path.relpath(self.dataset.path, self.out), "dataset_hash": dataset_hash(self.dataset.entries),
+            "dataset": data.address or os.path.relpath(data.path, self.out), "dataset_hash": dataset_hash(data.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
         kept = self.out / KEPT

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import tyro
 
-from gaponet.cli.options import Folder
 from gaponet.cli.out import Out, show_result, writes
-from gaponet.data.store import open_dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar, bars
+from gaponet.share.stream import open_dataset
 from gaponet.study.ablation import Ablation
 from gaponet.study.compare import Compare, identified
 from gaponet.study.data import Data
@@ -62,7 +61,7 @@ def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
     return bars("trainings", todo)
 
 
-def _ask(kind: type[Any], dataset: Path, out: Path, question: Any, options: Options) -> None:
+def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
     data, robot = open_dataset(dataset, options.robot)
     if kind in PLAYED:
         _play(question, data, robot, out, options)
@@ -115,11 +114,12 @@ def _command(kind: type[Any]) -> Any:
             signal.signal(signal.SIGINT, signal.default_int_handler)  # options are understood (__main__.py)
         _ask(kind, dataset, out, question, options)
 
-    place = Folder
+    place = tyro.conf.Positional[str]
     ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
     trained_on = " that the models were trained on" if kind in PLAYED else ""
     ask.__doc__ = "\n    ".join((
-        f"{inspect.getdoc(kind)}\n\nArgs:", f"dataset: Dataset folder{trained_on}.",
+        f"{inspect.getdoc(kind)}\n\nArgs:",
+        f"dataset: Dataset folder{trained_on}, or the address (s3://, gs://) of one that was pushed.",
         "out: Folder of the results; its report.html shows all experiments in it.", "question: What is asked.",
         "options: Shared.",
     ))  # fmt: skip
