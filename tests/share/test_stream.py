@@ -80,8 +80,8 @@ def test_a_model_trained_and_judged_from_afar_is_that_of_the_folder(arm, tmp_pat
         data.append(arm_sequence(arm, ctrl, late(ctrl, 2), f"wave {i}"))
     address, found = f"file://{tmp_path}/bucket/arm", []
     push(data.path, address)
-    small = "--budget 640 --model.history 2 --warm-start.rounds 1 --warm-start.num-envs 16".split()
-    small += "--warm-start.steps 40 --warm-start.gradient-steps 20".split()
+    small = ["--budget", "640", "--model.history", "2", "--warm-start.rounds", "1", "--warm-start.num-envs", "16"]
+    small += ["--warm-start.steps", "40", "--warm-start.gradient-steps", "20"]
     study = ["experiment", "compare", "--models", "mlp", "--seeds", "1", "--workers", "1", *small]
     for place in (str(data.path), address):
         run = tmp_path / f"run{len(found)}"
