@@ -1,6 +1,6 @@
 """Ten times the steps, and networks of the paper's size: error against steps and seconds, real SO-101.
 
-    python benchmarks/steps.py WORK --logs LOGS [--seeds 3] [--arms usual layers full …] [--workers 2]
+    python benchmarks/steps.py WORK --logs LOGS [--seeds 3] [--arms usual:1 usual:10 layers:10:1 …] [--workers 2]
 
 An arm is a network: today's, one with the paper's layers, and that with every joint's answer from every joint (full
 coupling), as the paper has it. Each is trained by the supervised start alone, in the nominal simulator, for six rounds
@@ -24,16 +24,19 @@ from ppo import real
 from publish import publish, say
 
 from gaponet.data.json_file import read_kept
-from gaponet.metrics import standard_error
+from gaponet.data.split import split_entries, spread
+from gaponet.metrics import metrics, runs, standard_error
 from gaponet.plot.charts import lines
 from gaponet.plot.methods import METHODS, colour, shade
 from gaponet.plot.table import Spread, Table
+from gaponet.sim.replay import replay
 from gaponet.study.ablation import PAPER_SIZE
 from gaponet.study.found import baselines, train_all
 from gaponet.study.pool import RESULT, Cell
 from gaponet.study.result import Result, facts
 from gaponet.study.study import Study
 from gaponet.training.kept import PROGRESS
+from gaponet.training.run import VALIDATION_RUNS
 
 LAYERS = PAPER_SIZE.removeprefix("coupling=full:")
 ARMS = {"usual": ("today's network", "", 0.0), "layers": ("the paper's layers", LAYERS, -0.4),
@@ -74,8 +77,8 @@ class Arm:
 
     def series(self) -> tuple[str, list[float], list[Spread]]:
         """Best validation error so far, against million steps."""
-        best = [np.minimum.accumulate([r["val_mpjae"] for r in c]) for c in self.curves()]
-        at = [r["steps"] / 1e6 for r in self.curves()[0]]
+        best = [np.minimum.accumulate([r["val_mpjae"] for r in c[1:]]) for c in self.curves()]
+        at = [r["steps"] / 1e6 for r in self.curves()[0][1:]]
         return (
             shade(colour("gaponet"), ARMS[self.name][2]), at,
             [Spread.of(values, 1e3) for values in zip(*best, strict=True)],
@@ -97,6 +100,14 @@ def row(arm: Arm, short: Arm) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
+def validated(study: Study) -> float:
+    """Error of the identified simulator on the validation motions, mrad."""
+    val = study.data.sequences(spread(split_entries(study.data)["val"], VALIDATION_RUNS), optional=False)
+    assert study.identified
+    twins = replay(val, study.identified, lock_idle=True)
+    return 1e3 * metrics(runs(val, [t.qpos for t in twins], study.robot))["mpjae"]
+
+
 HEAD = ("network", "M steps", "seeds", "minutes", "validation", "test", "less than the short, paired", "motions better")
 CAPTION = (
     "MPJAE in mrad, whole-motion free run; ± std over seeds, of the paired difference standard error over motions. "
@@ -111,8 +122,14 @@ def result(found: list[Arm], study: Study, failed: list[str]) -> Result:
     levels = baselines(next(c for c in found[0].cells if c.done), study)
     levels = {word: 1e3 * levels[word]["known"]["mpjae"] for word in ("nominal", "identified")}
     table = Table("steps", HEAD, tuple(row(a, short[a.name]) for a in found), CAPTION)
-    series = {f"{a.title}": a.series() for a in found if a.times > 1}
-    figure = lines([("real SO-101, supervised start", series)], ("million control steps", "validation MPJAE, mrad"))
+    series = {a.title: a.series() for a in found if a.times > 1}
+    ends = [x[0] for _, x, _ in series.values()][:1] + [x[-1] for _, x, _ in series.values()][:1]
+    label, tint = METHODS["identified"][:2]
+    series[f"{label}, no operator"] = tint, ends, [Spread(validated(study), float("nan"), 1)] * 2
+    figure = lines(
+        [("real SO-101, supervised start", series)], ("million control steps", "validation MPJAE, mrad"),
+        [(x, f"{x:g}") for x in (0.1, 0.3, 1.0, 3.0)], log=True,
+    )  # fmt: skip
     said = ", ".join(f"{METHODS[word][0]} {level:.2f}" for word, level in levels.items())
     notes = f"SO-101: recordings of a real robot. Without an operator, on the same test motions, mrad: {said}."
     repeat = facts(study.data, arms=[f"{a.name} × {a.times}: {len(a.curves())} seeds" for a in found])
@@ -128,12 +145,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--arms", nargs="+", default=[f"{name}:{n}" for n in TIMES for name in ARMS],
-                        help="NAME:TIMES, as they are trained")  # fmt: skip
+                        help="NAME:TIMES or NAME:TIMES:SEEDS")  # fmt: skip
     args = parser.parse_args()
     study = real(args)
-    named = [word.split(":") for word in args.arms]
-    found = [Arm(name, study, int(times)) for name, times in named]
-    failed = train_all([c for seed in zip(*(a.cells for a in found), strict=True) for c in seed], study, say)
+    found = []
+    for word in args.arms:
+        name, times, *seeds = word.split(":")
+        found.append(Arm(name, replace(study, seeds=int((seeds or [args.seeds])[0])), int(times)))
+    cells = sorted((c for a in found for c in a.cells), key=lambda c: c.seed)  # what is done first can be compared
+    failed = train_all(cells, study, say)
     publish(result([a for a in found if a.curves()], study, failed), args.work / "results")
 
 
