@@ -4,10 +4,9 @@
 
 On the VIRTUAL SO-101 set of benchmarks/kills.py. `kills` starts again what was killed and compares its end with
 a run that was not. A frozen rank is missed after 25 s (120 where it had not begun), and torchrun gives it 30 s more.
-`seeds` trains with one
-process on two threads and with two processes on one each, in turns: the same options, so the same total batch. `speed`
-does so with the default recipe, half of the steps PPO's, for a machine that is otherwise idle. Prints one JSON object;
-exits with 1 where a run differs, a rank lives on, or a step budget is not met.
+`seeds` trains with one process on two threads and with two processes on one each, in turns: the same options, so the
+same total batch. `speed` does so with the default recipe, half of the steps PPO's, for a machine that is otherwise
+idle. Prints one JSON object; exits with 1 where a run differs, a rank lives on, or a step budget is not met.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -57,7 +58,7 @@ def train(
         + f": {how_trained(card)}"
         + (" (interrupted)" if card["interrupted"] else "")
     )
-    screen.say(f"model in {trained.path}; next: gaponet eval {out} {dataset}; gaponet report {out}")
+    screen.say(f"model in {trained.path}; next: gaponet eval {out} {quote(dataset)}; gaponet report {out}")
     shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
     screen.result({k: card[k] for k in shown})
 

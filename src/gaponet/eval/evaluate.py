@@ -135,12 +135,12 @@ def evaluate(
         "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
         "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
-        "command": _command(runs_dirs, dataset.path, motions),
+        "command": _command(runs_dirs, dataset.address or dataset.path, motions),
     }
     return Evaluation(result, done_runs, ctrl, deltas)
 
 
-def _command(runs_dirs: ListOf[Path], dataset: Path, motions: tuple[str, ...]) -> str:
+def _command(runs_dirs: ListOf[Path], dataset: Path | str, motions: tuple[str, ...]) -> str:
     """What a shell needs to repeat an evaluation."""
     words = ["gaponet", "eval", str(runs_dirs[0]), str(dataset)]
     words += ["--also", *map(str, runs_dirs[1:])] if len(runs_dirs) > 1 else []

@@ -67,9 +67,9 @@ class ServoLaw:
         batch: A mujoco.batch.Batch, or what has its bind, expand and forward.
         """
         self.batch, self.model = batch, model
-        self.dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
         user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(LAW)))
         self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+        self.dof = like(self._qpos, model.jnt_dofadr[model.actuator_trnid[:, 0]])
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
