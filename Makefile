@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz kills workers lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
 
 setup: $(VENV)/.done
 
@@ -26,8 +26,10 @@ $(VENV)/.done: pyproject.toml constraints.txt
 demo: setup
 	$(BIN)/gaponet demo
 
+# Two processes, one test file at a time each; JOBS=0 for one.
+JOBS ?= 2
 test: setup
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
@@ -35,34 +37,40 @@ faults: setup
 
 # Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
 live: setup
-	$(BIN)/python tests/deploy/live.py --minutes 10 $(LIVE)
+	$(BIN)/python tests/robots/control/live.py --minutes 10 $(LIVE)
 
 # Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
 peers: setup
-	$(BIN)/python -m pytest -m peers -s tests/deploy
+	$(BIN)/python -m pytest -m peers -s tests/robots/control
 
-# mjlab (in an environment of its own in ~/.cache/gaponet, some GB) plays exports beside AlignedSim: minutes.
+# mjlab, MJX, Newton and MuJoCo (environments of their own in ~/.cache/gaponet, some GB) play exports beside ours: minutes.
 engines: setup
-	$(BIN)/python -m pytest -m peers -s tests/engine
+	$(BIN)/python -m pytest -m peers -s tests/interop/engine
 
 # SeaweedFS (S3) and a stand-in of GCS (in an environment of their own in ~/.cache/gaponet) take pushes and pulls: minutes.
 buckets: setup
-	$(BIN)/python -m pytest -m peers -s tests/share
+	$(BIN)/python -m pytest -m peers -s tests/interop/share
 
 # Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup
 	$(BIN)/pip install -q -e ".[dev,view]"
-	$(BIN)/python -m pytest -m browser -s tests/view
+	$(BIN)/python -m pytest -m browser -s tests/lab/view
 
-# A million random and adversarial states through controller and limits, in simulated time: minutes; counts as JSON.
+# A million random and adversarial states through controller and limits, in simulated time; then found poses against plans and
+# hostile live targets against the fence, judged by MuJoCo: minutes, then half an hour; counts as JSON.
 adversary: setup
-	OMP_NUM_THREADS=1 $(BIN)/python tests/deploy/adversary.py --states 1000000
+	OMP_NUM_THREADS=1 $(BIN)/python tests/robots/control/adversary.py --states 1000000
+	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/robots/control/plan_adversary.py --poses 1000 --seconds 60
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.
 FUZZ ?=
 fuzz: setup
 	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m fuzzing $(FUZZ)
+
+# Files of some bytes that ask for gigabytes or for ever, each opened by its command: five minutes, on Linux.
+hostile: setup
+	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m process.hostile
 
 # Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root. Then ranks
 # of torchrun killed and frozen: five minutes.
@@ -88,6 +96,7 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python .ci/size.py
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-issue-forms .github/ISSUE_TEMPLATE/*.yml
 	$(BIN)/zizmor --offline --quiet .github/workflows
@@ -109,6 +118,10 @@ resolve: .tools/.done
 # Wheel and sdist, tried in clean environments outside of the checkout, one for each extra.
 wheels: .tools/.done
 	$(TOOLS) $(PYTHON) .ci/wheels.py
+
+# The core alone, then each other part on it: wheels of their own in clean environments, with their tests: half an hour.
+parts: .tools/.done
+	$(TOOLS) $(PYTHON) .ci/parts.py $(PARTS)
 
 # The tests with the lowest versions that pyproject.toml allows, and with the newest.
 TESTS ?= tests

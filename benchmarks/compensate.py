@@ -13,12 +13,12 @@ import numpy as np
 import tyro
 
 from gaponet.data.store import Dataset
-from gaponet.deploy.compensator import INVERSE, Compensator, CompensatorConfig
+from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import idle_joints
-from gaponet.virtual.fleet import load_fleet
-from gaponet.virtual.unit import VirtualRobot
+from gaponet_robots.virtual.fleet import load_fleet
+from gaponet_robots.virtual.unit import VirtualRobot
 
 Array = np.ndarray
 WARMTH = 12.0  # K above ambient
@@ -29,14 +29,14 @@ METHODS: dict[str, CompensatorConfig | None] = {
     "uncompensated": None,
     "simulator: G": replace(AT_ONCE, aim="simulator", feedback=0.0),
     "simulator: G + feedback": replace(AT_ONCE, aim="simulator"),
-    "target: gravity alone": replace(AT_ONCE, iterations=0, feedback=0.0),
-    "target: gravity + feedback": replace(AT_ONCE, iterations=0),
+    "target: gravity alone": replace(AT_ONCE, feedback=0.0),
+    "target: gravity + feedback": AT_ONCE,
     "target: gravity + G": replace(AT_ONCE, feedback=0.0),
     "target: gravity + G + feedback": AT_ONCE,
-    "the same, learned inverse": replace(AT_ONCE, inverse="learned"),  # after gaponet export RUN --to inverse
     "the same, payload not told": AT_ONCE,
     "the same, targets 40 ms ahead": replace(AT_ONCE, lead=2),
 }
+ALONE = ("target: gravity alone", "target: gravity + feedback")  # without the model
 
 
 def main(
@@ -59,10 +59,9 @@ def main(
     for name, config in METHODS.items():
         if only and name not in (*only, "uncompensated"):
             continue
-        if config is not None and config.inverse == "learned" and not (model.path / INVERSE).is_dir():
-            continue
         told = None if "not told" in name else mass
-        q, u, aimed = play(robot, model, unit, targets, mass, config, told)
+        asked = None if config is None or name in ALONE else model
+        q, u, aimed = play(robot, asked, unit, targets, mass, config, told)
         if nominal is None:
             nominal = aimed  # the shadow of the first method is the nominal simulator under the targets
         skip, op = round(SKIP / robot.dt), robot.operated_index
@@ -73,7 +72,7 @@ def main(
 
 
 def play(
-    robot: RobotSpec, model: GapModel, unit: str, targets: Array, mass: Array, config: CompensatorConfig | None,
+    robot: RobotSpec, model: GapModel | None, unit: str, targets: Array, mass: Array, config: CompensatorConfig | None,
     told: Array | None,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Measured positions, commands and the shadow's positions of the operated joints, (T, N, n) rad each."""
@@ -82,7 +81,7 @@ def play(
     physics = load_fleet("easy", robot).unit(unit)
     robots = VirtualRobot(robot, [physics] * count, [(float(m), "both") for m in mass], robot.dt, locked=locked)
     robots.reset(targets[0], list(range(count)), WARMTH)
-    shadow = replace(AT_ONCE, aim="simulator", iterations=0, feedback=0.0)  # sends what it is given
+    shadow = replace(AT_ONCE, aim="simulator", feedback=0.0)  # without a model it sends what it is given
     compensator = Compensator(robot, model, config or shadow, num_envs=count)
     compensator.reset(targets[0], told)
     q, u, aimed = (np.empty((len(targets), count, len(op))) for _ in range(3))

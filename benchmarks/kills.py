@@ -36,7 +36,6 @@ from typing import Any
 import numpy as np
 
 import gaponet.model.export  # what a child needs is there before it is forked
-import gaponet.study.study
 import gaponet.training.run  # noqa: F401
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset

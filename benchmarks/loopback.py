@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 import tyro
 
-from gaponet.deploy.controller import Controller
-from gaponet.deploy.drivers.unitree import UnitreeDriver
-from gaponet.deploy.phases import ControlConfig
-from gaponet.deploy.safety import SafetyConfig
 from gaponet.robot import load_robot
+from gaponet_robots.control.controller import Controller
+from gaponet_robots.control.phases import ControlConfig
+from gaponet_robots.control.safety import SafetyConfig
+from gaponet_robots.drivers.unitree import UnitreeDriver
 
 
 def main(

@@ -26,19 +26,19 @@ from virtual_h1_2 import CONFIG, PPO, RECIPE, UNIT, WORD, Bench, run
 
 from gaponet.data.json_file import read_kept, write_json
 from gaponet.data.store import Dataset
+from gaponet.methods import METHODS, colour
 from gaponet.metrics import standard_error
-from gaponet.plot.charts import lines
-from gaponet.plot.methods import METHODS, colour
-from gaponet.plot.table import Spread, Table
 from gaponet.robot import load_robot
 from gaponet.sim.identify import DEFAULT_TERMS
-from gaponet.study.compare import identified
-from gaponet.study.found import Found, train_all
-from gaponet.study.pool import RESULT, SETUP, Cell
-from gaponet.study.result import Result, facts
-from gaponet.study.study import Study
+from gaponet.spread import Spread, Table
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.kept import PROGRESS
+from gaponet_lab.plot.charts import lines
+from gaponet_lab.study.compare import identified
+from gaponet_lab.study.found import Found, train_all
+from gaponet_lab.study.pool import RESULT, SETUP, Cell
+from gaponet_lab.study.result import Result, facts
+from gaponet_lab.study.study import Study
 
 ARMS = ("real-warm", "real-identified", "virtual-warm", "virtual-identified")
 WARM, FURTHER = "gaponet", WORD

@@ -7,9 +7,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from gaponet.study.page import write
-from gaponet.study.pool import Running
-from gaponet.study.result import Result
+from gaponet_lab.study.page import write
+from gaponet_lab.study.pool import Running
+from gaponet_lab.study.result import Result
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"
 

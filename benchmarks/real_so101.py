@@ -18,15 +18,15 @@ from publish import publish, say
 
 from gaponet.cli.main import main as gaponet
 from gaponet.data.store import Dataset
-from gaponet.plot.charts import Course, against
-from gaponet.plot.style import joint_label
 from gaponet.robot import load_robot
-from gaponet.study.compare import Compare, identified
-from gaponet.study.found import Found, answer
-from gaponet.study.result import Result
-from gaponet.study.study import Study
 from gaponet.training.config import TrainConfig, WarmStartConfig
-from gaponet.view.side_by_side import pick, side_by_side
+from gaponet_lab.plot.charts import Course, against
+from gaponet_lab.plot.style import joint_label
+from gaponet_lab.study.compare import Compare, identified
+from gaponet_lab.study.found import Found, answer
+from gaponet_lab.study.result import Result
+from gaponet_lab.study.study import Study
+from gaponet_lab.view.side_by_side import pick, side_by_side
 
 SHOWN, JOINT, SECONDS = "dual_joint_elbow_wrist", "elbow_flex", 25.0
 MODELS = ("mlp:mlp_match=on", "shared_mlp", "gaponet", "identified+gaponet")

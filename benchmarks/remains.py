@@ -26,16 +26,16 @@ from gaponet.eval.whose import label
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
 from gaponet.model.calibration import EVALUATIONS, FIELDS, PRIOR, calibrate, recordings
-from gaponet.motion.recipe import Take, load_recipe
-from gaponet.plot.table import Table
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import DEFAULT_TERMS
 from gaponet.sim.refit import refit
 from gaponet.sim.replay import Corrector
-from gaponet.study.result import Result, facts
-from gaponet.virtual.fleet import Fleet, load_fleet
-from gaponet.virtual.physics import Physics
-from gaponet.virtual.play import Job, play
+from gaponet.spread import Table
+from gaponet_lab.study.result import Result, facts
+from gaponet_robots.motion.recipe import Take, load_recipe
+from gaponet_robots.virtual.fleet import Fleet, load_fleet
+from gaponet_robots.virtual.physics import Physics
+from gaponet_robots.virtual.play import Job, play
 
 CAUSES: dict[str, Callable[[Physics], Physics]] = {
     "friction at rest (Stribeck)": lambda u: u.without("stribeck"),

@@ -24,8 +24,6 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
-from gaponet.bench.training import bench_train, recordings
-from gaponet.bench.turns import Turn
 from gaponet.data.sequence import Sequence
 from gaponet.model.baselines.mlp import matched_hidden
 from gaponet.model.config import ModelConfig
@@ -38,6 +36,8 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig, TrainConfig
 from gaponet.training.env import DeltaEnv
+from gaponet_lab.bench.training import bench_train, recordings
+from gaponet_lab.bench.turns import Turn
 
 Array = np.ndarray
 

@@ -25,18 +25,18 @@ from publish import publish, say
 
 from gaponet.data.json_file import read_kept
 from gaponet.data.split import split_entries, spread
+from gaponet.methods import METHODS, colour, shade
 from gaponet.metrics import metrics, runs, standard_error
-from gaponet.plot.charts import lines
-from gaponet.plot.methods import METHODS, colour, shade
-from gaponet.plot.table import Spread, Table
 from gaponet.sim.replay import replay
-from gaponet.study.ablation import PAPER_SIZE
-from gaponet.study.found import baselines, train_all
-from gaponet.study.pool import RESULT, Cell
-from gaponet.study.result import Result, facts
-from gaponet.study.study import Study
+from gaponet.spread import Spread, Table
 from gaponet.training.kept import PROGRESS
 from gaponet.training.run import VALIDATION_RUNS
+from gaponet_lab.plot.charts import lines
+from gaponet_lab.study.ablation import PAPER_SIZE
+from gaponet_lab.study.found import baselines, train_all
+from gaponet_lab.study.pool import RESULT, Cell
+from gaponet_lab.study.result import Result, facts
+from gaponet_lab.study.study import Study
 
 LAYERS = PAPER_SIZE.removeprefix("coupling=full:")
 ARMS = {"usual": ("today's network", "", 0.0), "layers": ("the paper's layers", LAYERS, -0.4),

@@ -30,13 +30,11 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
+from gaponet.methods import shade
 from gaponet.metrics import metrics, runs, standard_error
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines import delay_offset
-from gaponet.plot.charts import bars
-from gaponet.plot.methods import shade
-from gaponet.plot.table import Spread, Table
 from gaponet.robot import LAW, RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import DEFAULT_TERMS, identify
@@ -45,11 +43,13 @@ from gaponet.sim.model import build_model
 from gaponet.sim.multistart import descend
 from gaponet.sim.refit import cut
 from gaponet.sim.replay import Corrector, replay
-from gaponet.study.found import Found, answer
-from gaponet.study.pool import Cell
-from gaponet.study.result import Result
-from gaponet.study.study import Study
+from gaponet.spread import Spread, Table
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet_lab.plot.charts import bars
+from gaponet_lab.study.found import Found, answer
+from gaponet_lab.study.pool import Cell
+from gaponet_lab.study.result import Result
+from gaponet_lab.study.study import Study
 
 RECIPE = Path(__file__).with_suffix(".toml")
 UNIT, WORD = "virtual-4", "identified+gaponet:warm_start.rounds=0"

@@ -30,12 +30,12 @@ from tensordict import TensorDict
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.model.artifact import GapModel
-from gaponet.motion.library import Library
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
-from gaponet.virtual.fleet import load_fleet
-from gaponet.virtual.unit import VirtualRobot
+from gaponet_robots.motion.library import Library
+from gaponet_robots.virtual.fleet import load_fleet
+from gaponet_robots.virtual.unit import VirtualRobot
 
 Array = np.ndarray
 

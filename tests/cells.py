@@ -7,7 +7,7 @@ import os
 import time
 
 from gaponet.errors import ModelError
-from gaponet.study.pool import Cell, Tell
+from gaponet_lab.study.pool import Cell, Tell
 
 
 def note_threads(cell: Cell, tell: Tell) -> None:

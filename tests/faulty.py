@@ -121,11 +121,16 @@ def one_of(logs: list[Recording], change: Callable[[Recording], Recording], whic
     return [change(log) if i == which else log for i, log in enumerate(logs)]
 
 
-def cut_file(folder: Path) -> None:
-    """The logger was killed in the middle of a row."""
+def cut_file(folder: Path, within: int = 20) -> None:
+    """The logger was killed in the middle of a row, `within` letters behind its beginning."""
     file = sorted(folder.rglob("state_motor.csv"))[2]
     text = file.read_text()
-    file.write_text(text[: len(text) * 2 // 3])
+    file.write_text(text[: text.index("\n", len(text) * 2 // 3) + 1 + within])
+
+
+def cut_at_a_row(folder: Path) -> None:
+    """What was written last is a whole row."""
+    cut_file(folder, within=0)
 
 
 def swapped(values: np.ndarray) -> np.ndarray:
@@ -211,4 +216,5 @@ FAULTS: dict[str, tuple[Callable[[list[Recording]], list[Recording]], dict[str, 
         lambda logs: all_of(logs, lambda g: g.change(J, tau=lambda x: np.clip(x, -peak(x) / 2, peak(x) / 2))), {}),
     "saturated command": (lambda logs: all_of(logs, lambda g: g.change(J, ctrl=lambda x: np.clip(x, -0.4, 0.4))), {}),
     "truncated file": (list, {"damage": cut_file}),
+    "truncated at a row's end": (list, {"damage": cut_at_a_row}),
 }  # fmt: skip

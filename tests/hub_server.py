@@ -26,6 +26,7 @@ class FakeHub(ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.url = f"http://127.0.0.1:{self.server_port}"
         self.repos: dict[str, list[tuple[str, Files]]] = {}  # "datasets/me/x" → commits, newest last
+        self.tags: dict[str, dict[str, str]] = {}  # repository → tag → commit
         self.blobs: dict[str, bytes] = {}  # large files that arrived, by SHA-256
         self.sent: Counter[str] = Counter()  # large files uploaded, by SHA-256
         self.got: Counter[str] = Counter()  # files downloaded whole, by path
@@ -94,8 +95,9 @@ class Handler(BaseHTTPRequestHandler):
         self.answer({"error": code}, status, {"X-Error-Code": code, "X-Error-Message": code})
 
     def at(self, repo: str, revision: str) -> tuple[str, Files] | None:
-        """A commit, by its hash or by the name of its branch."""
+        """A commit, by its hash, its tag or by the name of its branch."""
         commits = self.server.repos.get(repo)
+        revision = self.server.tags.get(repo, {}).get(revision, revision)
         if commits is None:
             self.refuse(404, "RepoNotFound")
             return None
@@ -141,6 +143,13 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self.answer(content, 200, headers)
 
+    def do_DELETE(self) -> None:
+        m = re.fullmatch(r"/api/((?:datasets|models)/[^/]+/[^/]+)/tag/([^/]+)", unquote(urlsplit(self.path).path))
+        if m and self.server.tags.get(m[1], {}).pop(m[2], None):
+            self.answer({})
+        else:
+            self.refuse(404, "RevisionNotFound")
+
     def do_PUT(self) -> None:
         oid = self.path.rpartition("/")[2]
         data = self.body()
@@ -172,6 +181,13 @@ class Handler(BaseHTTPRequestHandler):
                 ]})  # fmt: skip
         elif m := re.fullmatch(r"/(datasets/)?([^/]+/[^/]+)\.git/info/lfs/objects/batch", path):
             self.answer({"transfer": "basic", "objects": [self.batch(o) for o in json.loads(data)["objects"]]})
+        elif m := re.fullmatch(r"/api/((?:datasets|models)/[^/]+/[^/]+)/tag/([^/]+)", path):
+            tags, tag = self.server.tags.setdefault(m[1], {}), json.loads(data)["tag"]
+            if tag in tags:
+                self.refuse(409, "Conflict")
+            elif found := self.at(m[1], m[2]):
+                tags[tag] = found[0]
+                self.answer({})
         elif m := re.fullmatch(r"/api/((?:datasets|models)/[^/]+/[^/]+)/commit/([^/]+)", path):
             self.commit(m[1], m[2], [json.loads(line) for line in data.splitlines()])
         else:

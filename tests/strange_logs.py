@@ -64,11 +64,12 @@ def write_mat(folder: Path, rows: int = ROWS) -> None:
 
 
 def write_pace(folder: Path, rows: int = ROWS) -> None:
-    """A dictionary of tensors."""
+    """A dictionary of tensors, and of gains as NumPy arrays, as newer ones of PACE's collectors are."""
     import torch
 
     ctrl, qpos = map(torch.tensor, motion(rows))
-    torch.save({"time": 0.02 * torch.arange(rows), "dof_pos": qpos, "des_dof_pos": ctrl}, folder / "a.pt")
+    gains = {"kp": np.array([20.0, 30.0]), "kd": np.array([1.0, 1.5])}
+    torch.save({"time": 0.02 * torch.arange(rows), "dof_pos": qpos, "des_dof_pos": ctrl} | gains, folder / "a.pt")
     (folder / "logs.toml").write_text(TOML)
 
 
@@ -77,6 +78,9 @@ def write_asap(folder: Path, rows: int = ROWS) -> None:
     ctrl, qpos = motion(rows)
     (folder / "a.pkl").write_bytes(pickle.dumps({"walk": {"dof": qpos, "action": ctrl / 0.25, "fps": 50}}))
     (folder / "logs.toml").write_text(TOML + "action_scale = 0.25\n")
+
+
+CUSTOM = "std_msgs/Header header\nstring[] joints\nfloat64[] position\nfloat32[3] gains\nuint8 mode"
 
 
 def write_bag(
@@ -92,18 +96,19 @@ def write_bag(
     """States at 50 Hz and commands at 25 Hz, on two topics.
 
     Args:
-        command: What kind of message: state, trajectory, array, controller, unitree.
+        command: What kind of message: state, trajectory, array, controller, custom, unitree.
         drift, away: Of the command's clock against the recorder's, s/s and s.
         twice: Every state is recorded two times.
     """
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from gaponet.data.formats.rosbag import CONTROLLER, HG
+    from gaponet_interop.formats.rosbag import CONTROLLER, HG
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in HG.items():
         store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
+    store.register(get_types_from_msg(CUSTOM, "my_robot_msgs/msg/JointCommand"))
     store.register(get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState"))
     make = lambda kind, **fields: store.types[kind](**fields)  # noqa: E731
     ctrl, qpos = motion(rows)
@@ -132,6 +137,11 @@ def write_bag(
         if kind == "trajectory":
             told = "trajectory_msgs/msg/JointTrajectory"
             return told, make(told, header=header(t), joint_names=list(JOINTS), points=[point(x)])
+        if kind == "custom":
+            told = "my_robot_msgs/msg/JointCommand"
+            return told, make(
+                told, header=header(t), joints=list(JOINTS), position=x, gains=np.ones(3, np.float32), mode=2
+            )
         if kind == "array":
             layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
             return "std_msgs/msg/Float64MultiArray", make("std_msgs/msg/Float64MultiArray", layout=layout, data=x)

@@ -67,7 +67,7 @@ def test_any_executor_of_the_standard_library_will_do(tmp_path):
 
 
 def test_a_library_is_loaded_only_where_it_is_asked_for_and_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
-    code = f"import sys, gaponet.executor, gaponet.study.found; print({set(MODULES.values())!r} & set(sys.modules))"
+    code = f"import sys, gaponet.executor, gaponet_lab.study.found; print({set(MODULES.values())!r} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "set()\n"
     with (

@@ -1,31 +1,43 @@
 """The house: what is loaded when, and which way imports go."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import gaponet
 
-SOURCE = Path(gaponet.__file__).parent
-# A module may import from its own rank or a lower one, also inside functions. The ground floor: plot and all modules of
-# the top folder that are not named here.
-RANKS = [
-    {"data"}, {"metrics"}, {"sim"}, {"family"}, {"motion"}, {"virtual"}, {"model"},
-    {"training", "deploy", "engine"}, {"eval"}, {"study", "view", "bench", "share"}, {"api"}, {"cli"},
-]  # fmt: skip
+SOURCE = Path(gaponet.__file__).parents[1]
+# Part → the parts that it may import from. The core knows no other by name: it asks gaponet.parts.
+PARTS = {
+    "gaponet": {"gaponet"}, "gaponet_robots": {"gaponet", "gaponet_robots"},
+    "gaponet_interop": {"gaponet", "gaponet_interop"}, "gaponet_lab": {"gaponet", "gaponet_robots", "gaponet_lab"},
+}  # fmt: skip
+# Within a part a module may import from its own rank or a lower one, also inside functions. The ground floor: all
+# modules of the part's top folder that are not named here, and process/.
+RANKS = {
+    "gaponet": [
+        {"data"}, {"metrics"}, {"sim"}, {"model"}, {"training", "deploy"}, {"eval"}, {"api"}, {"cli"},
+    ],
+    "gaponet_robots": [{"motion"}, {"control", "drivers", "targets", "virtual"}, {"cli"}],
+    "gaponet_interop": [{"formats", "writers", "engine"}, {"share"}, {"cli"}],
+    "gaponet_lab": [{"plot"}, {"view", "report", "bench", "real"}, {"study"}, {"cli"}],
+}  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {
-    ".".join(("gaponet", *file.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__"): file
-    for file in SOURCE.rglob("*.py")
+    ".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__"): file
+    for part in PARTS
+    for file in (SOURCE / part).rglob("*.py")
 }
-MOST: dict[str, int] = {}  # files in a folder; 16 in all others
+MOST = {"gaponet": 19, "sim": 17}  # files in a folder; 16 in all others
 
 
 def rank(module: str) -> int:
-    name = module.split(".")[1]
-    assert (SOURCE / f"{name}.py").is_file() or name == "plot" or name in set().union(*RANKS), f"{name} has no rank"
-    return next((i for i, names in enumerate(RANKS, 1) if name in names), 0)
+    part, name = module.split(".")[:2]
+    ranks = RANKS[part]
+    assert (SOURCE / part / f"{name}.py").is_file() or name in {"process"}.union(*ranks), f"{module} has no rank"
+    return next((i for i, names in enumerate(ranks, 1) if name in names), 0)
 
 
 def top_level_imports(tree: ast.Module) -> list[str]:
@@ -71,8 +83,23 @@ def test_imports_go_one_way():
     for name, file in MODULES.items():
         if name.split(".")[1:2] in ([], ["__main__"]):
             continue
-        for other in imported(file) - {"gaponet"}:
-            assert rank(other) <= rank(name), f"{file} imports {other}"
+        part = name.split(".")[0]
+        for other in imported(file) - PARTS.keys():
+            of = other.split(".")[0]
+            assert of in PARTS[part], f"{file} imports {other} of a part that may be missing"
+            assert of != part or rank(other) <= rank(name), f"{file} imports {other}"
+
+
+def test_what_the_parts_offer_is_there():
+    for part in sorted(PARTS.keys() - {"gaponet"}):
+        tables = {k: v for k, v in vars(importlib.import_module(part)).items() if k.isupper()}
+        assert tables
+        for where in (where for table in tables.values() for where in table.values()):
+            module, _, name = where.partition(":")
+            tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+            assert not name or name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)}, (
+                where
+            )
 
 
 def test_no_module_imports_one_that_imports_it_not_even_in_a_function():
@@ -91,18 +118,25 @@ def test_no_folder_is_more_than_a_newcomer_can_hold():
 
 
 def test_torch_is_imported_only_where_networks_live():
-    allowed = {f"model/{name}.py" for name in ("deeponet", "export", "fuse", "layers", "points")}
-    allowed |= {"data/formats/pace.py", "sim/warp.py"}  # reads what torch wrote; steps on a GPU
-    allowed |= {f"model/baselines/{name}.py" for name in ("fno", "mlp", "tokens", "transformer")}
-    for file in SOURCE.rglob("*.py"):
+    allowed = {f"gaponet/model/{name}.py" for name in ("deeponet", "export", "fuse", "layers")}
+    allowed |= {"gaponet/sim/warp.py"}  # steps on a GPU
+    allowed |= {f"gaponet/model/baselines/{name}.py" for name in ("fno", "mlp", "tokens", "transformer")}
+    free = ("gaponet/training/", "gaponet_interop/engine/", "gaponet_lab/bench/", "gaponet_lab/study/pool.py")
+    for file in MODULES.values():
         place = file.relative_to(SOURCE).as_posix()
         names = top_level_imports(ast.parse(file.read_text(encoding="utf-8")))
         uses = "import torch" in file.read_text(encoding="utf-8") or any(n.split(".")[0] == "rsl_rl" for n in names)
-        free = place.startswith(("training/", "engine/", "bench/")) or place == "study/pool.py"
-        assert not uses or place in allowed or free, place
+        assert not uses or place in allowed or place.startswith(free), place
 
 
-def test_deploy_and_model_never_import_training():
-    for folder in ("model", "deploy", "engine", "eval", "view"):
+def test_what_may_run_on_a_robot_never_imports_training():
+    for folder in (
+        "gaponet/model",
+        "gaponet/deploy",
+        "gaponet/eval",
+        "gaponet_robots",
+        "gaponet_interop",
+        "gaponet_lab/view",
+    ):
         for file in (SOURCE / folder).rglob("*.py"):
             assert "gaponet.training" not in file.read_text(encoding="utf-8"), file

@@ -60,3 +60,9 @@ def test_exact_versions_lie_within_the_ranges():
             assert number(low) <= number(exact[name]), name
             assert not high or number(exact[name]) < number(high), name
     assert {"torch", "mujoco", "numpy", "rsl-rl-lib"} <= exact.keys()
+
+
+def test_no_extra_of_our_own_carries_a_marker():
+    """hatchling loses a marker beside the project's own name."""
+    wanted = [line for lines in PROJECT["optional-dependencies"].values() for line in lines]
+    assert not [line for line in wanted if line.startswith("gaponet[") and ";" in line]

@@ -19,6 +19,13 @@ def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(cap
     assert len(lines) == 5
 
 
+def test_what_is_complete_is_said_once(capfd):
+    with progress.bar("training") as update:
+        for stage in ("ppo", "gain", "gain", "export"):
+            update(1, 1, stage)
+    assert capfd.readouterr().err == "training: 100 %, 0 s, ppo\n"
+
+
 def test_parts_that_run_side_by_side_are_told_together(capfd):
     with progress.bars("runs", 4) as show:
         show({"mlp seed 0": (0.5, "round 3"), "gaponet seed 0": (0.25, "")}, 1)

@@ -13,9 +13,9 @@ from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.backends import Bound
 from gaponet.model.config import ModelConfig
 from gaponet.robot import RobotSpec
-from gaponet.study.played.trained import Trained
-from gaponet.study.result import Result
-from gaponet.virtual.physics import Physics, neutral
+from gaponet_lab.study.played.trained import Trained
+from gaponet_lab.study.result import Result
+from gaponet_robots.virtual.physics import Physics, neutral
 
 WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
 CONFIG = ModelConfig(history=2, payload_max=0.4)

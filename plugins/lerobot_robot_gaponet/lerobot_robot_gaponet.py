@@ -8,7 +8,6 @@ a policy that stalls leaves the arm held, then damped.
 
 import shlex
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
+from gaponet.process import child
 from gaponet.robot import RobotSpec, load_robot
 
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
@@ -58,7 +58,8 @@ class GaponetSO101Config(RobotConfig):
 
     port: str = "/dev/ttyACM0"
     calibration: Path | None = None  # that file, compared with what the servos hold; without one the servos' counts
-    model: Path | None = None  # run of gaponet train; without one targets go to the arm as they are, within limits
+    known: Path | None = None  # robot folder of gaponet identify: targets are compensated by what is known of the arm
+    model: Path | None = None  # run of gaponet train, on top; without both targets go to the arm as they are
     fps: float | None = None  # control rate, Hz, the same as LeRobot's: default what the model was trained at, else 30
     options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
@@ -102,8 +103,8 @@ class GaponetSO101(Robot):
         """Servos are left as they are set; the limits and the model's card ask what they have."""
 
     def connect(self, calibrate: bool = True) -> None:
-        from gaponet.deploy.driver import DriverError
-        from gaponet.deploy.targets.client import RemoteRobot
+        from gaponet_robots.control.driver import DriverError
+        from gaponet_robots.targets.client import RemoteRobot
 
         self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
         address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")
@@ -133,9 +134,10 @@ class GaponetSO101(Robot):
             rate = 1 / GapModel.load(config.model).card["dt"][0]
         words = ["--driver", "so101", "--port", config.port, "--rate", str(rate or DEFAULT_RATE), "--yes"]
         words += ["--targets", "zmq", "--live.address", address]
+        words += ["--robot", str(config.known.absolute()), "--compensate"] if config.known else []
         words += ["--model", str(config.model)] if config.model else []
         words += ["--calibration", str(config.calibration)] if config.calibration else []
-        return [sys.executable, "-m", "gaponet", "run", *words, *shlex.split(config.options)]
+        return child.words("gaponet", "run", *words, *shlex.split(config.options))
 
     def get_observation(self) -> dict[str, Any]:
         state = next(self._states, None) if self._process else None
@@ -220,9 +222,9 @@ class GaponetMotion(Teleoperator):
         self._rows = self._all_rows()
 
     def _all_rows(self) -> Iterator[np.ndarray]:
-        from gaponet.motion.files import SUFFIXES, read_motion
-        from gaponet.motion.library import Library
-        from gaponet.motion.minjerk import blend, move_time
+        from gaponet_robots.motion.files import SUFFIXES, read_motion
+        from gaponet_robots.motion.library import Library
+        from gaponet_robots.motion.minjerk import blend, move_time
 
         given, dt = self.config.motions, 1 / self.config.fps
         files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES) if Path(given).is_dir() else []
@@ -259,7 +261,7 @@ class GaponetMotion(Teleoperator):
 @ProcessorStepRegistry.register("gaponet_correct")
 @dataclass
 class GaponetCorrect(ProcessorStep):
-    """Corrects SO-101 joint targets, once per control period at the rate that the model was trained at.
+    """Corrects SO-101 joint targets, once per control period, by a model at its rate, or by an identified robot at its.
 
     For a robot that is not gaponet_so101: the correction is bounded in size and rate, but nothing watches the arm. As
     last step of a policy's postprocessor actions are tensors (..., 6) of all joints, and no state is known; as a robot
@@ -267,17 +269,20 @@ class GaponetCorrect(ProcessorStep):
     """
 
     model: str = ""
+    known: str = ""  # instead of a model, a robot folder of gaponet identify
     payload_mass: float = 0.0
     dynamics: bool = False  # feed forward what moving asks for: for planned, smooth targets alone
 
     def __post_init__(self) -> None:
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
-        from gaponet.deploy.safety import Limits, SafetyConfig, limit_delta
         from gaponet.model.artifact import GapModel
+        from gaponet_robots.control.safety import Limits, SafetyConfig, limit_delta
 
-        network = GapModel.load(self.model)
-        self.spec = network.simulator()
-        self.units, self.dt = Units(self.spec), network.card["dt"][0]
+        if bool(self.model) == bool(self.known):
+            raise ValueError("gaponet_correct: give either model, a run, or known, a robot folder of gaponet identify")
+        network = GapModel.load(self.model) if self.model else None
+        self.spec = load_robot(Path(self.known)) if network is None else network.simulator()
+        self.units, self.dt = Units(self.spec), self.spec.dt if network is None else network.card["dt"][0]
         self.compensator = Compensator(self.spec, network, CompensatorConfig(dynamics=self.dynamics), self.dt)
         self.limits = Limits.of(self.spec, self.spec.joint_names, SafetyConfig())
         self._bounded = limit_delta
@@ -313,7 +318,7 @@ class GaponetCorrect(ProcessorStep):
         return np.clip(target + self._delta, self.limits.low, self.limits.high)
 
     def get_config(self) -> dict[str, Any]:
-        return {"model": self.model, "payload_mass": self.payload_mass, "dynamics": self.dynamics}
+        return {"model": self.model, "known": self.known, "payload_mass": self.payload_mass, "dynamics": self.dynamics}
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
         return features

@@ -24,18 +24,19 @@ __version__ = "0.1.0"
 
 _HOMES = {  # name → module
     **dict.fromkeys(
-        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "calibrate"), "gaponet.api"
+        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "calibrate", "calibrate_robot"),
+        "gaponet.api",
     ),
     "Dataset": "gaponet.data.store",
-    "open_dataset": "gaponet.share.stream",
+    "open_dataset": "gaponet.data.store",
     "load_robot": "gaponet.robot",
     "RobotSpec": "gaponet.robot",
     "GapModel": "gaponet.model.artifact",
     "AlignedSim": "gaponet.deploy.aligned_sim",
     "MujocoAligner": "gaponet.deploy.mujoco_loop",
     "Compensator": "gaponet.deploy.compensator",
-    "Controller": "gaponet.deploy.controller",
-    "RemoteRobot": "gaponet.deploy.targets.client",
+    "Controller": "gaponet_robots.control.controller",
+    "RemoteRobot": "gaponet_robots.targets.client",
 }
 __all__ = ["GAPONetError", "__version__", *_HOMES]
 

@@ -5,6 +5,8 @@ import signal
 import sys
 from types import FrameType
 
+from gaponet.process.child import leave_folder
+
 
 def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
     """End at once: nothing has begun, and an exception could be lost in an import."""
@@ -15,6 +17,7 @@ def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
 def entry() -> None:
     try:
         signal.signal(signal.SIGINT, _leave)
+        leave_folder()
         from gaponet.cli.main import main
 
         code = main(begin=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))

@@ -5,6 +5,7 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 
 from __future__ import annotations
 
+import os
 import time
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
@@ -14,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, UsageError
+from gaponet.errors import DatasetError, NoGainError, UsageError
+from gaponet.files import MARK
+from gaponet.parts import named, offered
 from gaponet.progress import bar, noted
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import MOVE_KEPT
@@ -49,8 +52,8 @@ def import_logs(
         out: Dataset folder; appended to where it exists.
         unit_id: Which of its kind: any name, the same for all logs of one unit. Needed unless the format states it.
         payload_mass: kg in each hand, 0.0 when empty. Needed unless the format states it.
-        options: payload_side, level, fmt, kp, kd, skip_bad, joint_map, logs, position_unit, time_unit, allow_pickle, as
-            data.importer.import_logs takes them.
+        options: payload_side, level, fmt, kp, kd, skip_bad, joint_map, logs, position_unit, time_unit, rate, cut,
+            allow_pickle, strict, as data.importer.import_logs takes them.
 
     Raises:
         LogError, JointMismatchError, UsageError, DatasetError: The message says which file and what to do.
@@ -119,32 +122,38 @@ def gap(
     motions: tuple[str, ...] = (),
     run: GapModel | Place | None = None,
 ) -> dict[str, Any]:
-    """Measure how far the nominal simulator is from the robot, in whole-motion free run, and with a run, why.
+    """Measure how far the nominal simulator is from the robot, in whole-motion free run; of an identified one also why.
 
     Args:
         dataset: Sequences without a twin are replayed first. Also the address of one that was pushed to a bucket.
-        robot: Another robot than the one that the dataset keeps.
+        robot: Another robot than the one that the dataset keeps. An identified one is taken as `run` is.
         motions: Only these.
-        run: A run of train: what delay, offset, each cause that was identified and the model remove, and the floor, on
-            motions that it never saw; kept as gap.json, .svg and .png in the run, whose report shows them.
+        run: A robot folder that identify wrote, or a run of train: what each cause that was identified and the model
+            remove, and the floor, on motions that it never saw; kept there as gap.json, .svg and .png.
 
     Returns:
-        methods → nominal → metrics (mpjae rad, …), and by_joint, by_payload, by_unit, by_motion, by_horizon the same;
-        dataset, sequences, hours, virtual, robot, simulator_hash. With a run: as eval.gap.gap_by_step.
+        methods → nominal (and identified, and the model's) → metrics (mpjae rad, …), and by_joint, by_payload, by_unit,
+        by_motion, by_horizon the same; dataset, sequences, hours, virtual, robot, simulator_hash. Of an identified
+        robot or a run also what eval.gap.gap_by_step says.
     """
     from gaponet.metrics import Run, summary
     from gaponet.sim.model import model_hash
 
-    if run is not None:
+    spec = None if robot is None else robot if isinstance(robot, RobotSpec) else load_robot(robot)
+    if run is not None or (spec is not None and spec.nominal is not None):
+        from gaponet.eval.candidate import Candidate
         from gaponet.eval.gap import gap_by_step
-        from gaponet.eval.gap_figure import write_gap
 
-        data, spec = _opened(dataset, robot, folder := _run(run))
+        folder = None if run is None else _run(run)
+        data, spec = _opened(dataset, spec, folder)
+        one = Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
         with bar("gap") as update:
-            found = gap_by_step(folder, data, spec, motions, update)
-        write_gap(found, folder)
+            found = gap_by_step(one, data, motions, update)
+        draw = offered("PROVIDES").get("figure of a gap")
+        if draw and (folder is not None or (one.folder / MARK).is_file()):  # a user's own folder is left as it is
+            named(draw)(found, one.folder, one.kind)
         return found
-    data, spec = _opened(dataset, robot)
+    data, spec = _opened(dataset, spec)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
     pairs = (data.pair(e, simulator) for e in entries)
@@ -190,8 +199,13 @@ def identify(
     table: bool = True,
     shared: bool = False,
     threads: int = 0,
+    budget: str | None = None,
+    stops: bool = False,
 ) -> Identification:
     """Fit the servos of the simulator, and what the robot touches, to the training motions.
+
+    What is written follows the validation motions better than the robot as it was given; where nothing does, nothing is
+    written.
 
     Recordings made with several gains are fitted together, each in a simulator of its own gains.
 
@@ -205,16 +219,21 @@ def identify(
         terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
         shared: Give joints with one type of servo ([[servo]] in robot.toml) one law; what it costs is said.
-        threads: For the table, 0 for all cores.
+        threads: 0 for all cores.
+        budget: Time such as 60s or 4m that the searches may take, the table's apart; default as long as it takes.
+        stops: Give joints that stayed behind several commands a stop there; else they are asked about.
 
     Raises:
         DatasetError, UsageError: A unit is not there.
+        NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
+    from gaponet.data.json_file import write_json
     from gaponet.data.split import split_entries
     from gaponet.files import writing
-    from gaponet.robot_folder import save_robot
+    from gaponet.robot_folder import ORIGIN, save_robot
+    from gaponet.sim.identify import BETTER, no_gain, whole_errors
     from gaponet.sim.identify import identify as fit
-    from gaponet.sim.replay import replay
+    from gaponet.training.budget import Budget
 
     data, spec = _opened(dataset, robot)
     data.require_robot(spec)
@@ -223,16 +242,26 @@ def identify(
         raise UsageError(f"--units {min(set(units) - held)}: not in {data.path}")
     parts = split_entries(data, tuple(sorted((held - set(units) if units else set()) | set(holdout_units))))
     began, val = time.monotonic(), data.sequences(parts["val"])
+    seconds = None if budget is None else Budget.parse(budget).seconds
+    if budget is not None and seconds is None:
+        raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
     with writing(Path(out), "robot"), bar("identifying") as update:
-        found = fit(data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update)
+        found = fit(
+            data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update, seconds, stops
+        )
+        given, left = whole_errors(val, spec, threads), whole_errors(val, found.robot, threads)
+        if not found.better or left.mean() > BETTER * given.mean():
+            raise NoGainError(no_gain(found, spec, given, left))
         save_robot(found.robot, Path(out))
-    seconds, op = time.monotonic() - began, spec.operated_index
-
-    def errors(simulator: RobotSpec) -> np.ndarray:
-        twins = replay(val, simulator, nthread=threads, lock_idle=True)
-        return np.array([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(val, twins, strict=True)])
-
-    return Identification(found, {"nominal": errors(spec.nominal or spec), "identified": errors(found.robot)}, seconds)
+        nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
+        val_errors = {"nominal": nominal, "identified": left}
+        write_json(Path(out) / ORIGIN, {
+            "dataset": data.address or os.path.relpath(data.path, out),
+            "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
+            "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
+            "val_mpjae": {name: float(e.mean()) for name, e in val_errors.items()},
+        })  # fmt: skip
+    return Identification(found, val_errors, time.monotonic() - began)
 
 
 def train(
@@ -293,10 +322,10 @@ def evaluate(
     motions: tuple[str, ...] = (),
     robot: RobotSpec | Place | None = None,
 ) -> Evaluation:
-    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it.
+    """Step simulators through logs they never saw: nominal, identified, and with the shipped model on top.
 
     Args:
-        run: Run folder, or what train returned; the result is kept in it.
+        run: Robot folder that identify wrote; or run folder, or what train returned. The result is kept in it.
         dataset: The dataset trained on (its test motions are used) or another.
         also: Further runs to compare, e.g. the MLP's.
         motions: Only these.
@@ -308,12 +337,15 @@ def evaluate(
             transfer was never measured so far from the simulator of the run.
     """
     from gaponet.eval import evaluate as measuring
+    from gaponet.eval.candidate import is_robot
     from gaponet.robot_folder import keeps_robot, kept_robot
     from gaponet.sim.model import model_hash
 
     folder = _run(run)
     data, spec = _opened(dataset, robot, folder)
-    target, kept = None, kept_robot(folder, spec.name) if robot is not None and keeps_robot(folder) else spec
+    target, kept = None, spec
+    if robot is not None and (is_robot(folder) or keeps_robot(folder)):
+        kept = load_robot(folder) if is_robot(folder) else kept_robot(folder, spec.name)
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
     with bar("evaluating") as update:
@@ -351,7 +383,7 @@ def calibrate(
         UsageError, ModelError: The unit is not named, or the model fits another robot.
     """
     from gaponet.data.sequence import require_same_gains
-    from gaponet.eval.evaluate import corrected_robot
+    from gaponet.eval.candidate import corrected_robot
     from gaponet.model import calibration
     from gaponet.model.artifact import GapModel
 
@@ -371,10 +403,97 @@ def calibrate(
     return found
 
 
+@dataclass(frozen=True)
+class Calibrated:
+    """A robot folder that was fitted to one unit.
+
+    Attributes:
+        robot: With the unit's servos; its nominal robot is the given one's.
+        unit: Whose recordings they were.
+        errors: Mean |error| of each whole recording, (recordings,) rad: before, after.
+        payload_mass, payload_std: kg in each hand that carries, and its standard error, where it was asked for.
+    """
+
+    robot: RobotSpec
+    unit: str
+    errors: dict[str, np.ndarray]
+    payload_mass: float | None
+    payload_std: float | None
+
+
+def calibrate_robot(
+    robot: RobotSpec | Place,
+    source: Dataset | Place,
+    out: Place,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    seconds: float = 30.0,
+    unknown_payload: bool = False,
+    payload_mass: float | None = None,
+) -> Calibrated:
+    """Fit what is particular to one unit to a short log: a robot folder in, a robot folder out, no model.
+
+    The same fit as `calibrate`: what the log does not show stays as it was known.
+
+    Args:
+        robot: What is known: the folder that identify wrote, or a nominal one.
+        source: A dataset, or logs that gaponet import reads.
+        out: Robot folder to write.
+        unit: Which one, where the dataset holds several.
+        motions: Only these.
+        seconds: How much of the recordings to fit, in windows of 8 s; all of them judge.
+        unknown_payload: Do not believe the recordings' payload, estimate it too; all must carry the same.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+
+    Raises:
+        UsageError: The unit is not named.
+        NoGainError: The fit does not follow the recordings better than the robot as it was known; nothing is written.
+    """
+    import tempfile
+
+    from gaponet.files import write_text, writing
+    from gaponet.model import calibration
+    from gaponet.robot_folder import ORIGIN, save_robot
+    from gaponet.sim.identify import BETTER, whole_errors
+
+    spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
+    with tempfile.TemporaryDirectory() as place, writing(Path(out), "robot"):
+        if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
+            import_logs(source, spec, Path(place) / "data", unit or None, payload_mass)
+            data = Dataset(Path(place) / "data")
+        else:
+            data, _ = _opened(source, spec)
+        data.require_robot(spec)
+        units = sorted({e.meta.unit_id for e in data.entries})
+        if unit not in units and (unit or len(units) != 1):
+            raise UsageError(f"--unit {unit or '(none)'}: {source} holds units {', '.join(units)}; name one")
+        sequences = data.sequences([e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])])
+        believed = all(s.meta.known_gains[1] is not None for s in sequences)
+        with bar("calibrating") as update:
+            found = calibration.fit(
+                spec, sequences, seconds, unknown_payload, None,
+                lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"), believed,
+            )  # fmt: skip
+        if found.payload_mass is not None:
+            mass = float(found.payload_mass)
+            sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]
+        errors = {name: whole_errors(sequences, r) for name, r in (("before", spec), ("after", found.robot))}
+        before, after = (1e3 * float(e.mean()) for e in errors.values())
+        if after > BETTER * before:
+            raise NoGainError(
+                f"nothing is written: over all {len(sequences)} recording(s) the fit leaves {after:.2f} mrad, "
+                f"{spec.name} as it is known {before:.2f}; give longer logs (--seconds), or keep the robot as it is"
+            )
+        save_robot(found.robot, Path(out))
+        if (spec.folder / ORIGIN).is_file():  # which motions identification saw is still to be known
+            write_text(Path(out) / ORIGIN, (spec.folder / ORIGIN).read_text(encoding="utf-8"))
+    return Calibrated(found.robot, unit or units[0], errors, found.payload_mass, found.payload_std)
+
+
 def _opened(
     dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
-    from gaponet.share.stream import open_dataset
+    from gaponet.data.store import open_dataset
 
     return open_dataset(dataset, robot, run)
 

@@ -43,6 +43,8 @@ def bare_text(spec: mujoco.MjSpec, path: Path) -> str:
     root = ET.fromstring(spec.to_xml())
     for child in [c for c in root if c.tag in (*DROPPED, "compiler")]:
         root.remove(child)
+    for element in root.iter("geom"):  # a class may name what was dropped
+        element.attrib.pop("material", None)
     root.insert(0, ET.Element("compiler", COMPILER))
     asset, world = ET.SubElement(root, "asset"), root.find("worldbody")
     assert world is not None

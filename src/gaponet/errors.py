@@ -43,8 +43,16 @@ class RemoteError(GAPONetError):
     """A place on the network cannot be reached, or does not hold what it says."""
 
 
+class NoGainError(GAPONetError):
+    """Nothing that was fitted follows the recordings better than what is known already."""
+
+
 class WorkerError(GAPONetError):
     """The processes that worked on something died of it, one after the other."""
+
+
+class MissingPartError(GAPONetError):
+    """What was asked for belongs to a part of gaponet that is not installed."""
 
 
 class UsageError(GAPONetError):

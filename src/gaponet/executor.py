@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 
 from gaponet.errors import UsageError, WorkerError
 from gaponet.files import MARK
+from gaponet.process.child import SAFE
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -294,10 +295,11 @@ KINDS = {LOCAL: _local, "ray": _ray, "dask": _dask, "submitit": _submitit}
 @contextmanager
 def _for_children(threads: int) -> Iterator[None]:
     """What a process that is started now reads from its environment; Ctrl-C in the terminal is for its parent alone."""
-    before = {name: os.environ.get(name) for name in POOLS}
+    told = dict.fromkeys(POOLS, str(threads)) | {SAFE: "1"}
+    before = {name: os.environ.get(name) for name in told}
     main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
-    os.environ.update(dict.fromkeys(POOLS, str(threads)))
+    os.environ.update(told)
     try:
         yield
     finally:

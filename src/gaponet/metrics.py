@@ -35,12 +35,15 @@ class Run:
     dt: float
     qpos_real: Array
     qpos_sim: Array
+    recorded: tuple[int, ...] | None = None  # columns that the recording holds; None for all
 
     @classmethod
     def of(cls, real: Sequence, simulated: Array, robot: RobotSpec) -> Run:
         """A recording and simulated positions of all joints, (T, n_all) rad; keeps neither."""
         op = robot.operated_index
-        return cls(real.meta, real.dt, real.qpos[:, op], np.asarray(simulated)[:, op])
+        unknown = real.meta.unrecorded
+        held = tuple(i for i, j in enumerate(robot.operated) if j not in unknown) if unknown else None
+        return cls(real.meta, real.dt, real.qpos[:, op], np.asarray(simulated)[:, op], held)
 
     @property
     def error(self) -> Array:
@@ -76,8 +79,20 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
         iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
         SAGE and the paper report, tables show the first few).
     """
-    rows = [_sequence_metrics(r, columns) for r in part]
+    mine = [(r, c) for r in part if (c := _recorded(r, columns)) is None or c]
+    rows = [_sequence_metrics(r, c) for r, c in mine]
     return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
+
+
+def _recorded(run: Run, columns: list[int] | None) -> list[int] | None:
+    """Of these columns, those that the recording holds."""
+    if run.recorded is None:
+        return columns
+    return [i for i in run.recorded if columns is None or i in columns]
+
+
+def _slice(run: Run) -> list[int] | slice:
+    return slice(None) if run.recorded is None else list(run.recorded)
 
 
 def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
@@ -122,8 +137,8 @@ def horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
         for run in part:
             last = max(round(seconds / run.dt), 1)
             if len(run.error) >= last:
-                values.append(np.abs(run.error[last // 2 : last]).mean())
+                values.append(np.abs(run.error[last // 2 : last][:, _slice(run)]).mean())
         if values:
             out[f"{seconds:g}"] = {"mpjae": float(np.mean(values))}
-    out["whole"] = {"mpjae": float(np.mean([np.abs(r.error).mean() for r in part]))}
+    out["whole"] = {"mpjae": float(np.mean([np.abs(r.error[:, _slice(r)]).mean() for r in part]))}
     return out

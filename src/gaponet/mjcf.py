@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from gaponet.errors import RobotError
+from gaponet.process import sandbox
+from gaponet.process.sandbox import inside
 
 if TYPE_CHECKING:
     import mujoco
@@ -15,21 +20,44 @@ if TYPE_CHECKING:
 ELEMENTS = 20_000  # after <replicate> and the like: the largest public humanoids have some hundreds
 CELLS = 1 << 24  # pixels of a texture, samples of a height field
 BYTES = 256 << 20  # of one file, or of a simulation's memory
+PACKAGED = Path(__file__).resolve().with_name("robots")
+# What costs no more than it says. Anything else (meshes, textures, attached models, …) is tried in the sandbox.
+PLAIN = {
+    "mujoco", "compiler", "option", "flag", "size", "memory", "default", "worldbody", "body", "frame", "inertial",
+    "joint", "freejoint", "geom", "site", "light", "camera", "statistic", "visual", "global", "headlight", "map",
+    "scale", "rgba", "quality", "contact", "pair", "exclude", "actuator", "position", "velocity", "motor", "general",
+    "keyframe", "key", "sensor", "jointpos", "jointvel", "actuatorfrc", "gyro", "accelerometer", "framepos",
+}  # fmt: skip
+PLAIN_ELEMENTS = 2000
+COUNTS = {"nsample", "resolution", "builtin", "file", "num", "dim"}  # attributes that make more than they say
+USER = [f"nuser_{kind}" for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")]
+SOLVERS = ("iterations", "ls_iterations", "noslip_iterations", "ccd_iterations", "sdf_iterations", "sdf_initpoints")
+LARGEST = {"size": dict.fromkeys(("nuserdata", "nkey", *USER), 1000), "option": dict.fromkeys(SOLVERS, 1000)}
+_TRIED: set[frozenset[tuple[str, int, int]]] = set()
 
 
-def read_mjcf(path: Path) -> mujoco.MjSpec:
+def read_mjcf(path: Path, tried: bool = False) -> mujoco.MjSpec:
     """An MJCF as a specification that can be changed and compiled.
+
+    What is made of plain elements alone, or lies in the package, is as small as it looks; anything else is tried in the
+    sandbox first, once for each state of its files.
+
+    Args:
+        path: The file.
+        tried: The caller has tried it.
 
     Raises:
         RobotError: Not MJCF, larger than a robot, or it names something that is not a file.
     """
     import mujoco
 
-    require_size(path)
-    try:
+    look = require_size(path)
+    state = frozenset(look.files)
+    if not (tried or look.plain or state in _TRIED or path.resolve().is_relative_to(PACKAGED)):
+        _try(path)
+        _TRIED.add(state)
+    with said(path, "not valid MJCF"):
         return mujoco.MjSpec.from_file(str(path))
-    except (ValueError, mujoco.FatalError) as error:
-        raise RobotError(f"{path}: not valid MJCF: {' '.join(str(error).split())}") from None
 
 
 def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
@@ -38,55 +66,100 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     Raises:
         RobotError: It does not compile.
     """
+    with said(path, "does not compile"):
+        return spec.compile()
+
+
+@contextmanager
+def said(path: Path, what: str) -> Iterator[None]:
+    """MuJoCo's errors as one line."""
     import mujoco
 
     try:
-        return spec.compile()
-    except (ValueError, mujoco.FatalError) as error:
-        raise RobotError(f"{path}: does not compile: {' '.join(str(error).split())}") from None
+        yield
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        text = " ".join(str(error).split())
+        if sandbox.here() and "allocat" in text:
+            raise MemoryError from None
+        text = "MuJoCo does not say why; does it ask for too much?" if "unknown exception" in text else text
+        raise RobotError(f"{path}: {what}: {text}") from None
 
 
-def require_size(path: Path) -> None:
+@inside(RobotError, "mujoco", 0.5)
+def _try(path: Path) -> None:
+    require_moderate(compiled(read_mjcf(path, tried=True), path), path)
+
+
+def require_moderate(model: mujoco.MjModel, path: Path) -> None:
+    """Refuse a model whose simulation takes more than BYTES, or does not come through a step."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    if mujoco.mj_sizeModel(model) + data.nbuffer > BYTES:
+        raise RobotError(f"{path}: a simulation of it takes more than {BYTES >> 20} MiB; gaponet does not load it")
+    mujoco.mj_step(model, data)
+
+
+@dataclass
+class Look:
+    """What an MJCF is made of: files (path, size, time), how many elements in all, and whether all are PLAIN."""
+
+    files: set[tuple[str, int, int]] = field(default_factory=set)
+    count: float = 0.0
+    plain: bool = True
+
+
+def require_size(path: Path) -> Look:
     """Refuse a file that is no XML, or makes or names more than a robot has."""
-    _count(path, path.parent, {path.resolve()})
+    look = Look()
+    _count(path, path.parent, {path.resolve()}, look, 1.0)
+    look.plain = look.plain and look.count <= PLAIN_ELEMENTS
+    return look
 
 
-def _count(path: Path, folder: Path, seen: set[Path]) -> int:
-    """Elements that a file makes, those of its <include>s counted; refuses too many."""
+def _count(path: Path, folder: Path, seen: set[Path], look: Look, times: float) -> None:
+    """Count what a file makes, its <include>s too; refuses too much."""
     if not path.is_file() or path.stat().st_size > BYTES:
         raise RobotError(f"{path}: is missing, not a file, or has more than {BYTES >> 20} MiB")
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # an encoding that nobody knows
         raise RobotError(f"{path}: not valid MJCF: {error}") from None
-    count = 0.0
-    open_tags = [(root, 1.0)]
+    open_tags = [(root, times)]
     while open_tags:
         tag, times = open_tags.pop()
         times *= _copies(tag)
-        count += times
-        if count > ELEMENTS or _extent(tag, "width", "height") > CELLS or _extent(tag, "nrow", "ncol") > CELLS:
+        look.count += times
+        look.plain = look.plain and tag.tag in PLAIN and not COUNTS & tag.attrib.keys()
+        if look.count > ELEMENTS or _extent(tag, "width", "height") > CELLS or _extent(tag, "nrow", "ncol") > CELLS:
             raise RobotError(f"{path}: <{tag.tag}> makes a model far larger than a robot; gaponet does not load it")
         if tag.tag == "size" and _bytes(tag.get("memory", "0")) > BYTES:
             raise RobotError(f"{path}: <size memory> is above {BYTES >> 20} MiB; delete it, MuJoCo finds its own")
+        for name in LARGEST.get(tag.tag, {}).keys() & tag.attrib.keys():
+            if not _extent(tag, name) <= LARGEST[tag.tag][name]:
+                most = LARGEST[tag.tag][name]
+                raise RobotError(f"{path}: <{tag.tag} {name}> is above {most}, more than a robot needs; delete it")
         if tag.tag == "include":
             other = folder / tag.get("file", "")
             if other.resolve() in seen:
                 raise RobotError(f"{path}: includes {other.name} twice")
-            count += times * _count(other, folder, seen | {other.resolve()})
+            _count(other, folder, seen | {other.resolve()}, look, times)
         open_tags += [(child, times) for child in tag]
-    _require_files(root, path, folder)
-    return math.ceil(count)
+    _require_files(root, path, folder, look)
 
 
-def _require_files(root: ElementTree.Element, path: Path, folder: Path) -> None:
+def _require_files(root: ElementTree.Element, path: Path, folder: Path, look: Look) -> None:
     places = {folder} | {
         folder / tag.get(key, "") for tag in root.iter("compiler") for key in ("meshdir", "texturedir", "assetdir")
     }
-    for name in {tag.get("file", "") for tag in root.iter()}:
+    for name in {path.name, *(tag.get(key, "") for tag in root.iter() for key in ("file", "filename"))}:
         for place in places:
             file = place / name
-            if file.exists() and not file.is_dir() and (not file.is_file() or file.stat().st_size > BYTES):
+            if not file.exists() or file.is_dir():
+                continue
+            told = file.stat()
+            look.files.add((str(file.resolve()), told.st_size, told.st_mtime_ns))
+            if not file.is_file() or told.st_size > BYTES:
                 raise RobotError(f"{path}: {name} is not a file, or has more than {BYTES >> 20} MiB")
 
 

@@ -87,14 +87,14 @@ def _progress(title: str) -> Iterator[_Show]:
 def _lines(title: str, console: Console) -> _Show:
     """The same as lines, the first when there is something to say, then at most one every EVERY seconds."""
     began = time.monotonic()
-    last = began - EVERY
+    last, ended = began - EVERY, False
 
     def show(running: Running, done: float, total: float, note: str = "") -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last < EVERY and done < total:
+        nonlocal last, ended
+        now, complete = time.monotonic(), done >= total
+        if now - last < EVERY and (ended or not complete):
             return
-        last = now
+        last, ended = now, complete
         parts = [note, *(f"{name} {100 * share:.0f} % {said}".rstrip() for name, (share, said) in running.items())]
         share = f"{100 * done / total:.0f} %" if total else ""
         said = "; ".join(part for part in parts if part)

@@ -11,6 +11,7 @@ import atexit
 import dataclasses
 import difflib
 import functools
+import re
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the M
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
-SERVO = ("kp", "effort_limit", *FITTED)  # what identification may change
+SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
 
 
@@ -163,17 +164,21 @@ class RobotSpec:
         return any(getattr(self, name).any() for name in LAW)
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
-        """The same robot with identified values: joint → any of SERVO."""
+        """The same robot with identified values: joint → any of SERVO. A damping below zero is taken from kd."""
         changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO}
         for joint, values in servos.items():
+            i = self.index([joint])[0]
             for name, value in values.items():
-                changed[name][self.index([joint])[0]] = value
+                changed[name][i] = value
+            if changed["damping"][i] < 0:
+                changed["kd"][i] = max(changed["kd"][i] + changed["damping"][i], 0.0)
+                changed["damping"][i] = 0.0
         return dataclasses.replace(self, **changed, nominal=self.nominal or self)
 
     def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
         """The same robot with its servos set to other gains, (n) N·m/rad and N·m·s/rad; None leaves them as they are.
 
-        The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp.
+        The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp and kd.
         """
         if kp is None and kd is None:
             return self
@@ -181,10 +186,11 @@ class RobotSpec:
         known = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
         if np.allclose(known, (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
             return self
-        ratio = np.divide(known[0], nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
+        stiffer = np.divide(known[0], nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
+        found = np.divide(self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0)
         nominal = dataclasses.replace(nominal, kp=known[0], kd=known[1])
         own = self.nominal and nominal
-        return dataclasses.replace(self, kp=self.kp * ratio, kd=known[1], nominal=own)
+        return dataclasses.replace(self, kp=self.kp * stiffer, kd=known[1] * found, nominal=own)
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -220,7 +226,8 @@ class RobotSpec:
         """The robot's own name of a joint called `name` in a log.
 
         Args:
-            name: Name in the log; paths such as /robot/link/joint are reduced to their last part.
+            name: Name in the log; of left/waist the robot has left_waist, or else the last part. kLeftElbow and
+                left_elbow are left_elbow_joint.
             where: File, for the error.
             extra: The user's --map, tried first.
         """
@@ -229,9 +236,11 @@ class RobotSpec:
             mapped = table.get(full, table.get(short))
             if mapped is not None:
                 full = short = mapped
-        if short not in self.joint_names:
+        found = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
+        same = [found] if found else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
+        if len(same) != 1:
             raise JointMismatchError(self._unknown(short, where))
-        return short
+        return same[0]
 
     def _unknown(self, name: str, where: str) -> str:
         close = difflib.get_close_matches(name, self.joint_names, n=1, cutoff=0.3)
@@ -240,6 +249,11 @@ class RobotSpec:
             f"{where} names joint '{name}', but robot '{self.name}' has: {', '.join(self.joint_names)}. "
             f"Map it with --map {name}={hint}"
         )
+
+
+def _letters(joint: str) -> str:
+    """What names of one joint have in common in the styles of C, of ROS and of Python."""
+    return re.sub(r"[^a-z0-9]|joint", "", re.sub(r"^k(?=[A-Z])", "", joint).lower())
 
 
 @functools.cache

@@ -36,6 +36,8 @@ class ServoType:
     damping: Gain | None = None  # N·m·s/rad
     armature: Gain | None = None  # kg·m²
     frictionloss: Gain | None = None  # N·m
+    gain: Gain | None = None  # N·m/rad for a firmware kp of 1
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # … at this supply, which it goes with
 
     @property
     def published(self) -> dict[str, float]:
@@ -58,6 +60,7 @@ class Servo:
     """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
 
     kp: Gain | None = None
+    kd: Gain | None = None
     effort_limit: Gain | None = None
     damping: Gain | None = None
     armature: Gain | None = None

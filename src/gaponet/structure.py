@@ -44,11 +44,18 @@ def _all_finite(value: Any) -> Any:
     return value
 
 
+def _hex(text: str) -> str:
+    if len(text) != 64 or not set(text) <= set("0123456789abcdef"):
+        raise ValueError("should be the 64 lowercase hex digits of a SHA-256")
+    return text
+
+
 class _Format(TypedDict):
     format: int
 
 
 Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
+Sha256 = Annotated[str, AfterValidator(_hex)]
 Count = Annotated[int, Interval(ge=0, le=10**15)]
 Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
 Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]  # infinity too, but no NaN
@@ -94,7 +101,7 @@ def parse_json(
 
 def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
     """A JSON file as a value of type `kind`; arguments and error as of `validated`."""
-    return parse_json(kind, _content(path, error, hint), path, error, hint, more)
+    return parse_json(kind, content(path, error, hint), path, error, hint, more)
 
 
 def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = "") -> T:
@@ -108,7 +115,7 @@ def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError
 def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "") -> T:
     """A TOML file as a value of type `kind`; arguments and error as of `validated`."""
     try:
-        table = tomllib.loads(_content(path, error, hint).decode())
+        table = tomllib.loads(content(path, error, hint).decode())
     except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
         raise error(_line(path, f"not valid TOML: {found}", hint)) from None
     return validated(kind, table, path, error, hint)
@@ -163,11 +170,12 @@ def read_npz(path: Path, error: type[GAPONetError], hint: str = "") -> dict[str,
         raise error(_line(path, f"not readable ({reason})", hint)) from None
 
 
-def _content(path: Path, error: type[GAPONetError], hint: str) -> bytes:
+def content(path: Path, error: type[GAPONetError], hint: str = "", largest: int = LARGEST) -> bytes:
+    """The bytes of a file; refuses what is none (a folder, a pipe) and what has more than `largest`."""
     if not path.is_file():
         raise error(_line(path, "is missing, or not a file", hint))
-    if path.stat().st_size > LARGEST:
-        raise error(_line(path, f"has more than {LARGEST >> 20} MiB", hint))
+    if path.stat().st_size > largest:
+        raise error(_line(path, f"has more than {largest >> 20} MiB", hint))
     return path.read_bytes()
 
 

@@ -108,6 +108,41 @@ def test_a_state_that_comes_before_its_command_is_an_error(arm, tmp_path):
     assert re.match(r"shoulder moves 6\d ms before its command in 1 of 1 motions: are command and", said[0])
 
 
+def lively(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Commands that jump and wander, and a state that follows them as a servo with inertia does."""
+    rng = np.random.default_rng(seed)
+    ctrl = np.repeat(rng.uniform(-0.5, 0.5, (30, 2)), 30, axis=0)
+    return ctrl, late(lowpass(ctrl, 0.02, 4.0), 4)
+
+
+def test_velocities_where_position_targets_should_be_are_an_error(arm, tmp_path):
+    ctrl, qpos = good()
+    finding = found(
+        examine(arm, tmp_path, arm_sequence(arm, np.gradient(ctrl, 0.02, axis=0), qpos)), "command", "error"
+    )
+    assert "no position targets; they are most like velocities" in finding.message
+
+
+@pytest.mark.parametrize(("odd", "check", "words"), [
+    (lambda i, q: np.stack([np.interp(np.arange(len(q)) * 1.003, np.arange(len(q)), c) for c in q.T], axis=1),
+     "clock", "each recording follows its commands sooner"),
+    (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 follows its commands"),
+], ids=["clocks that drift", "one late recording"])  # fmt: skip
+def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(arm, tmp_path, odd, check, words):
+    logs = [(f"m{i}", *lively(i)) for i in range(5)]
+    fine = examine(arm, tmp_path / "fine", *(arm_sequence(arm, u, q, motion=m) for m, u, q in logs))
+    assert not {f.check for f in fine.findings if f.level in ("warning", "error")} & {
+        "clock",
+        "lag",
+        "copied",
+        "averaged",
+    }
+    bad = examine(
+        arm, tmp_path / "bad", *(arm_sequence(arm, u, odd(i, q), motion=m) for i, (m, u, q) in enumerate(logs))
+    )
+    assert any(f.check == check and words in f.message for f in bad.findings if f.level in ("warning", "error"))
+
+
 def test_one_sample_one_radian_off_is_a_warning(arm, tmp_path):
     ctrl, qpos = good()
     qpos[200, 1] += 1.0

@@ -7,8 +7,8 @@ from faulty import FAULTS, all_of, examine, recordings
 from gaponet.data.checks.finding import proposal
 from gaponet.data.store import Dataset
 from gaponet.errors import GAPONetError
-from gaponet.eval.draw_findings import draw_findings
 from gaponet.robot import load_robot
+from gaponet_lab.report.draw_findings import draw_findings
 
 # Check, level and words of the finding that names it; no level: the import refuses with these words.
 NAMED = {
@@ -20,7 +20,7 @@ NAMED = {
     "offset of 150 mrad": ("offset", "warning", "more than assembly leaves"),
     "lag of 100 ms more": ("lag", "warning", "of dead time: very long"),
     "lag of one joint": ("lag", "warning", "elbow_flex lags 1"),
-    "scale of 1.2": ("unit", "warning", "elbow_flex goes 1.2"),
+    "scale of 1.2": ("scale", "warning", "elbow_flex goes 1.2"),
     "scale of 0.8": ("scale", "warning", "elbow_flex goes 0.8"),
     "gear of 2": ("unit", "warning", "elbow_flex goes 2.0"),
     "spike of a state": ("jumps", "warning", "elbow_flex jumps and comes back"),
@@ -44,6 +44,7 @@ NAMED = {
     "saturated torque": ("saturation", "warning", "torque of elbow_flex is cut off flat at"),
     "saturated command": ("unit", "warning", "elbow_flex goes 1."),
     "truncated file": ("", "", "the file may be cut short"),
+    "truncated at a row's end": ("", "", "its states end"),
 }
 
 

@@ -86,12 +86,26 @@ def test_one_recording_twice_in_the_source_is_refused(logs, so101, tmp_path):
 
 def test_other_payloads_and_units_are_appended(logs, so101, tmp_path):
     import_logs(logs, so101, "lab", 0.0, tmp_path / "data")
-    import_logs(logs, so101, "lab", 0.2, tmp_path / "data", payload_side="hand")
-    report = import_logs(logs, so101, "roof", 0.0, tmp_path / "data")
-    assert len(report.dataset) == 6
-    assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[::2]] == [
+    for lag, unit, mass, side in ((3, "lab", 0.2, "hand"), (4, "roof", 0.0, None)):
+        ctrl = wave(200, 6)
+        write_sage(tmp_path / unit / "up", ctrl, late(ctrl, lag))
+        report = import_logs(tmp_path / unit, so101, unit, mass, tmp_path / "data", payload_side=side)
+    assert [(e.meta.unit_id, e.meta.payload_mass) for e in report.dataset.entries[1:]] == [
         ("lab", 0.0), ("lab", 0.2), ("roof", 0.0),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("unit", "mass"), [("lab", 0.2), ("roof", 0.0)])
+def test_known_samples_under_new_labels_are_refused_and_can_be_had_once_the_old_ones_are_gone(
+    logs, so101, tmp_path, unit, mass
+):
+    dataset = import_logs(logs, so101, "lab", 0.0, tmp_path / "data").dataset
+    write_so101(logs / "real" / "so101" / "custom" / "new")
+    with pytest.raises(DatasetError, match=r"down: known samples under new labels: .* gaponet data remove .* down-lab"):
+        import_logs(logs, so101, unit, mass, tmp_path / "data")
+    assert len(Dataset(tmp_path / "data")) == 2
+    assert [e.meta.motion for e in dataset.remove(("*-lab-0kg-*",))] == ["down", "up"]
+    assert len(import_logs(logs, so101, unit, mass, tmp_path / "data").dataset) == 3
 
 
 def test_a_second_take_of_a_motion_is_its_next_repetition(logs, so101, tmp_path):

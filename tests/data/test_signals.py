@@ -22,7 +22,18 @@ def test_a_state_between_two_samples_lies_on_the_line():
 
 
 def test_a_command_holds_until_the_next_arrives():
-    assert resample_zoh(TIME, VALUES, np.array([0.0, 0.099, 0.1, 0.399, 0.4]))[:, 0].tolist() == [0, 0, 1, 1, 4]
+    assert resample_zoh(TIME, VALUES, np.linspace(0.0, 0.4, 9))[:, 0].tolist() == [0, 0, 1, 1, 1, 1, 1, 1, 4]
+    assert resample_zoh(TIME, VALUES, np.array([0.08, 0.12]))[:, 0].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 4e-4])
+def test_commands_that_share_a_loops_stamps_with_faster_states_are_of_their_instant(jitter):
+    states = 1_700_000_000.123 + 0.01 * np.arange(3001) + jitter * np.random.default_rng(0).uniform(-1, 1, 3001)
+    sent = np.arange(1501.0)[:, None]
+    grid = states[0] + 0.01 * np.arange(3001)
+    held = resample_zoh(states[::2], sent, grid)[:, 0]
+    late = held != np.arange(3001) // 2
+    assert late.sum() == 0
 
 
 def test_the_derivative_of_a_ramp_is_its_slope_up_to_the_ends():

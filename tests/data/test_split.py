@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from arm import commands, record
-from logs import arm_sequence, late, wave
+from logs import arm_columns, arm_sequence, late, table_text, wave
 
 from gaponet.data.commands import alike, sketch
+from gaponet.data.importer import import_logs
 from gaponet.data.split import (
     PARTS,
     make_split,
@@ -256,11 +257,33 @@ def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_pat
     assert values(make_split(data, "motion", ("lift3_1kg",))["test"], "motion") == {"lift3_0kg", "lift3_1kg"}
 
 
-def test_motions_that_are_all_one_cannot_be_split(arm, tmp_path):
+def test_motions_that_are_all_one_are_repetitions_and_no_motions(arm, tmp_path):
     data = Dataset.create(tmp_path / "data", arm)
     for lag in range(4):
         data.append(arm_sequence(arm, walk(100, 1), late(walk(100, 1), lag), f"m{lag}"))
-    with pytest.raises(UsageError, match="motions with equal commands count once"):
-        split_entries(data)
+    parts = split_entries(data)
+    assert [[e.meta.motion for e in parts[part]] for part in PARTS] == [["m0", "m1"], ["m2"], ["m3"]]
     with pytest.raises(UsageError, match="all 4 motions have equal commands, so they are one"):
         make_split(data, "motion")
+
+
+def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(arm, tmp_path):
+    data, whole = Dataset.create(tmp_path / "data", arm), wave(900, 2)
+    for i in range(7):
+        played = arm_sequence(arm, whole, late(whole, 2) + 1e-3 * i, "chirp")
+        data.append(replace(played, meta=replace(played.meta, repetition=i)))
+    first = split_entries(data)
+    assert [sorted(e.meta.repetition for e in first[part]) for part in PARTS] == [[0, 1, 2, 3], [4], [5, 6]]
+    parts = make_split(data, "repetition", ("2",))
+    assert [sorted(e.meta.repetition for e in parts[part]) for part in PARTS] == [[0, 1, 3, 4, 5], [6], [2]]
+    with pytest.raises(UsageError, match="needs 3 pieces of one recording"):
+        make_split(data, "time")
+    (tmp_path / "long.csv").write_text(table_text(arm_columns(900)))
+    report = import_logs(
+        tmp_path / "long.csv", arm, "a", 0.0, tmp_path / "cut", cut=4.0, position_unit="rad", time_unit="s"
+    )
+    assert [(e.meta.motion, e.rows) for e in report.entries] == [("long@0s", 225), ("long@4s", 225), ("long@9s", 225),
+                                                                 ("long@14s", 225)]  # fmt: skip
+    parts = make_split(report.dataset, "time")
+    named = [[e.meta.motion for e in parts[part]] for part in PARTS]
+    assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]

@@ -47,6 +47,16 @@ def test_the_same_recording_is_refused_by_name(dataset, sequence):
     assert len(Dataset(dataset.path)) == 1
 
 
+def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, sequence):
+    other = dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    with pytest.raises(DatasetError, match=r"no sequence '\*-3kg-\*'; sequences.jsonl in it lists the ids"):
+        dataset.remove(("*-1kg-*", "*-3kg-*"))
+    assert dataset.remove(("*-1kg-*",)) == [other]
+    (left,) = Dataset(dataset.path).entries
+    assert [f.stem for f in (dataset.path / "sequences").iterdir()] == [left.id]
+    assert Dataset(dataset.path).read(left).content_hash() == left.hash
+
+
 def test_another_payload_of_the_same_motion_is_another_sequence(dataset, sequence):
     dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
     assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]

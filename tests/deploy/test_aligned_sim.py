@@ -124,8 +124,25 @@ def test_a_scene_that_does_not_fit_is_refused(robot, model):
     mj_model = build_model(robot)
     with pytest.raises(ModelError, match=r"trained at 50\.0 Hz"):
         MujocoAligner(model, mj_model, 0.01, 0.0)
-    with pytest.raises(ModelError, match="corrects joint 'left/shoulder', the scene has shoulder, elbow"):
+    with pytest.raises(ModelError, match="moves joint 'left/shoulder', the scene has shoulder, elbow"):
         MujocoAligner(model, mj_model, 0.02, 0.0, prefix="left/")
     mj_model.actuator_gainprm[1, 0] = 25.0
     with pytest.raises(ModelError, match="joint 'elbow': kp is 25 in the scene, the model was trained with 20"):
         MujocoAligner(model, mj_model, 0.02, 0.0)
+
+
+def test_a_scene_moves_like_an_identified_robot_without_a_model(robot):
+    law = {"kp": 15.0, "frictionloss": 0.05, "stribeck": 0.05, "stribeck_speed": 0.1}
+    known = robot.with_servos(dict.fromkeys(robot.joint_names, law))
+    mj_model = build_model(robot, 0.2)
+    data, align, sim = mujoco.MjData(mj_model), MujocoAligner(known, mj_model, 0.02, 0.2), AlignedSim(known, None, 0.2)
+    plain, apart = AlignedSim(robot, None, 0.2), []
+    for target in commands(60, 3):
+        data.ctrl[:] = align(data, target)
+        mujoco.mj_step(mj_model, data, robot.decimation)
+        sim.step(target)
+        plain.step(target)
+        apart.append([np.abs(sim.qpos - other).max() for other in (data.qpos, plain.qpos)])
+    aligned, nominal = np.mean(apart, axis=0)
+    assert aligned < 0.1 * nominal
+    assert MujocoAligner(robot, mj_model, 0.02, 0.2).transfer is None  # it moves so of itself

@@ -9,7 +9,7 @@ from arm import TOML, XML, commands, write_arm
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
-from gaponet.errors import ModelError, UsageError
+from gaponet.errors import ModelError, RobotError, UsageError
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.backends import Bound
 from gaponet.model.calibration import Calibration
@@ -189,6 +189,27 @@ def test_a_payload_that_nobody_announced_is_found(robot, model):
     assert np.abs(np.diff(q[-50:], axis=0)).max() < 1e-3
 
 
+@pytest.mark.parametrize(
+    ("held", "told", "doubted"), [(0, 0.4, True), (1, 0.0, True), (0, 0.0, False), (1, 0.4, False)]
+)
+def test_a_payload_that_was_told_is_compared_with_what_the_servos_give(robot, model, held, told, doubted):
+    arm, compensator = WeakArm(robot, WeakArm.masses[held]), Compensator(robot, model, NOW, payload_step=0.1)
+    play(arm, np.repeat([[0.3, -0.2]], 200, axis=0), compensator, told)
+    assert (f"{told:g} kg were told, and the torques are those of about" in compensator.doubt) == doubted
+    assert compensator.payload_mass[0] == told
+
+
+def test_torques_that_are_no_payloads_are_not_believed_to_be_the_largest(robot, model):
+    target = np.array([0.3, -0.2])
+    compensator = Compensator(robot, model, NOW, payload_step=0.1)
+    compensator.reset(target, None)
+    per_kg = np.subtract(*compensator.estimate._gravity(target)[::-1])
+    across = 6.0 * np.array([-per_kg[1], per_kg[0]]) + 2.0 * per_kg  # mostly what no payload does
+    for _ in range(200):
+        compensator.step(target, target, np.zeros(2), compensator.estimate._gravity(target)[0] + across)
+    assert compensator.payload_mass[0] == 0.0
+
+
 def test_a_blocked_joint_winds_nothing_up(robot, model):
     target = np.array([0.3, 0.3])
     compensator = Compensator(robot, model, replace(NOW, limit=0.05))
@@ -255,6 +276,36 @@ def test_an_identified_robot_with_late_servos_and_zero_errors_reaches_its_target
     for _ in range(150):
         arm.step(compensator.step(target, arm.qpos[0].copy())[None])
     np.testing.assert_allclose(arm.qpos[0], target, atol=0.05 / 16)  # within the friction band
+
+
+def test_without_a_model_what_was_identified_is_fed_forward(robot):
+    """Weak servos with friction at rest: known, they follow."""
+    law = {"kp": 16.0, "offset": 0.03, "frictionloss": 0.1, "stribeck": 0.1, "stribeck_speed": 0.05}
+    identified, targets = robot.with_servos(dict.fromkeys(robot.joint_names, law)), commands(150, 1)
+    missed = {}
+    for name, known in (("raw", None), ("nominal", robot), ("identified", identified)):
+        arm = BatchSim(identified, [(0.2, "both", 0.02)], 1)
+        arm.reset(slice(None), targets[:1], np.zeros((1, 2)), past=targets[None, :1])
+        compensator = Compensator(known, config=replace(NOW, dynamics=True)) if known else None
+        if compensator:
+            compensator.reset(targets[0], 0.2)
+        q = []
+        for target in targets:
+            q.append(arm.qpos[0].copy())
+            arm.step((compensator.step(target, q[-1]) if compensator else target)[None])
+        missed[name] = error(np.array(q), targets)
+    assert missed["identified"] < 0.5 * missed["nominal"] < 0.5 * missed["raw"]
+
+
+def test_without_a_model_servos_with_other_gains_and_absurd_payloads_are_refused(robot):
+    compensator = Compensator(robot.with_servos({"elbow": {"kp": 12.0}}), config=CompensatorConfig(payload_max=0.5))
+    joints, kd = robot.joint_names, np.zeros(2)
+    compensator.require_gains(joints, np.array([20.0, 20.1]), kd)  # as robot.toml says, not as identified
+    with pytest.raises(RobotError, match="kp of elbow is 20 there, the servo has 12"):
+        compensator.require_gains(joints, np.array([20.0, 12.0]), kd)
+    for mass in (np.nan, -1.0, 0.6):
+        with pytest.raises(UsageError, match=r"payload_mass is .* up to 0\.5"):
+            compensator.reset(np.zeros(2), mass)
 
 
 def test_payloads_beyond_those_trained_on_are_refused_unless_told(robot):

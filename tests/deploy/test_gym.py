@@ -38,6 +38,15 @@ def test_the_tracking_environment_keeps_gymnasiums_rules(robot, model):
     check_env(TrackingEnv(AlignedSim(robot, model), [commands(30, 0), commands(40, 1)]), skip_render_check=True)
 
 
+def test_gymnasium_makes_it_by_name():
+    env = gymnasium.make(
+        "gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101", motions=["chirp-elbow_flex"], preview=1
+    )
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == env.observation_space.shape == (15,)
+    assert env.step(env.action_space.sample())[1] < 0
+
+
 def test_an_idle_policy_asks_the_simulator_for_the_reference(robot, model):
     from gaponet.deploy.gym import TrackingEnv
 

@@ -11,12 +11,13 @@ from runs import untrained
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import DatasetError, ModelError
-from gaponet.eval.evaluate import choose, evaluate
+from gaponet.eval.candidate import Candidate, choose
+from gaponet.eval.evaluate import evaluate
 from gaponet.eval.gap import gap_by_step
 from gaponet.robot import load_robot
 from gaponet.robot_folder import kept_robot
 from gaponet.sim.model import model_hash
-from gaponet.view.side_by_side import side_by_side
+from gaponet_lab.view.side_by_side import side_by_side
 
 STIFF = TOML.replace("kp = 20.0", "kp = 90.0")
 
@@ -51,7 +52,7 @@ def test_a_folder_named_like_the_robot_in_the_current_directory_changes_nothing(
         found = evaluate([run], dataset, robot).result
         assert found["methods"]["nominal"]["mpjae"] == before
         assert found["simulator_hash"] == model_hash(arm)
-        assert gap_by_step(run, dataset, robot)["left"]["nominal"] == pytest.approx(before)
+        assert gap_by_step(Candidate.load(run, robot), dataset)["left"]["nominal"] == pytest.approx(before)
     assert main(["gap", str(data.path)]) == 2  # no run here that keeps one
     assert "keeps no robot, and the package has no 'arm'; say which robot it is with --robot" in capsys.readouterr().err
 
@@ -60,7 +61,7 @@ def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_pa
     stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
     for ask in (
         lambda: evaluate([run], data, stranger),
-        lambda: gap_by_step(run, data, stranger),
+        lambda: gap_by_step(Candidate.load(run, stranger), data),
         lambda: side_by_side(data, data.entries[3], stranger, [run]),
     ):
         with pytest.raises(ModelError, match=r"run: its nominal simulator is \w{12}, that of .*other.arm is \w{12}: "):

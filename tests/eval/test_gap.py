@@ -11,14 +11,15 @@ from runs import untrained
 from gaponet.data.repeatability import periods
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.eval.evaluate import LEARNED
+from gaponet.eval.candidate import Candidate
 from gaponet.eval.gap import CAUSES, causes, floor, gap_by_step, removed
-from gaponet.eval.gap_figure import waterfall
 from gaponet.eval.run_files import read_gap
+from gaponet.eval.verdict import LEARNED
+from gaponet.methods import title
 from gaponet.metrics import Run
-from gaponet.plot.methods import title
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import replay
+from gaponet_lab.report.gap_figure import waterfall
 
 
 def test_the_encoder_step_is_read_off_the_recordings():
@@ -59,7 +60,7 @@ def test_a_run_of_every_kind_has_its_steps_and_its_figure(arm, tmp_path, kind):
         data.append(sequence)
     motions = sorted({e.meta.motion for e in data.entries})
     run = untrained(tmp_path / "run", arm, data, kind, train=motions[:1], val=motions[1:2], test=motions[2:])
-    found = gap_by_step(run, data, arm)
+    found = gap_by_step(Candidate.load(run, arm), data)
     assert list(found["left"]) == ["nominal", "delay", "offset", kind]
     assert found["left"][kind] == pytest.approx(found["left"]["nominal"], rel=0.2)  # it corrects nothing yet
     assert found["floor"] == {"encoder": None, "repeatability": None, "both": None}

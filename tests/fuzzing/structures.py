@@ -22,15 +22,15 @@ from gaponet.data.pair import Twin
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
 from gaponet.eval import run_files
-from gaponet.eval.evaluate import split_of_run as read_run_split
+from gaponet.eval.candidate import split_of_run as read_run_split
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.motion.collision import Collision
 from gaponet.robot import load_robot
 from gaponet.sim.model import build_model
-from gaponet.virtual.draw import MARK
-from gaponet.virtual.fleet import FLEETS, load_fleet, to_toml
+from gaponet_robots.motion.collision import Collision
+from gaponet_robots.virtual.draw import MARK
+from gaponet_robots.virtual.fleet import FLEETS, load_fleet, to_toml
 
 COLLISION = """same_limb = ["upper fore"]
 [[capsule]]

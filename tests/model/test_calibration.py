@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from arm import commands, record, write_arm
 
-from gaponet.errors import ModelError, UsageError
+from gaponet import api
+from gaponet.data.store import Dataset
+from gaponet.errors import ModelError, NoGainError, UsageError
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
+from gaponet.robot import load_robot
 from gaponet.sim.replay import replay
 
 
@@ -100,3 +103,19 @@ def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, c
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
     with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
         calibration.load(tmp_path, found.weights)
+
+
+def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for log in logs:
+        data.append(log)
+    found = api.calibrate_robot(robot, data, tmp_path / "today", seconds=16.0)
+    assert found.errors["after"].mean() < 0.2 * found.errors["before"].mean()
+    written = load_robot(tmp_path / "today")
+    np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
+    np.testing.assert_array_equal(written.nominal.kp, robot.kp)
+    same = Dataset.create(tmp_path / "same", robot)
+    same.append(record(robot, commands(450, 0), "m0"))
+    with pytest.raises(NoGainError, match="nothing is written"):
+        api.calibrate_robot(robot, same, tmp_path / "again", seconds=8.0)
+    assert not (tmp_path / "again" / "robot.toml").exists()

@@ -5,13 +5,11 @@ import pytest
 import torch
 from arm import recordings, write_arm
 
-from gaponet.errors import ModelError
 from gaponet.model.backends import Bound, FunctionNetwork
 from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.model.observation import Layout
-from gaponet.model.sensor import ProbeOracle
 from gaponet.sim.replay import replay
 from gaponet.training.config import RewardConfig
 from gaponet.training.env import DeltaEnv
@@ -19,83 +17,15 @@ from gaponet.training.env import DeltaEnv
 LIMITS = np.array([[-10.0, 10.0]] * 2)
 
 
-def corrector(infer, config, robot, points=None):
-    return DeltaCorrector(FunctionNetwork(infer, config.input_dim(2), 2), config, robot, points)
+def corrector(infer, config, robot):
+    return DeltaCorrector(FunctionNetwork(infer, config.input_dim(2), 2), config, robot)
 
 
-class Asked:
-    """A simulator that writes down who was asked, and answers with the position of whoever it is."""
-
-    def __init__(self, probes):
-        self.probes, self.calls, self.offsets, self.q = probes, [], None, 0.0
-
-    def __call__(self, ids, offsets):
-        self.calls.append(ids.tolist())
-        self.offsets = offsets
-        return np.full((len(ids), self.probes, 4), self.q)
-
-
-def started(config, num_envs=2, **more):
-    loop = DeltaLoop(config, LIMITS, num_envs, **more)
-    frames = np.zeros((num_envs, loop.history.depth, 2))
-    loop.begin(slice(None), frames, frames, frames)
-    return loop
-
-
-def at(loop, q):
-    state = np.full((2, 2), float(q))
-    if loop.ask:
-        loop.ask.q = q
-    return loop.observe(state, 0 * state, state, np.zeros(2))
-
-
-def step(loop, q):
-    state = np.full((2, 2), float(q))
-    loop.push(state, 0 * state, state)
-
-
-@pytest.mark.parametrize(
-    "config",
-    [ModelConfig(), ModelConfig(payload_input=False), ModelConfig(sensor_hold=2), ModelConfig(sensors="oracle"),
-     ModelConfig(sensors="learned", sensor_hold=2), ModelConfig(kind="mlp", sensor_hold=2, sensors="oracle")],
-)  # fmt: skip
+@pytest.mark.parametrize("config", [ModelConfig(), ModelConfig(payload_input=False), ModelConfig(kind="mlp")])
 def test_the_parts_of_x_touch_and_fill_it(config):
     layout = Layout(config, 3)
-    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.refresh, layout.answers]
+    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action]
     assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
-
-
-def test_the_observation_of_the_last_refresh_stays_until_the_next():
-    config = ModelConfig(history=1, payload_input=False, sensor_hold=2)
-    loop, refresh = started(config), Layout(config, 2).refresh
-    seen = []
-    for q in range(5):
-        x = at(loop, q)
-        assert x[0, 0] == q
-        seen.append(x[0, refresh][0])
-        step(loop, q)
-    assert seen == [0, 0, 2, 2, 4]
-
-
-def test_a_restarted_simulation_alone_is_asked_anew():
-    oracle = Asked(3)
-    loop = started(ModelConfig(history=1, sensors="oracle", num_probes=3, sensor_hold=4), ask=oracle)
-    at(loop, 1)
-    at(loop, 1)  # asked for twice, the simulator is asked once
-    step(loop, 1)
-    frames = np.zeros((1, 1, 2))
-    loop.begin(np.array([1]), frames, frames, frames)
-    x = at(loop, 2)
-    assert oracle.calls == [[0, 1], [1]]
-    assert x[:, -1].tolist() == [1.0, 2.0]
-
-
-def test_learned_points_are_chosen_from_the_present_observation():
-    oracle = Asked(3)
-    config = ModelConfig(history=1, payload_input=False, sensors="learned", num_probes=3)
-    loop = started(config, ask=oracle, points=lambda x: np.repeat(x[:, :1], 6, axis=1).reshape(-1, 3, 2))
-    at(loop, 0.25)
-    assert (oracle.offsets == 0.25).all()
 
 
 class FirstRow:
@@ -108,30 +38,20 @@ class FirstRow:
         return low
 
 
-@pytest.mark.parametrize(
-    "change",
-    [{}, {"delta_hold": 3}, {"sensor_hold": 2}, {"sensors": "oracle"}, {"sensors": "learned", "sensor_hold": 2}],
-    ids=["plain", "delta held", "sensors held", "oracle", "learned"],
-)
+@pytest.mark.parametrize("change", [{}, {"delta_hold": 3}], ids=["plain", "delta held"])
 def test_training_and_free_run_give_the_network_the_same_numbers(change, tmp_path):
     robot = write_arm(tmp_path)
     config = ModelConfig(history=2, stride=2, num_probes=3, **change)
     sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
-    lean = 0.02 * np.arange(6).reshape(1, 3, 2)
-
-    def points(x):
-        return lean + x[:, :1, None]
-
     free: list = []
 
     def infer(x):
         free.append(x.copy())
         return np.full((1, 2), 0.01, np.float32)
 
-    learned = points if config.learns_points else None
-    replay(sequence, robot, corrector(infer, config, robot, learned), nthread=1)
+    replay(sequence, robot, corrector(infer, config, robot), nthread=1)
     env = DeltaEnv(sequence, robot, config, 1, 1000, RewardConfig(), nthread=1)
-    env.rng, env.loop.points = FirstRow(), learned
+    env.rng = FirstRow()
     env.reset()
     trained = []
     while not env.ended()[0]:
@@ -140,25 +60,6 @@ def test_training_and_free_run_give_the_network_the_same_numbers(change, tmp_pat
             env.advance(np.full((1, 2), 0.01, np.float32))
     assert len(trained) == 13 // config.delta_hold
     np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
-
-
-def test_the_simulator_is_asked_only_while_a_motion_lasts(tmp_path, monkeypatch):
-    robot = write_arm(tmp_path)
-    config = ModelConfig(sensors="oracle", num_probes=3)
-    short, long = recordings(robot, 2, rows=8)[0], recordings(robot, 2, rows=14)[1]
-    asked: list = []
-    answer = ProbeOracle.__call__
-
-    def noted(self, qpos, qvel, offsets=None, ids=None):
-        asked.append(len(ids))
-        return answer(self, qpos, qvel, offsets, ids)
-
-    monkeypatch.setattr(ProbeOracle, "__call__", noted)
-    together = replay([short, long], robot, corrector(lambda x: x[:, -2:] * 0.01, config, robot), nthread=1)
-    assert asked == [2] * 7 + [1] * 6
-    for sequence, twin in zip((short, long), together, strict=True):
-        alone = replay([sequence], robot, corrector(lambda x: x[:, -2:] * 0.01, config, robot), nthread=1)[0]
-        np.testing.assert_allclose(twin.qpos, alone.qpos, atol=1e-9)
 
 
 def test_a_correction_is_held(tmp_path):
@@ -182,11 +83,6 @@ def test_robots_decide_at_their_own_times_where_one_began_later():
     assert added == [[1, 1], [1, 2], [1, 2], [3, 2], [3, 4], [3, 4]]
 
 
-def test_a_model_that_asks_the_simulator_is_refused_outside_of_one():
-    with pytest.raises(ModelError, match="of no use outside a simulator; train with --model"):
-        DeltaLoop(ModelConfig(sensors="oracle"), LIMITS, 1)
-
-
 class TorchRule:
     """A rule that looks at all of x, on torch buffers; and the same rule on numpy's."""
 
@@ -202,7 +98,7 @@ class TorchRule:
         return Bound(x, delta, lambda: delta.copy_(x @ weights))
 
 
-@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"delta_hold": 2}, {"sensor_hold": 3}, {"payload_input": False}])
+@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"delta_hold": 2}, {"payload_input": False}])
 def test_torch_and_numpy_arrays_give_the_same_corrections(change):
     config = ModelConfig(**{"history": 3} | change)
     rule, rng = TorchRule(config), np.random.default_rng(1)

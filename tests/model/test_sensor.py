@@ -40,13 +40,3 @@ def test_absolute_answers_are_the_next_state(tmp_path):
         for target in ("delta", "absolute")
     )
     np.testing.assert_allclose(absolute, delta + np.concatenate([q, 0.02 * v], axis=1)[:, None], atol=1e-6)
-
-
-def test_some_states_can_be_asked_at_targets_of_their_own(tmp_path):
-    robot, config = write_arm(tmp_path), ModelConfig(num_probes=4)
-    oracle = ProbeOracle(robot, config, [(0.0, "both", 0.02), (0.3, "both", 0.02), (0.3, "both", 0.01)])
-    q, v = np.full((3, 2), 0.2), np.full((3, 2), -0.4)
-    whole = oracle(q, v)
-    np.testing.assert_array_equal(oracle(q[:2], v[:2], ids=np.array([0, 2])), whole[[0, 2]])
-    offsets = np.repeat(probe_offsets(config, 2)[None, ::-1], 3, axis=0)
-    np.testing.assert_array_equal(oracle(q, v, offsets), whole[:, ::-1])

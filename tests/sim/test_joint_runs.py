@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from arm import TOML, recordings, write_arm
 
+from gaponet.metrics import runs, summary
 from gaponet.robot import LAW
+from gaponet.sim import joint_runs
+from gaponet.sim.identify import identify
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
 
@@ -33,11 +36,13 @@ def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
     whole = [t.qpos for t in replay(real, acting)]
     runs = JointRuns(real, robot)
     values = {f: np.full((1, 2), float(v)) for f, v in servos.items()}
-    alone = runs.errors(values)[:, 0, 0]
-    company = np.where(runs.counted, whole[0] - real[0].qpos, 0.0)
+    alone = runs.errors(values)[0, :, 0].T
+    company = np.where(runs.counted[0][:, None], whole[0] - real[0].qpos, 0.0)
     assert np.abs(company).mean() > 0.005  # it is not the robot that was recorded
     assert np.abs(alone - company).mean() < 0.1 * np.abs(company).mean()
     assert set(changed) <= {*FIRST, *LAW}
+    if joint_runs.advance is not None:
+        np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
 
 
 def test_recordings_at_several_gains_have_one_servo(tmp_path):
@@ -52,3 +57,25 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
     assert np.abs(JointRuns(told, robot).errors(values)).mean() < 1e-3
     untold = [replace(s, meta=replace(s.meta, kp=None)) for s in told]
     assert np.abs(JointRuns(untold, robot).errors(values)).mean() > 5e-3
+
+
+def test_what_was_not_recorded_stands_still_and_counts_nowhere(tmp_path):
+    """Windows of a second in which one joint moves, the other at an angle that was told: nothing is asked of it."""
+    robot = write_arm(tmp_path / "arm")
+    windows = []
+    for real in recordings(robot, 3, rows=250, kp=0.7):
+        qpos, ctrl, qvel = (np.array(getattr(real, f)) for f in ("qpos", "ctrl", "qvel"))
+        qpos[:, 0], ctrl[:, 0], qvel[:, 0] = 0.4, 0.4, 0.0
+        meta = replace(real.meta, notes=real.meta.notes | {"posture": {robot.joint_names[0]: 0.4}})
+        whole = replace(real, meta=meta, qpos=qpos, ctrl=ctrl, qvel=qvel)
+        (moved,) = replay([whole], robot.with_servos({robot.joint_names[1]: {"kp": 0.7 * robot.kp[1]}}))
+        assert np.array_equal(moved.qpos[:, 0], np.full(250, np.float32(0.4)))
+        seen = replace(whole, qpos=moved.qpos, qvel=moved.qvel)
+        windows += [seen.rows(slice(a, a + 50)) for a in range(0, 250, 50)]
+    found = identify(windows, robot, terms=())
+    assert found.robot.kp[1] == pytest.approx(0.7 * robot.kp[1], rel=0.02)
+    assert found.robot.kp[0] == pytest.approx(robot.kp[0], rel=1e-3)
+    assert found.after < 0.2 * found.before
+    total = summary(runs(windows, [t.qpos for t in replay(windows, robot)], robot), robot)
+    assert total["mpjae"] == total["by_joint"][robot.joint_names[1]]["mpjae"]
+    assert total["by_joint"][robot.joint_names[0]] == {}

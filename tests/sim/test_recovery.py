@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from arm import TOML, commands, recordings, write_arm
 
+from gaponet.progress import silent
 from gaponet.robot import LAW, Table
 from gaponet.sim import touching
-from gaponet.sim.identify import CLASSIC, Fit
+from gaponet.sim.axes import CLASSIC, Bounds
+from gaponet.sim.identify import Clock, Fit
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
 
@@ -34,14 +36,14 @@ def played(robot, acting, count, rows):
 def test_a_term_of_the_law_comes_back(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
-    fit = Fit(JointRuns(parts, robot), robot, parts)
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.guess[f] for f in LAW if f in law}
-    found = fit.search(tuple(law), start, lambda error: None)
+    fit = Fit(JointRuns(parts, robot), robot, Bounds(robot, parts))
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in LAW if f in law}
+    found = fit.search(tuple(law), start, Clock(None, 1, silent), "law")
     assert set(CLASSIC) < set(found)
-    std = fit.uncertainty(found)
+    std, _ = fit.uncertainty(found)
     for field, value in law.items():
-        for i, joint in enumerate(robot.joint_names):  # within 5 %, or said to be uncertain by as much
-            assert abs(found[field][i] - value) < max(0.05 * value, std[joint][field])
+        for i, joint in enumerate(robot.joint_names):  # within 5 %, or two standard errors
+            assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
             assert std[joint][field] < value
 
 

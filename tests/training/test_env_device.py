@@ -25,9 +25,8 @@ def make(folder, device, rows=60, **model):
     return DeltaEnv(sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device)
 
 
-@pytest.mark.parametrize("model", [{}, {"sensors": "oracle", "num_probes": 3, "sensor_hold": 2}])
-def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path, model):
-    ours, theirs = (make(tmp_path, device, history=2, stride=3, **model) for device in ("cpu", "warp-cpu"))
+def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
+    ours, theirs = (make(tmp_path, device, history=2, stride=3) for device in ("cpu", "warp-cpu"))
     rng, ends = np.random.default_rng(0), 0
     for _ in range(STEPS):
         seen, also = ours.get_observations(), theirs.get_observations()
@@ -80,16 +79,13 @@ def test_nothing_but_the_list_of_resets_goes_to_the_host(tmp_path):
     assert resets
 
 
-@pytest.mark.parametrize("sensors", ["predicted", "learned"])
-def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path, sensors):
+def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
     robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
     dataset = Dataset.create(data, robot)
     for sequence in recordings(robot, 8, rows=80, kp=0.5, delay=2):
         dataset.append(sequence)
     small = TrainConfig(
-        ModelConfig(
-            sensors=sensors, history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)
-        ),
+        ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
         warm_start=WarmStartConfig(
             rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
         ),

@@ -2,48 +2,107 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from math import isfinite
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
 
 from gaponet import api
 from gaponet.cli.identify import COLUMNS
-from gaponet.cli.options import Flag, Json, Robot, Run, Source, like
+from gaponet.cli.options import Flag, Folder, Json, Robot, like
 from gaponet.cli.out import Out
+from gaponet.errors import UsageError
 from gaponet.eval.tables import mrad
+from gaponet.robot import RobotSpec, as_option
+
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.")]
+Logs = Annotated[
+    tyro.conf.Positional[str], tyro.conf.arg(help="Dataset folder or address; for a robot folder logs as well.")
+]
 
 
 @like(api.calibrate)
 def calibrate(
-    run: Run,
-    dataset: Source,
+    run: Known,
+    dataset: Logs,
+    out: Path | None = None,
     unit: str = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
-    payload_mass: Literal["recorded", "unknown"] = "recorded",
+    payload_mass: str = "recorded",
     robot: Robot = None,
     mixed_gains: Flag = False,
     json: Json = False,
 ) -> None:
     """Fit what is particular to one unit (gain, damping, friction, zero offset, delay of each joint) from a short log.
 
-    The trained model stays as it is. gaponet eval then shows the unit without and with its calibration.
+    A robot folder in, a robot folder out: gaponet calibrate ./my_robot LOGS --out ./my_robot_today. Of a run the
+    trained model stays as it is; gaponet eval then shows the unit without and with its calibration.
 
     Args:
-        payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same.
+        out: Robot folder to write, where a robot folder is calibrated.
+        payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same. A
+            number: kg in each hand, of logs whose format does not state it.
     """
+    screen = Out(json)
+    unknown = payload_mass == "unknown"
+    if (run / "robot.toml").is_file():
+        if out is None:
+            raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the calibrated one")
+        if robot is not None or mixed_gains:
+            raise UsageError("--robot and --mixed-gains are for the calibration of a run")
+        told = None if unknown or payload_mass == "recorded" else _mass(payload_mass)
+        made = api.calibrate_robot(run, dataset, out, unit, motions, seconds, unknown, told)
+        before, after = (float(e.mean()) for e in made.errors.values())
+        screen.say(
+            f"{mrad(before)} → {mrad(after)} mrad over {len(made.errors['after'])} recording(s) of unit {made.unit} "
+            f"({after / before:.2f}); robot folder {out}"
+        )
+        servos = _servos(made.robot)
+        _show(screen, made.unit, servos, made.payload_mass, made.payload_std)
+        screen.say(f"next: gaponet run MOTION --robot {as_option(out)} --compensate …")
+        screen.result({
+            "unit_id": made.unit, "before": before, "after": after, "servos": servos, "robot": str(out),
+            "payload_mass": made.payload_mass, "payload_std": made.payload_std,
+        })  # fmt: skip
+        return
+    if out is not None:
+        raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its calibrations")
+    if not unknown and payload_mass != "recorded":
+        raise UsageError(f"--payload-mass {payload_mass}: a run takes recorded or unknown")
+    found = api.calibrate(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
+    _show(screen, found.unit_id, found.servos, found.payload_mass, found.payload_std)
+    screen.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; kept in {run}")
+    screen.say(f"next: gaponet eval {run} {dataset}")
+    screen.result(asdict(found))
+
+
+def _show(
+    screen: Out, unit: str, servos: Mapping[str, Mapping[Any, float]], mass: float | None, std: float | None
+) -> None:
+    """A unit's servos, and its payload."""
     from gaponet.model import calibration
 
-    out = Out(json)
-    unknown = payload_mass == "unknown"
-    found = api.calibrate(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
-    out.table(f"Unit {found.unit_id}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
-        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in found.servos.items()
+    screen.table(f"Unit {unit}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
+        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in servos.items()
     ])  # fmt: skip
-    if found.payload_mass is not None:
-        known = found.payload_std is not None and isfinite(found.payload_std)  # it takes two windows to tell
-        spread = f" ± {found.payload_std:.2f}" if known else ""
-        out.say(f"payload {found.payload_mass:.2f}{spread} kg in each hand that carries")
-    out.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; kept in {run}")
-    out.say(f"next: gaponet eval {run} {dataset}")
-    out.result(asdict(found))
+    if mass is not None:
+        spread = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it takes two windows to tell
+        screen.say(f"payload {mass:.2f}{spread} kg in each hand that carries")
+
+
+def _servos(robot: RobotSpec) -> dict[str, dict[str, float]]:
+    from gaponet.model import calibration
+
+    at = robot.joint_names.index
+    return {j: {f: float(getattr(robot, f)[at(j)]) for f in calibration.FIELDS} for j in robot.operated}
+
+
+def _mass(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise UsageError(f"--payload-mass {text}: give recorded, unknown, or a number of kg") from None

@@ -1,4 +1,4 @@
-"""gaponet data: card, split, figures, export."""
+"""gaponet data: card, split, figures, export, remove, labels."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.cli.options import Data, Json, Robot, Source
+from gaponet.cli.options import Data, Folder, Json, Robot, Source
 from gaponet.cli.out import Out
 from gaponet.data.checks.finding import some
-from gaponet.data.store import Dataset
+from gaponet.data.store import Dataset, open_dataset
+from gaponet.parts import take
 from gaponet.progress import bar
-from gaponet.share.stream import open_dataset
 
 
 def card(
@@ -36,22 +36,26 @@ def card(
         data.state(**stated)
     with bar("reading") as update:
         made = make_card(data, update)
-    write_card(data, made, card_text(made))
     show_card(out, made)
-    out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
+    if data.read_only:
+        out.say("nothing may be written into that folder, so the card is only shown")
+    else:
+        write_card(data, made, card_text(made))
+        out.say(f"written: {dataset / 'CARD.md'!s}, {dataset / 'card.json'!s}")
     out.result(made)
 
 
 def split(
     dataset: Data,
-    by: Literal["motion", "unit", "payload"],
+    by: Literal["motion", "unit", "payload", "repetition", "time"],
     holdout: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
     """Divide a dataset into training, validation and test parts that share no recording; writes splits/….json into it.
 
     Args:
-        by: What the test part has and the others have not.
+        by: What the test part has and the others have not; of repetitions and of time (logs imported with --cut) the
+            last.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter of them by a fixed rule.
     """
     from gaponet.data.card import count
@@ -87,7 +91,7 @@ def figures(
     Args:
         out: Folder for the pictures, each as SVG and PNG.
     """
-    from gaponet.eval.draw_dataset import draw_all
+    draw_all = take("PROVIDES", "figures of a dataset", "drawing")
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
@@ -103,7 +107,7 @@ def figures(
 def export(
     dataset: Source,
     out: Path,
-    to: Literal["lerobot", "sage", "npz", "asap", "mcap"] = "lerobot",
+    to: str = "lerobot",
     robot: Robot = None,
     json: Json = False,
 ) -> None:
@@ -111,16 +115,16 @@ def export(
 
     Args:
         out: New folder.
-        to: LeRobotDataset v3.0 (one set for each rate), SAGE folder, NumPy, ASAP's motion with action, or ROS 2 bags.
+        to: lerobot (v3.0, one set for each rate), sage, npz (NumPy), asap (motion with action), mcap (ROS 2 bags).
     """
-    from gaponet.data.writers import WRITERS, export
+    from gaponet.data.writers import export
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
     with bar("exporting") as update:
         sets = export(data, spec, out, to, update)
     shown = sets[:20]
-    screen.table(f"{out!s}: {WRITERS[to]}", ["set", "episodes", "frames", "fps"], [
+    screen.table(f"{out!s}: {to}", ["set", "episodes", "frames", "fps"], [
         [str(s.path), f"{s.episodes:,}", f"{s.frames:,}", f"{s.fps:g}"] for s in shown
     ])  # fmt: skip
     if len(shown) < len(sets):
@@ -130,17 +134,75 @@ def export(
     screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
 
 
+def remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
+    """Take sequences out of a dataset, with their twins; the logs that they came from can be imported again.
+
+    Args:
+        ids: Names or patterns of them, as sequences.jsonl lists them: '*-1kg-*' is all with a payload of 1 kg.
+    """
+    out, data = Out(json), Dataset(dataset)
+    gone = data.remove(ids)
+    out.say(f"removed {len(gone)}: {some([e.id for e in gone])}; {data.path!s} now holds {len(data)}")
+    out.result({"removed": [e.id for e in gone], "sequences": len(data)})
+
+
+def labels(
+    logs: Folder,
+    robot: str,
+    out: Path,
+    payloads: tuple[float, ...],
+    units: int = 1,
+    rate: float | None = None,
+    json: Json = False,
+) -> None:
+    """Estimate which payload each recording of one moving joint carried and which unit made it, by held torque.
+
+    Args:
+        logs: File or folder of logs.
+        robot: Robot name or folder.
+        out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
+        payloads: Those that were in the room, kg.
+        units: How many robots there were.
+        rate: Hz, of logs without a clock.
+    """
+    from gaponet.data.formats import read_logs
+    from gaponet.robot import load_robot
+
+    screen, spec = Out(json), load_robot(robot)
+    estimate, write = (take("PROVIDES", f"labels {what}", "estimating labels") for what in ("of logs", "to logs.toml"))
+    gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
+    found = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
+    write(found, out, rate)
+    columns = ["joint", "to, rad", "recordings", "N·m a kg", "bands apart", "units, N·m", "payload told"]
+    screen.table("Held torque at equal commands", columns, [
+        [c.joint, f"{c.command:+.2f}", str(c.count), f"{c.slope:+.2f}", f"{c.apart:.1f}",
+         ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.told else "no"]
+        for c in found.cells
+    ])  # fmt: skip
+    if a := found.agreement:
+        screen.say(
+            f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
+            f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
+        )
+    screen.say(
+        f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
+    )
+    screen.result({"cells": found.cells, "agreement": found.agreement, "recordings": found.recordings})
+
+
 # Each is run while the command line is parsed; what is left to call is nothing.
 Action = (
     Annotated[None, tyro.conf.subcommand("card", constructor=card)]
     | Annotated[None, tyro.conf.subcommand("split", constructor=split)]
     | Annotated[None, tyro.conf.subcommand("figures", constructor=figures)]
     | Annotated[None, tyro.conf.subcommand("export", constructor=export)]
+    | Annotated[None, tyro.conf.subcommand("remove", constructor=remove)]
+    | Annotated[None, tyro.conf.subcommand("labels", constructor=labels)]
 )
 
 
 def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
-    """What a dataset holds: its card, splits, pictures and export."""
+    """What a dataset holds: its card, splits, pictures and export; what of it is removed; labels that logs lack."""
 
 
 def show_card(out: Out, made: dict[str, Any]) -> None:

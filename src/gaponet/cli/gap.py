@@ -8,11 +8,12 @@ from typing import Any
 from gaponet import api
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
+from gaponet.data.store import open_dataset
 from gaponet.eval.tables import by_group, mrad, totals
+from gaponet.eval.verdict import next_step, verdict
 from gaponet.executor import LOCAL
-from gaponet.plot.methods import title
-from gaponet.plot.table import Table
-from gaponet.share.stream import open_dataset
+from gaponet.methods import title
+from gaponet.spread import Table
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
 SHOWN = 8  # columns of the totals that a screen has room for
@@ -23,7 +24,7 @@ def gap(
     dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
     json: Json = False,
 ) -> None:  # fmt: skip
-    """How far the simulator is from the robot, by joint, payload, …; with --run what each step up to its model removes.
+    """How far the simulator is from the robot, by joint, payload, …; of an identified robot or a run also by causes.
 
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
 
@@ -35,12 +36,22 @@ def gap(
     if executor != LOCAL:
         api.pair(data, spec, executor)
     found = api.gap(data, spec, motions, run)
-    if run is None:
+    folder = run or (spec.folder if robot is None else Path(robot))
+    if "left" not in found:
         show_methods(out, found)
     else:
         _show_steps(out, found)
-        out.say(f"figure: {run / 'gap.png'}")
+        if (folder / "gap.png").is_file():
+            out.say(f"figure: {folder / 'gap.png'}")
+    show_verdict(out, found["methods"], dataset, folder if "left" in found else None)
     out.result(found)
+
+
+def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path | None, reported: bool = False) -> None:
+    """What the errors say, and which command comes next; folder is a robot's or a run, None where there is neither."""
+    for sentence in verdict(methods):
+        out.say(sentence)
+    out.say(f"next: {next_step(methods, dataset, folder, reported)}")
 
 
 def show_methods(out: Out, result: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 COLUMNS = {  # field → heading, factor from SI
     "kp": ("kp, N·m/rad", 1.0),
+    "kd": ("kd, N·m·s/rad", 1.0),
     "damping": ("damping, N·m·s/rad", 1.0),
     "frictionloss": ("friction, N·m", 1.0),
     "armature": ("armature, g·m²", 1e3),
@@ -38,6 +39,7 @@ COLUMNS = {  # field → heading, factor from SI
 }
 
 WIDE = 4  # columns of a table
+UNDETERMINED = "not determined by these logs"
 
 
 @writes("robot")
@@ -50,6 +52,9 @@ def identify(
     table: bool = True,
     shared: Flag = False,
     threads: int = 0,
+    budget: str | None = None,
+    stops: Flag = False,
+    details: Flag = False,
     robot: Robot = None,
     units: tuple[str, ...] = (),
     holdout_units: tuple[str, ...] = (),
@@ -57,18 +62,21 @@ def identify(
 ) -> None:
     """Fit gains, damping, friction, armature, zero offsets and delays of the simulator to the training motions.
 
-    The result is a robot folder: use it with --robot, with a slash: gaponet train DATASET --robot ./OUT --out RUN.
+    The result is a robot folder: use it with --robot, with a slash: gaponet gap DATASET --robot ./OUT. What the robot's
+    file says of gains is where the fit starts; those that recordings state are believed. Where nothing does better than
+    the robot as it is, nothing is written and the exit status is 2.
 
     Args:
         terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
+        details: Say of every joint what these logs do not determine.
     """
     screen = Out(json)
-    made = api.identify(dataset, out, windows, robot, units, holdout_units, terms, table, shared, threads)
-    found = made.found
-    _tell(screen, found, made.val)
-    screen.say(
-        f"{made.seconds:.0f} s; robot folder {out}; next: gaponet train {dataset} --robot {as_option(out)} --out RUN"
+    made = api.identify(
+        dataset, out, windows, robot, units, holdout_units, terms, table, shared, threads, budget, stops
     )
+    found = made.found
+    _tell(screen, found, made.val, details)
+    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {as_option(out)}")
     screen.result({
         "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
@@ -95,8 +103,13 @@ def _values(found: Identified) -> dict[str, dict[str, float]]:
     }
 
 
-def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None:
-    """The servos as a table, what was tried and what it gave."""
+def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray], details: bool) -> None:
+    """The verdict, the servos as a table, what was tried and what it gave."""
+    nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
+    screen.say(
+        f"nominal {nominal} → identified {left} mrad on {len(errors['nominal'])} whole validation motion(s) "
+        f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
+    )
     values = _values(found)
     shown = [f for f in COLUMNS if any(v.get(f) for v in values.values())]
     for start in range(0, len(shown), WIDE):
@@ -126,14 +139,13 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray]) -> None
             f"table: {what}; where tips are low {mrad(touch.before.mean())} → {mrad(touch.after.mean())} mrad, in "
             f"{', '.join(touch.motions)}"
         )
+    unknown = [w for w in found.warnings if UNDETERMINED in w]
     for warning in found.warnings:
-        screen.say(f"  {warning}", "warning", "yellow")
-    nominal, left = (f"{mrad(e.mean())} ± {mrad(standard_error(e))}" for e in errors.values())
-    screen.say(
-        f"windows {mrad(found.before)} → {mrad(found.after)} mrad; whole validation motions (± over "
-        f"{len(errors['nominal'])} recordings): nominal {nominal}, identified {left} mrad "
-        f"({errors['identified'].mean() / errors['nominal'].mean():.2f})"
-    )
+        if details or warning not in unknown:
+            screen.say(f"  {warning}", "warning", "yellow")
+    if unknown and not details:
+        joints = ", ".join(w.partition(":")[0] for w in unknown)
+        screen.say(f"not determined in part: {joints}; --details says what. Take a joint's values as a set")
 
 
 def _cell(value: float | None, std: float | None, factor: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -11,9 +11,11 @@ import tyro
 from gaponet import api
 from gaponet.cli.options import Flag, Folder, Json, Source, like
 from gaponet.cli.out import Out, show_findings
+from gaponet.data.checks.finding import some
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
 from gaponet.files import writing
+from gaponet.parts import take
 from gaponet.robot import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -38,10 +40,13 @@ def import_logs(
     logs: Path | None = None,
     position_unit: Literal["rad", "deg", "fraction", "signed_percent"] | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] | None = None,
+    rate: float | None = None,
+    cut: float | None = None,
     level: Literal["joint", "upper_body", "whole_body"] | None = None,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     skip_bad: bool = False,
+    strict: bool = False,
     allow_pickle: bool = False,
     guess: bool = False,
     json: Json = False,
@@ -58,11 +63,15 @@ def import_logs(
         position_unit: Unit of positions, where the format leaves it open; velocities are that per second.
             signed_percent: LeRobot's older −100..100.
         time_unit: Unit of time, where the format leaves it open.
+        rate: Hz, of logs without a clock.
+        cut: Cut long recordings into equal pieces of about so long, s; each is a motion of its own.
         level: What the motions move; whole_body by default.
         kp: Stiffness while recording, N·m/rad: a number, or JOINT=NUMBER for some joints; default what the format
             states, else the robot's.
         kd: The same of the damping gain, N·m·s/rad.
         skip_bad: Cut bad rows and leave out logs that cannot be read, and list both, instead of refusing all.
+        strict: Refuse logs whose velocity, torque or temperature is nonsense in some rows, instead of making up for it
+            there and saying so.
         allow_pickle: Open pickled files (ASAP), with an unpickler that makes arrays, numbers and text only.
         guess: Print a logs.toml for these logs, filled in as far as they show it, and import nothing.
     """
@@ -78,8 +87,9 @@ def import_logs(
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
     report = api.import_logs(
         src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, kp=kp, kd=kd,
-        skip_bad=skip_bad, allow_pickle=allow_pickle,
+        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
+        kp=kp, kd=kd,
+        skip_bad=skip_bad, allow_pickle=allow_pickle, strict=strict,
     )  # fmt: skip
     show_import(Out(json), report, spec)
 
@@ -96,7 +106,7 @@ def doctor(
     """
     from gaponet.data.checks.finding import proposal
     from gaponet.data.doctor import inventory
-    from gaponet.share.stream import open_dataset
+    from gaponet.data.store import open_dataset
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
@@ -108,7 +118,7 @@ def doctor(
         out.say(line)
     drawn: list[Path] = []
     if figures is not None:
-        from gaponet.eval.draw_findings import draw_findings
+        draw_findings = take("PROVIDES", "figures of findings", "drawing")
 
         with writing(figures, "figures"):
             drawn = draw_findings(data, spec, diagnosis.findings, figures)
@@ -119,10 +129,11 @@ def doctor(
 
 def formats(json: Json = False) -> None:
     """List the log formats that are read, and what each needs."""
-    from gaponet.data.formats import FORMATS, about, module
+    from gaponet.data.formats import about, module
+    from gaponet.data.formats import formats as known
 
     out = Out(json)
-    rows = {fmt: (about(fmt), module(fmt).EXTRA) for fmt in FORMATS}
+    rows = {fmt: (about(fmt), module(fmt).EXTRA) for fmt in known()}
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
         [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
     ])  # fmt: skip
@@ -137,6 +148,28 @@ def cuts(entries: list[Entry]) -> dict[str, list[str]]:
         if cut := entry.meta.notes.get("cut"):
             found.setdefault(cut, []).append(entry.meta.motion)
     return found
+
+
+def nonsense(entries: list[Entry]) -> list[str]:
+    """What was nonsense in some rows, a line for each channel (data.describe.limits)."""
+    told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
+    for entry in entries:
+        for channel, found in entry.meta.notes.get("nonsense", {}).items():
+            told.setdefault(channel, []).append((entry, found))
+    return [
+        f"{channel} is nonsense in {sum(f['rows'] for _, f in found)} rows of {len(found)} recordings (first "
+        f"{found[0][1]['worst']:.4g} of {found[0][1]['joints'][0]} in {found[0][0].meta.motion}): "
+        f"{', '.join(dict.fromkeys(f['done'] for _, f in found))}; --strict refuses them"
+        for channel, found in told.items()
+    ]
+
+
+def unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
+    """A line about operated joints that the logs do not hold."""
+    lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
+    if not lacking:
+        return []
+    return [f"{some(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says where"]
 
 
 def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
@@ -163,6 +196,8 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     )
     for cut, motions in cuts(entries).items():
         out.say(f"{', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
+    for line in (*nonsense(entries), *unrecorded(entries, robot)):
+        out.say(line, "note", "cyan")
     for line in report.cut[:MAX_ROWS]:
         out.say(line, "cut", "yellow")
     if len(report.cut) > MAX_ROWS:

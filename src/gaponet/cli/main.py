@@ -10,63 +10,39 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
-from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-from gaponet.errors import GAPONetError, UsageError, missing_extra
+from gaponet.errors import GAPONetError, MissingPartError, UsageError, missing_extra
+from gaponet.parts import installed, named, offered
 from gaponet.text import plain
 
-# Task → command → module:function. A module is imported when its command is run; help reads what it says of itself.
+# Task → commands; those of parts that are not installed are left out, and what somebody else's part brings comes last.
 TASKS = {
-    "Logs": {
-        "import": "gaponet.cli.logs:import_logs",
-        "formats": "gaponet.cli.logs:formats",
-        "doctor": "gaponet.cli.logs:doctor",
-        "data": "gaponet.cli.data:data",
-        "excite": "gaponet.cli.robots.excite:excite",
-        "collect": "gaponet.cli.collect:collect",
-        "robot": "gaponet.cli.robots.robot:robot",
-    },
-    "The gap": {
-        "gap": "gaponet.cli.gap:gap",
-        "view": "gaponet.cli.view:view",
-    },
-    "Closing it": {
-        "identify": "gaponet.cli.identify:identify",
-        "train": "gaponet.cli.train:train",
-        "calibrate": "gaponet.cli.calibrate:calibrate",
-        "export": "gaponet.cli.export:export",
-    },
-    "Is it closed?": {
-        "eval": "gaponet.cli.train:evaluate",
-        "report": "gaponet.cli.train:report",
-        "runs": "gaponet.cli.studies.runs:runs",
-        "experiment": "gaponet.cli.studies.experiment:experiment",
-    },
-    "On a robot, real or virtual": {
-        "run": "gaponet.cli.robots.run:run",
-        "record": "gaponet.cli.robots.record:record",
-        "virtual": "gaponet.cli.robots.virtual:virtual",
-    },
-    "Try it, time it, share it": {
-        "demo": "gaponet.cli.demo:demo",
-        "bench": "gaponet.cli.bench:bench",
-        "push": "gaponet.cli.share:push",
-        "pull": "gaponet.cli.share:pull",
-    },
+    "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
+    "The gap": ("gap", "view"),
+    "Closing it": ("identify", "calibrate", "train", "export"),
+    "Is it closed?": ("eval", "report", "runs", "experiment"),
+    "On a robot, real or virtual": ("run", "record", "virtual"),
+    "Try it, time it, share it": ("demo", "bench", "push", "pull"),
+}
+# Command → module:function. A module is imported when its command is run; help reads what it says of itself.
+CORE = {
+    **{name: f"gaponet.cli.{name}:{name}" for name in ("data", "robot", "gap", "identify", "calibrate", "train")},
+    **{name: f"gaponet.cli.logs:{name}" for name in ("formats", "doctor")},
+    "import": "gaponet.cli.logs:import_logs",
+    "eval": "gaponet.cli.train:evaluate",
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 WIDTH = 100  # letters of a command's purpose
-COMMANDS = {name: where for commands in TASKS.values() for name, where in commands.items()}
 
 
-def load(command: str) -> Callable[..., Any]:
-    """The function behind a command."""
-    module, function = COMMANDS[command].split(":")
-    return getattr(import_module(module), function)
+def commands() -> dict[str, str]:
+    """Every command of this installation → module:function."""
+    return CORE | offered("COMMANDS")
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
@@ -88,7 +64,7 @@ def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13  # SIGPIPE, which Windows has not
     except OSError as error:  # a full disk, a missing permission: the user's to mend, not a bug
-        return _say(f"File: {error.filename or ''}: {error.strerror or error}")
+        return _say(": ".join(str(part) for part in ("File", error.filename, error.strerror or error) if part))
     except MemoryError:
         return _say("Memory: there is not enough of it for this; give less at once, or close other programs")
     except KeyboardInterrupt:
@@ -107,8 +83,13 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
-    if name not in COMMANDS and not completing:
-        close = get_close_matches(name, COMMANDS, 1)
+    known = commands()
+    if name not in known and not completing:
+        if name in chain.from_iterable(TASKS.values()):
+            raise MissingPartError(
+                f"gaponet {name} is not in this installation (parts: {installed()}); install it whole"
+            )
+        close = get_close_matches(name, known, 1)
         guess = f"do you mean {close[0]}? " if close else ""
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
@@ -122,7 +103,7 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         return run
 
     tyro.extras.subcommand_cli_from_dict(
-        {name: begun(load(name)) for name in (COMMANDS if completing else (name,))},
+        {name: begun(named(known[name])) for name in (known if completing else (name,))},
         prog="gaponet",
         description=ABOUT,
         args=argv,
@@ -133,9 +114,12 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 def overview() -> str:
     """All commands by task, a line each, on one screen; nothing is imported for it."""
     lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", "", ABOUT]
-    for task, commands in TASKS.items():
-        lines += ["", task]
-        lines += [f"  {name:<11}{_purpose(*where.split(':'))}" for name, where in commands.items()]
+    known = commands()
+    others = tuple(name for name in known if name not in chain.from_iterable(TASKS.values()))
+    for task, names in (TASKS | {"Of other packages": others}).items():
+        present = [name for name in names if name in known]
+        lines += ["", task] * bool(present)
+        lines += [f"  {name:<11}{_purpose(*known[name].split(':'))}" for name in present]
     return "\n".join(lines)
 
 

@@ -19,6 +19,7 @@ Source = Annotated[
     tyro.conf.arg(help="Dataset folder, or the address (s3://, gs://, file://) of one that was pushed."),
 ]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.")]
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.")]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these.")]
 Robot = Annotated[
     str | None, tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.")

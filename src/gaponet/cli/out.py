@@ -8,7 +8,6 @@ import json
 import sys
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from rich.console import Console
@@ -17,12 +16,11 @@ from rich.text import Text
 
 from gaponet.data.json_file import finite
 from gaponet.files import writing
-from gaponet.plot.table import Table as ResultTable
+from gaponet.spread import Table as ResultTable
 from gaponet.text import plain
 
 if TYPE_CHECKING:
     from gaponet.data.checks.finding import Finding
-    from gaponet.study.result import Result
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -81,25 +79,6 @@ def show_findings(out: Out, findings: Iterable[Finding]) -> None:
     """A line each."""
     for finding in findings:
         out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
-
-
-def show_result(result: Result, out: Path, screen: Out) -> None:
-    """Write the result's files and print its tables and sentences."""
-    from gaponet.study.page import write
-
-    files = write(result, out)
-    screen.say("", result.title)
-    screen.say(result.virtual)
-    for table in (t for t in result.tables if t.shown):
-        screen.show("", table)
-        if table.caption:
-            screen.say(table.caption)
-    for sentence in result.sentences:
-        screen.say(f"- {sentence}")
-    screen.say(f"written: {', '.join(str(f) for f in files)}")
-    screen.result({"name": result.name, "virtual": result.virtual, "facts": dict(result.facts),
-                   "sentences": list(result.sentences), "files": [str(f) for f in files],
-                   "tables": {t.name: t.record() for t in result.tables if t.shown}})  # fmt: skip
 
 
 def writes(kind: str) -> Callable[[Command], Command]:

@@ -1,4 +1,4 @@
-"""gaponet train, gaponet eval, gaponet report."""
+"""gaponet train, gaponet eval."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from typing import Annotated, Literal
 import tyro
 
 from gaponet import api
-from gaponet.cli.gap import show_methods
-from gaponet.cli.options import Flag, Json, Motions, Robot, Run, Source, like
+from gaponet.cli.gap import show_methods, show_verdict
+from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 from gaponet.model.config import Kind
-from gaponet.progress import bar
 from gaponet.training.config import TrainConfig
 from gaponet.training.config import fast as fast_preset
 
@@ -53,26 +52,25 @@ def train(
     card = trained.card
     val = card["val_mpjae"]
     screen.say(
-        f"best on validation: {mrad(val['model'])} mrad, nominal {mrad(val['nominal'])} "
-        f"({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in {card['seconds']:.0f} s"
-        + f": {how_trained(card)}"
-        + (" (interrupted)" if card["interrupted"] else "")
+        f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
+        f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
+        f"{card['seconds']:.0f} s: {how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
-    screen.say(f"model in {trained.path}; next: gaponet eval {out} {quote(dataset)}; gaponet report {out}")
+    screen.say(f"model in {trained.path}; next: gaponet eval {out} {quote(dataset)}")
     shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
     screen.result({k: card[k] for k in shown})
 
 
 @like(api.evaluate)
 def evaluate(
-    run: Run,
+    run: Known,
     dataset: Source,
     also: tuple[Path, ...] = (),
     motions: Motions = (),
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Step the simulator with the shipped artifact against logs it never saw, baselines beside it."""
+    """Step simulators through logs they never saw: nominal, identified, and with a run's shipped model on top."""
     out = Out(json)
     evaluation = api.evaluate(run, dataset, also, motions, robot)
     if not evaluation.result["unseen"]:
@@ -80,25 +78,5 @@ def evaluate(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
         )
     show_methods(out, evaluation.result)
+    show_verdict(out, evaluation.result["methods"], dataset, run)
     out.result(evaluation.result)
-
-
-def report(
-    run: Run, dataset: Path | None = None, also: tuple[Path, ...] = (), robot: Robot = None, json: Json = False
-) -> None:
-    """Write one self-contained offline HTML page about a run.
-
-    Args:
-        dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.
-        also: Further runs to compare, e.g. the MLP's.
-    """
-    from gaponet.view.portrait import portrait, prepare
-
-    prepare()
-    from gaponet.eval.report import write_report
-
-    out = Out(json)
-    with bar("report") as update:
-        path = write_report(run, dataset, also, robot, update, portrait)
-    out.say(f"report: {path}")
-    out.result({"report": str(path)})

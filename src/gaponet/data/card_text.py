@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from gaponet.data.card import NOT_STATED
-from gaponet.plot.table import Table
+from gaponet.spread import Table
 from gaponet.text import markdown
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}

@@ -56,6 +56,7 @@ class _Given:
     level: str | None
     kp: tuple[float, ...] | None
     kd: tuple[float, ...] | None
+    cut: float | None
 
 
 def import_logs(
@@ -73,6 +74,7 @@ def import_logs(
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     skip_bad: bool = False,
+    cut: float | None = None,
     **options: Any,
 ) -> ImportReport:
     """Import every recording under a path that is not there yet; a bad one refuses them all, and nothing is written.
@@ -80,7 +82,7 @@ def import_logs(
     What could be written before a full disk or a kill stays, complete, and the same call adds the rest.
 
     Args:
-        src: File or folder in one of data.formats.FORMATS.
+        src: File or folder in one of data.formats.formats().
         unit_id: Which of its kind; zero offsets belong to a unit. None where the format states it.
         payload_mass: In each hand named by payload_side, kg; 0.0 when empty. None where the format states it.
         out: Dataset folder; made, or appended to by one process at a time.
@@ -92,20 +94,24 @@ def import_logs(
             default what the format states, else the robot's.
         skip_bad: Cut bad rows and leave out recordings that cannot be read, instead of refusing all; the report lists
             both.
-        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, allow_pickle.
+        cut: Cut recordings into pieces of about so long, s, each a motion of its own.
+        options: Options of data.formats.read_logs: joint_map, logs, position_unit, time_unit, rate, allow_pickle,
+            strict.
 
     Raises:
         LogError, JointMismatchError: A recording cannot be read; the message names file and line.
         UsageError: Unit or payload are missing, or contradict what the format states.
-        DatasetError: `out` is another robot's, or a recording is in the source twice.
+        DatasetError: `out` is another robot's, a recording is in the source twice, or in `out` under other labels.
         FolderError: `out` is something else, or another process writes into it.
     """
     src, out = Path(src), Path(out)
     if payload_side is not None:
         _require_side(robot, payload_side)
     given = _Given(
-        unit_id, payload_mass, payload_side, level, _given_gains("kp", kp, robot), _given_gains("kd", kd, robot)
+        unit_id, payload_mass, payload_side, level, _given_gains("kp", kp, robot), _given_gains("kd", kd, robot), cut
     )
+    if cut is not None and not cut >= 0.8:
+        raise UsageError(f"--cut {cut:g}: pieces are 0.8 s long or more")
     with writing(out, KIND):
         known = Dataset.peek(out, robot)
         if known is not None:
@@ -141,15 +147,18 @@ def _import(
     digests: list[tuple[str, str]] = []
     held: list[Sequence] = []
     facts: dict[str, str] = {}
+    known = Dataset.peek(out, robot)
     size, total = 0, len(find_logs(src, fmt))
     for sequence, log in _sequences(src, robot, given, fmt, options):
         digests.append((sequence.content_hash(), sequence.meta.source))
+        if known is not None:
+            _refuse_relabelled(sequence, known)
         facts |= log.meta.get("dataset", {})
         size += sum(x.nbytes for c in ARRAYS if (x := getattr(sequence, c)) is not None)
         held.append(sequence)
         if size > HOLD:
             held.clear()
-        progress(len(digests), total, sequence.meta.motion)
+        progress(len(digests), max(total, len(digests)), sequence.meta.motion)  # a file may hold many
     _refuse_twice(digests)
     again = (s for s, _ in _sequences(src, robot, given, fmt, options))
     dataset = Dataset.create(out, robot)
@@ -185,13 +194,28 @@ def _sequences(
         sequence = to_sequence(log, robot, meta)
         if "notes" in log.meta.get("stated", {}):  # how it was first recorded, not how it was written here
             sequence = replace(sequence, meta=meta)
-        yield sequence, log
+        for piece in _pieces(sequence, given.cut):
+            yield piece, log
+
+
+def _pieces(sequence: Sequence, seconds: float | None) -> Iterator[Sequence]:
+    """A recording, or equal pieces of it of about so long, s; each says from when it is."""
+    count = max(1, round(sequence.duration / seconds)) if seconds else 1
+    if count == 1:
+        yield sequence
+        return
+    rows = len(sequence) // count
+    for start in range(0, count * rows, rows):
+        at, meta = round(start * sequence.dt, 3), sequence.meta
+        named = replace(meta, motion=f"{meta.motion}@{at:.0f}s", notes=meta.notes | {"from_s": at})
+        yield replace(sequence.rows(slice(start, start + rows)), meta=named)
 
 
 def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha256: str) -> SequenceMeta:
     """The user's word, completed by the format's; contradictions and gaps are refused."""
     stated = {k: tuple(v) if k in ("kp", "kd") else v for k, v in log.meta.get("stated", {}).items() if v is not None}
-    for name, value in vars(given).items():
+    said = {name: value for name, value in vars(given).items() if name != "cut"}
+    for name, value in said.items():
         flag = "--" + name.replace("_", "-")
         if value is not None and name in stated and stated[name] != value:
             raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
@@ -199,7 +223,7 @@ def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha
             example = "0 (kg in each hand, 0 when empty)" if name == "payload_mass" else "NAME"
             raise UsageError(f"{log.source}: this format does not say it: give {flag} {example}")
     fields: dict[str, Any] = {"source": _relative(log.source, src), "source_sha256": sha256, "repetition": UNSTATED}
-    fields |= {name: value for name, value in vars(given).items() if value is not None}
+    fields |= {name: value for name, value in said.items() if value is not None}
     return SequenceMeta(**(fields | {"robot": robot.name, "motion": motion} | stated))
 
 
@@ -247,6 +271,20 @@ def _refuse_twice(recordings: list[tuple[str, str]]) -> None:
         )
 
 
+def _refuse_relabelled(sequence: Sequence, known: Dataset) -> None:
+    """Refuse samples that the dataset has under another unit or payload: one of the labels is wrong."""
+    meta, alike = sequence.meta, [e.meta for e in known.entries if e.rows == len(sequence)]
+    for unit, mass, side in {(m.unit_id, m.payload_mass, m.payload_side) for m in alike}:
+        other = replace(meta, unit_id=unit, payload_mass=mass, payload_side=side)
+        twin = known.find(replace(sequence, meta=other).content_hash())
+        if twin is not None and (unit, mass, side) != (meta.unit_id, meta.payload_mass, meta.payload_side):
+            raise DatasetError(
+                f"{meta.source}: known samples under new labels: {known.path} holds them as unit {unit}, {mass:g} kg "
+                f"({side}), not unit {meta.unit_id}, {meta.payload_mass:g} kg ({meta.payload_side}). Nothing was "
+                f"imported; where the old label is the wrong one: gaponet data remove {known.path} {twin.id}"
+            )
+
+
 def _require_side(robot: RobotSpec, side: str) -> None:
     sides = ("both", *(mount.side for mount in robot.payload_mounts))
     if side not in sides:
@@ -262,5 +300,7 @@ def _sha256(files: tuple[str, ...]) -> str:
     """SHA-256 of a recording's files one after the other, by name (cat control.csv state_motor.csv)."""
     digest = hashlib.sha256()
     for file in files:
-        digest.update(Path(file).read_bytes())
+        with Path(file).open("rb") as content:
+            while block := content.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()

@@ -70,6 +70,11 @@ class SequenceMeta:
         return None if kp == ASSUMED else self.kp, None if (kd or kp) == ASSUMED else self.kd
 
     @property
+    def unrecorded(self) -> tuple[str, ...]:
+        """Joints of which nothing was recorded: they stand where they were said to, or at home."""
+        return (*self.notes.get("posture", {}), *self.notes.get("held_at_home", ()))
+
+    @property
     def slot(self) -> tuple[str, str, float, str]:
         """Recordings in one slot, at one rate, are repetitions of each other."""
         return self.motion, self.unit_id, self.payload_mass, self.payload_side
@@ -195,14 +200,16 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
     time is never stretched. Where none is, or rows are uneven, measurements are interpolated and commands held on a
     grid of the state's median period. The manifest says which. Refused are clocks that cannot be right: periods below
     0.1 ms or above 1 s, a gap of more than 2 s, three times as many rows as were recorded, a stated period that the
-    timestamps contradict.
+    timestamps contradict, states that end long before the commands.
 
     Args:
-        log: The recording; its joints are reordered to the robot's and missing ones filled at home, which is noted.
+        log: The recording; its joints are reordered to the robot's, and missing ones stand where its posture (meta
+            "posture", {joint: rad}) says, else at home, which is noted.
         robot: Decides the joint order; its gains stand where neither meta nor the log (meta "kp", "kd") says them.
         dt: Force this period, s.
     """
     time = log.channels["qpos"].time
+    _require_both_ends(log)
     period = np.diff(time)
     median = _median_period(log)
     shared = all(len(c.time) == len(time) and np.array_equal(c.time, time) for c in log.channels.values())
@@ -235,15 +242,26 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
             "qvel": "as recorded" if "qvel" in log.channels else "central differences of qpos",
         }
     )
-    absent = [name for name in robot.joint_names if name not in log.joint_names]
-    if absent:
-        notes["held_at_home"] = absent
+    posture = {j: x for j, x in log.meta.get("posture", {}).items() if j not in log.joint_names}
+    absent = [name for name in robot.joint_names if name not in log.joint_names and name not in posture]
+    notes |= ({"posture": posture} if posture else {}) | ({"held_at_home": absent} if absent else {})
     if converted:
         notes["converted_from"] = converted
     gains = {name: getattr(meta, name) or _recorded(name, log, robot) for name in ("kp", "kd")}
     said = ["as stated" if getattr(meta, n) else "as recorded" if n in log.meta else ASSUMED for n in gains]
     notes["gains"] = said[0] if said[0] == said[1] else f"kp {said[0]}, kd {said[1]}"
     return Sequence(SequenceMeta(**(asdict(meta) | gains | {"notes": notes})), robot.joint_names, dt, **arrays)
+
+
+def _require_both_ends(log: Log) -> None:
+    """Refuse states that end long before the commands do: a file that was cut at the end of a row reads well."""
+    states, commands = log.channels["qpos"].time, log.channels["ctrl"].time
+    missing = float(commands[-1] - states[-1])
+    if commands[0] < states[-1] and missing > max(1.0, 0.1 * float(commands[-1] - commands[0])):
+        raise LogError(
+            f"{log.source}: its states end {missing:.1f} s before its commands do: the file may be cut short; copy it "
+            "again, or cut the commands where the robot stopped (--skip-bad leaves the recording out)"
+        )
 
 
 def _row_period(time: Array, periods: tuple[float, ...]) -> float | None:
@@ -297,9 +315,11 @@ def _resample(log: Log, dt: float) -> dict[str, Array]:
 
 
 def _to_robot(name: str, values: Array, log: Log, robot: RobotSpec) -> Array:
-    """Columns in robot order; joints the log lacks stand at home (positions) or at zero."""
+    """Columns in robot order; joints the log lacks stand where its posture says or at home (positions), or at zero."""
     out = np.zeros((len(values), len(robot.joint_names)))
     if name in ("ctrl", "qpos"):
         out += robot.qpos_home
+        for joint, angle in log.meta.get("posture", {}).items():
+            out[:, robot.index([joint])] = angle
     out[:, robot.index(log.joint_names)] = values
     return out

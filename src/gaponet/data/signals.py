@@ -1,12 +1,28 @@
-"""Pure numpy on time series (T, n): resampling, derivatives, delay."""
+"""Pure numpy on time series (T, n): resampling, derivatives, delay, and how states follow commands in time.
+
+`Response` holds correlations that add up over recordings: the velocity of a joint is taken as a sum of commanded
+velocities of so long ago, and the weights say when it begins to move, and by how much a recording follows later.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from gaponet.arrays import Array
 
+TIE = 0.1  # of a period by which stamps may differ and mean one instant, as in rows that are kept as recorded
 FAST = 0.3  # rad/s of fast_speed from which a lag is mostly delay; below, it is mostly stiction
+STEP = 0.01  # s at the least
+BEFORE, AFTER = 0.12, 0.6  # s of the command before and after the state
+PARTS = 3  # of a recording
+SHIFTS = np.arange(-0.12, 0.1201, 0.002)  # s by which a part may follow later
+RIDGE = 1e-3
+SHARP = 0.8  # of the command's power: its correlation 20 ms later
+FOLLOWS = 0.7  # of the state's power is left where a joint does not follow
+HERTZ = np.arange(0.5, 60, 0.1)
+WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 
 
 def resample_linear(time: Array, values: Array, grid: Array) -> Array:
@@ -26,14 +42,17 @@ def resample_linear(time: Array, values: Array, grid: Array) -> Array:
 def resample_zoh(time: Array, values: Array, grid: Array) -> Array:
     """Hold each command until the next one arrives.
 
-    Commands are steps, not ramps: linear interpolation would invent motion the robot was never asked for.
+    Commands are steps, not ramps: linear interpolation would invent motion the robot was never asked for. A command
+    that comes within TIE of a grid's period after an instant is of that instant: one loop writes state and command with
+    one stamp, and neither the grid's rounding nor the loop's jitter may make it a whole period late.
 
     Args:
         time: Strictly increasing timestamps, (k,), s.
         values: Commands, (k, n), rad.
-        grid: Query times, (T,), s, within [time[0], time[-1]].
+        grid: Query times, evenly spaced, (T,), s, within [time[0], time[-1]].
     """
-    return values[np.searchsorted(time, grid, side="right") - 1]  # (T, n)
+    slack = TIE * (grid[-1] - grid[0]) / max(len(grid) - 1, 1)
+    return values[np.searchsorted(time, grid + slack, side="right") - 1]  # (T, n)
 
 
 def differentiate(values: Array, dt: float) -> Array:
@@ -115,3 +134,137 @@ def encoder_step(recordings: list[Array]) -> float:
     step = float(np.percentile(steps, 5))
     off = np.abs(steps / step - np.round(steps / step))
     return step if np.median(off) < 0.1 else 0.0
+
+
+@dataclass(frozen=True)
+class Response:
+    """Correlations of one recording in PARTS parts, n joints, at lags of `step` s.
+
+    Attributes:
+        own: Of the command with itself, lags 0 … BEFORE + AFTER, (PARTS, n, L).
+        cross: Of the command with the state, so much later: −BEFORE … AFTER, (PARTS, n, L).
+        power: Of the state, (PARTS, n).
+        duration: s.
+    """
+
+    step: float
+    own: Array
+    cross: Array
+    power: Array
+    duration: float
+
+
+def response(ctrl: Array, qpos: Array, dt: float) -> Response:
+    """Of ctrl and qpos (T, n)."""
+    every = max(1, round(STEP / dt))
+    step = every * dt
+    before, lags = round(BEFORE / step), round(BEFORE / step) + round(AFTER / step) + 1
+    size = len(ctrl[::every]) // PARTS
+    own, cross, power = [], [], []
+    for part in range(PARTS):
+        rows = slice(part * size, (part + 1) * size)
+        u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
+        length = 2 * max(len(u), lags)
+        a, b = np.fft.rfft(u, length, axis=0), np.fft.rfft(v, length, axis=0)
+        own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
+        later = np.fft.irfft(a.conj() * b, length, axis=0)
+        cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
+        power.append((v**2).sum(axis=0))
+    same, other, strength = (np.array(x, np.float32) for x in (own, cross, power))
+    return Response(step, same, other, strength, duration=len(ctrl) * dt)
+
+
+@dataclass(frozen=True)
+class Following:
+    """What some recordings say together.
+
+    Attributes:
+        onset: Time after which a joint has made a twentieth of the way, (n) s; NaN where it does not follow, or is
+            told to move so smoothly that this is not known.
+        shifts: By how much each part of each recording follows later than all, (recordings, PARTS) s; whole: all parts
+            of each together, (recordings).
+    """
+
+    onset: Array
+    shifts: Array
+    whole: Array
+
+
+def following(found: list[Response], told: list[bool] | None = None) -> Following:
+    """Of recordings at one step; those not `told` are shifted against the others, which alone say how joints follow."""
+    from scipy.linalg import toeplitz
+
+    step, n, lags = found[0].step, *found[0].own.shape[1:]
+    at = (np.arange(lags) - round(BEFORE / step)) * step
+    use = np.ones(len(found), bool) if told is None else np.array(told)
+    parts = [np.stack([getattr(r, f) for r in found]).astype(float) for f in ("own", "cross", "power")]
+    own, cross, power = (x[use].sum(axis=(0, 1)) for x in parts)
+    quick = sharp(found)
+    onset, fits = np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
+    for j in range(n):
+        if own[j, 0] <= 0 or power[j] <= 0:
+            continue
+        weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
+        left = power[j] - weights @ cross[j]
+        if left > FOLLOWS * power[j] or weights.sum() < 0.3:
+            continue
+        way = np.cumsum(weights) / weights.sum()
+        first = int(np.argmax(way > 0.05))
+        onset[j] = (
+            np.nan
+            if not quick[j]
+            else (
+                at[first]
+                + step
+                - step * (way[first] - 0.05) / max(way[first] - (way[first - 1] if first else 0.0), 1e-9)
+            )
+        )
+        moved = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS])
+        spread = np.fft.rfft(moved, 2 * lags, axis=1)
+        square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
+        square[:, 1:] *= 2
+        fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
+    return Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
+
+
+def sharp(found: list[Response]) -> Array:
+    """Joints whose commands change quickly enough to show when the joint begins to move, (n)."""
+    lags = [max(round(0.02 / r.step), 1) for r in found]
+    now, soon = (np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(found, ks, strict=True)], axis=0)
+                 for ks in ([0] * len(found), lags))  # fmt: skip
+    return np.asarray(soon < SHARP * now)
+
+
+def _peaks(fits: Array) -> Array:
+    """Shift of the best fit, (…, S) → (…) s; NaN at an end, and where nothing says."""
+    found = SHIFTS[fits.argmax(axis=-1)]
+    return np.where((np.abs(found) > SHIFTS[-2]) | (np.ptp(fits, axis=-1) == 0), np.nan, found)
+
+
+def spectrum(qpos: Array, dt: float) -> Array:
+    """Mean logarithm of the power of the velocities that are not zero, at HERTZ, (H); NaN above half the rate."""
+    moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
+    if not moved.size or len(moved) < 100:
+        return np.full(len(HERTZ), np.nan)
+    v = np.diff(moved, axis=0)
+    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
+    smooth = np.convolve(power, np.ones(3) / 3, "same")
+    return np.where(0.48 / dt > HERTZ, np.interp(HERTZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan)
+
+
+def averaged(levels: Array, widths: Array = WIDTHS) -> tuple[float, float]:
+    """Width in s of the average that best explains notches at its multiples in `levels` (H), and how deep they are."""
+    best = (0.0, 0.0)
+    known = HERTZ[np.isfinite(levels)]
+    if not len(known):
+        return best
+    for width in widths:
+        depth = []
+        for k in range(1, 5):
+            if (k + 0.4) / width > known[-1]:
+                break
+            near = levels[np.abs(HERTZ - k / width) < max(0.11, 0.012 * k / width)].min()
+            depth.append(np.interp([(k - 0.35) / width, (k + 0.35) / width], HERTZ, levels).mean() - near)
+        if depth and min(depth) > best[1]:
+            best = (float(width), float(min(depth)))
+    return best

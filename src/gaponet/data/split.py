@@ -1,9 +1,10 @@
 """Split files: which sequences are for training, validation (choosing) and test (reporting), by content hash.
 
 By motion, a fixed rule puts every repetition, payload and unit of a motion into one part; motions with equal commands
-are one motion, whatever they are called (data.commands). By unit or payload, the test
-part is what is held out, and validation is a part of the motions of the rest. Parts share no recording: neither one
-listed twice nor the same samples under another name, unit or payload.
+are one motion, whatever they are called (data.commands). By unit or payload, the test part is what is held out, and
+validation is a part of the motions of the rest. By repetition the last ones are the test, by time the last pieces of
+each recording that was cut (gaponet import --cut): both ask for what was asked before. Parts share no recording:
+neither one listed twice nor the same samples under another name, unit or payload.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import hashlib
 import itertools
 import json
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as ListOf
 from pathlib import Path
@@ -35,7 +37,11 @@ BY: dict[str, Callable[[Entry], str]] = {
     "motion": lambda e: e.meta.motion,
     "unit": lambda e: e.meta.unit_id,
     "payload": lambda e: f"{e.meta.payload_mass:g}",
+    "repetition": lambda e: str(e.meta.repetition),
+    "time": lambda e: f"{e.meta.notes.get('from_s', 0.0):g}",
 }
+IN_TURN = ("repetition", "time")  # what was asked before comes again: the later ones are held out
+MOTIONS = 3  # one for each part
 TEST_SHARE, VAL_SHARE = 0.25, 0.125  # of motions, units or payloads; at least one each
 
 
@@ -60,7 +66,8 @@ def split_entries(
     rates: tuple[float, ...] = (),
     train_share: float = 1.0,
 ) -> Parts:
-    """Entries per part: the fixed split by motion, the same for all rates and shares.
+    """Entries per part: the fixed split by motion, the same for all rates and shares; by repetition, where one or two
+    motions were played three times or more.
 
     Args:
         holdout_units: Appear in the test part only, with its motions.
@@ -87,6 +94,10 @@ def split_entries(
         raise UsageError(f"train_share is {train_share:g}; it is a share of the training motions, above 0 and up to 1")
     away = lambda m: m.unit_id in holdout_units or m.payload_mass in holdout_payloads  # noqa: E731
     lead = one_motion(dataset)
+    played = Counter((lead[e.meta.motion], *e.meta.slot[1:]) for e in dataset.entries)
+    if len(set(lead.values())) < MOTIONS <= max(played.values(), default=0):
+        parts = in_turn(dataset, "repetition")
+        return parts | {p: [e for e in parts[p] if not away(e.meta)] for p in ("train", "val")}
     motions = split_by_motion(lead.values())
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
     entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
@@ -98,6 +109,32 @@ def split_entries(
         if not entries:
             held = ", ".join([*holdout_units, *(f"{p:g} kg" for p in holdout_payloads)]) or "all other rates"
             raise UsageError(f"{dataset.path}: nothing left for {part} after holding out {held}")
+    return parts
+
+
+def in_turn(dataset: Dataset, by: str) -> Parts:
+    """The last quarter of the repetitions (or of the pieces of each recording in time) for testing, one before it for
+    validation, the rest for training. Recordings of one command are repetitions, whatever they are called.
+
+    Raises:
+        UsageError: There are fewer than three.
+    """
+    entries, lead = dataset.entries, one_motion(dataset) if by == "repetition" else {}
+    group: Callable[[Entry], Any] = lambda e: (*e.meta.slot[1:], lead[e.meta.motion] if lead else e.meta.source)  # noqa: E731
+    place: Callable[[Entry], Any] = (
+        (lambda e: (e.meta.motion, e.meta.repetition)) if lead else (lambda e: e.meta.notes.get("from_s", 0.0))
+    )
+    parts: Parts = {part: [] for part in PARTS}
+    for key in dict.fromkeys(map(group, entries)):
+        mine = [e for e in entries if group(e) == key]
+        turns = sorted({place(e) for e in mine})
+        test = max(1, round(TEST_SHARE * len(turns))) if len(turns) >= MOTIONS else 0
+        for e in mine:
+            last = len(turns) - 1 - turns.index(place(e))
+            parts["test" if last < test else "val" if test and last == test else "train"].append(e)
+    if not parts["test"]:
+        what = "repetitions" if by == "repetition" else "pieces of one recording (gaponet import --cut 8)"
+        raise UsageError(f"a split by {by} needs {MOTIONS} {what} or more")
     return parts
 
 
@@ -143,10 +180,10 @@ def split_by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
     then validation. Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
     """
     names = hash_order(motions)
-    if len(names) < 3:
+    if len(names) < MOTIONS:
         raise UsageError(
-            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs 3 or more; motions with equal "
-            "commands count once"
+            f"{len(names)} motion(s) ({', '.join(names)}): a split by motion needs {MOTIONS} or more; motions with "
+            "equal commands count once. Long recordings can be cut into several: gaponet import --cut 8"
         )
     test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
     return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
@@ -161,7 +198,7 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Part
     """Divide a dataset's sequences.
 
     Args:
-        by: motion, unit or payload.
+        by: motion, unit, payload, repetition or time.
         holdout: Motions, units or payloads (kg) for the test part; default a quarter, by the hash of their names.
 
     Returns:
@@ -170,15 +207,20 @@ def make_split(dataset: Dataset, by: str, holdout: tuple[str, ...] = ()) -> Part
     Raises:
         UsageError: Something held out is not there, or nothing is left for a part.
     """
+    if by in IN_TURN and not holdout:
+        return in_turn(dataset, by)
     lead = one_motion(dataset)
     key = (lambda e: lead[e.meta.motion]) if by == "motion" else BY[by]
     held = _held_out(dataset, by, holdout, key)
     rest = [e for e in dataset.entries if key(e) not in held]
     motions = hash_order(lead[e.meta.motion] for e in rest)
+    choice = key if by in IN_TURN else lambda e: lead[e.meta.motion]
+    if by in IN_TURN and rest:
+        motions = [max(map(key, rest), key=float)]  # of those that are not held out, the last
     chosen = set(motions[: max(1, round(len(set(lead.values())) * VAL_SHARE))])
     parts = {
-        "train": [e for e in rest if lead[e.meta.motion] not in chosen],
-        "val": [e for e in rest if lead[e.meta.motion] in chosen],
+        "train": [e for e in rest if choice(e) not in chosen],
+        "val": [e for e in rest if choice(e) in chosen],
         "test": [e for e in dataset.entries if key(e) in held],
     }
     for part in PARTS:

@@ -2,7 +2,7 @@
 
     dataset.json            format version, robot, joint names, units; licence and source where they were said
     robot/                  the nominal robot: robot.toml and an MJCF that needs nothing else (robot_folder)
-    sequences.jsonl         one line per sequence: metadata, hash, delays; appended, never rewritten in place
+    sequences.jsonl         one line per sequence: metadata, hash, delays; appended, never changed in place
     offsets.json            static offsets of each unit as fitted at import (data.offsets); recorded, never applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
     twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
@@ -20,12 +20,16 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import sys
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from tempfile import mkdtemp
+from typing import Annotated, Any, NotRequired, cast
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -37,6 +41,7 @@ from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta
 from gaponet.errors import DatasetError
 from gaponet.files import require_ours, sync, whole, write_text, writing
+from gaponet.parts import take
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.structure import Name, parse_json, read_format
@@ -44,6 +49,7 @@ from gaponet.structure import Name, parse_json, read_format
 FORMAT = 1
 MEND = "restore the file or import the log again"
 KIND, JOURNAL = "dataset", "sequences.jsonl"
+LARGEST_TABLE = 1 << 30  # bytes of what is read of one sequence at once
 
 
 class Header(TypedDict):
@@ -86,7 +92,7 @@ class Dataset:
         Raises:
             DatasetError: Not a dataset, written by a newer version, or a listed file is missing.
         """
-        self.path = Path(path)
+        self.path = self.twins = Path(path)  # twins lie elsewhere where the folder can only be read
         header = self.path / "dataset.json"
         if not header.is_file():
             raise DatasetError(
@@ -139,6 +145,24 @@ class Dataset:
             journal = self.path / JOURNAL
             if (journal.stat().st_size if journal.is_file() else 0) != self._end:
                 self._load()
+            yield
+
+    @property
+    def read_only(self) -> bool:
+        """Whether this user, or the disk, lets nothing be written into the folder."""
+        return not os.access(self.path, os.W_OK)
+
+    @contextmanager
+    def making_twins(self) -> Iterator[None]:
+        """As `writing`; twins of a folder that can only be read go into a temporary one, and with this object."""
+        if not self.read_only:
+            with self.writing():
+                yield
+            return
+        if self.twins == self.path:
+            self.twins = Path(mkdtemp(prefix="gaponet-twins-"))
+            weakref.finalize(self, shutil.rmtree, self.twins, ignore_errors=True)
+        with writing(self.twins, "twins"):
             yield
 
     def require_robot(self, robot: RobotSpec) -> None:
@@ -219,6 +243,22 @@ class Dataset:
         self._by_hash[digest] = entry
         return entry
 
+    def remove(self, patterns: tuple[str, ...]) -> list[Entry]:
+        """Take out the sequences whose ids match, with their twins; refuses a pattern that matches none."""
+        with self.writing():
+            for pattern in patterns:
+                if not any(fnmatchcase(e.id, pattern) for e in self.entries):
+                    raise DatasetError(f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids")
+            gone = [e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)]
+            lines = (self.path / JOURNAL).read_bytes()[: self._end].splitlines(keepends=True)
+            kept = [line for line, e in zip(lines, self.entries, strict=True) if e not in gone]
+            write_text(self.path / JOURNAL, b"".join(kept).decode())
+            for entry in gone:  # unlisted files are none of the dataset's, should this be cut short
+                for file in (self._file(entry), *self.path.glob(f"twins/*/{entry.id}.parquet")):
+                    file.unlink(missing_ok=True)
+            self._load()
+        return gone
+
     def read(self, entry: Entry, optional: bool = True) -> Sequence:
         """Load one sequence, without its optional channels where they are not asked for."""
         names = tuple(c for c in entry.channels if optional or c not in OPTIONAL)
@@ -239,8 +279,8 @@ class Dataset:
     def write_twin(self, entry: Entry, twin: Twin) -> None:
         """Store the simulated twin of a sequence, replacing an earlier one of the same model."""
         columns = {"qpos": twin.qpos, "qvel": twin.qvel, "tau": twin.tau}
-        file = self._twin_file(entry, twin.model_hash)
-        with self.writing():
+        with self.making_twins():
+            file = self.twins / "twins" / twin.model_hash / f"{entry.id}.parquet"
             file.parent.mkdir(parents=True, exist_ok=True)
             _write_table(file, columns, entry.dt, self.joint_names)
 
@@ -258,7 +298,8 @@ class Dataset:
         return self.path / "sequences" / f"{entry.id}.parquet"
 
     def _twin_file(self, entry: Entry, model: str) -> Path:
-        return self.path / "twins" / model / f"{entry.id}.parquet"
+        made = self.twins / "twins" / model / f"{entry.id}.parquet"
+        return made if made.is_file() else self.path / "twins" / model / f"{entry.id}.parquet"
 
     def _journal(self) -> Iterator[Entry]:
         journal = self.path / JOURNAL
@@ -321,6 +362,8 @@ def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
             kind = file.schema_arrow.field(column).type
             if not pa.types.is_fixed_size_list(kind) or kind.list_size != n or kind.value_type != pa.float32():
                 raise DatasetError(f"{path}: {column} is {kind}, not {n} joints' float32; {MEND}")
+        if 4 * rows * n * len(columns) > LARGEST_TABLE:
+            raise DatasetError(f"{path}: {rows:,} rows of {n} joints are more than {LARGEST_TABLE >> 20} MiB; {MEND}")
         table = file.read(columns=list(columns), use_threads=False)
         arrays = {c: table.column(c).combine_chunks().flatten().to_numpy(zero_copy_only=False) for c in columns}
     except (pa.ArrowException, OSError, KeyError, ValueError) as error:
@@ -335,12 +378,20 @@ def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
 def open_dataset(
     dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
-    """A dataset and its robot: the one asked for, else the one that the dataset keeps.
+    """A dataset, to be read, and its robot: the one asked for, else the one that the dataset keeps.
+
+    Args:
+        dataset: Folder; or the address (s3://, gs://, file://) of one that was pushed, which is read where it lies.
+        robot: Another robot than the one that the dataset keeps.
+        run: Whose robot is taken where the dataset keeps none.
+
+    Raises:
+        DatasetError, RemoteError: There is no dataset, it is damaged, or it cannot be reached.
 
     A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
     is said on stderr.
     """
-    data = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    data = dataset if isinstance(dataset, Dataset) else opened(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
@@ -350,3 +401,16 @@ def open_dataset(
         note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
         print(note, file=sys.stderr)
     return data, spec
+
+
+def opened(place: str | Path) -> Dataset:
+    """A dataset folder, or one behind an address.
+
+    Raises:
+        DatasetError, RemoteError: As open_dataset.
+    """
+    if "://" not in str(place):
+        return Dataset(place)
+    return cast(
+        "Dataset", take("PROVIDES", "dataset behind an address", "reading datasets where they were pushed")(str(place))
+    )

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.holds import Holds, find_holds
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import FAST, differentiate, estimate_delay, fast_speed
+from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass, response, spectrum
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
 
@@ -21,12 +21,14 @@ BLOCKED_CHANGE = 0.1  # by this, rad, without moving the joint
 STAND_S, STAND = 0.2, 0.005  # a joint that moves less than this in this time stands: s, rad
 FROZEN_CHANGE = 0.1  # the command must move this far while the state repeats itself, rad
 SLOPE_RANGE = 0.2  # commanded over less, sag and stiction decide the slope, rad
+SLOW_HERTZ = 0.3  # faster, a servo's resonance has its own scale
 LOADS, SLOW = 60, 0.5  # rows of a sequence in which torque is compared with gravity; no joint is faster there, rad/s
 TORQUE_NOISE = 0.05  # of the limit; a reading may exceed it by that
 COPIED = 1e-5  # command and state closer than this are one signal, rad
 JUMP, JUMP_ACCELERATION = 0.1, 1000.0  # off the line between its neighbours by this, rad, no joint turns back so fast
 DROPPED = 0.05  # a row of zeros so far from the next row was not measured, rad
 FLAT = 0.02  # rad that a joint moves while its torque says one number
+STEPPED = 0.05  # rad by which a command jumps, and a torque with it
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
 
 
@@ -66,6 +68,11 @@ class Survey:
         step: Steps in which positions are told, (n) rad; 0 where they are fine, or too few to tell.
         torque: None where no torque was recorded.
         holds: Rests.
+        response: When joints move after their commands (data.signals). spectra: Of command and state, (2, H).
+        beside: How far the nearest state is from the command of up to MAX_LAG_S ago, over that state's spread, (n); NaN
+            where the joint does not move.
+        as_velocity, as_torque: Correlation of the command with the measured velocity and torque, (n).
+        halted_s: Longest time for which all joints stood at once while the commands of half of them moved on, s.
         loads: Joint angles and torques, (k, n) each, in slow rows; None where no torque was recorded.
     """
 
@@ -93,6 +100,12 @@ class Survey:
     step: Array
     torque: Torque | None
     holds: Holds
+    response: Response
+    spectra: Array
+    beside: Array
+    as_velocity: Array
+    as_torque: Array
+    halted_s: float
     loads: tuple[Array, Array] | None
 
     @property
@@ -130,7 +143,7 @@ def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         follows=follows,
         opposes=opposes,
         lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
-        slope=_slope(ctrl, qpos, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
+        slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
         copied=(np.ptp(ctrl, axis=0) > 0.05) & (np.abs(ctrl - qpos) < COPIED).all(axis=0),
         jumps=_jumps(qpos, dt),
         dropped=_dropped(sequence, notes, robot),
@@ -142,6 +155,10 @@ def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
         step=_step(qpos),
         torque=_torque(sequence, robot),
         holds=find_holds(sequence, robot.operated_index),
+        response=response(ctrl, qpos, dt),
+        spectra=np.stack([spectrum(ctrl, dt), spectrum(qpos, dt)]),
+        **_kind(sequence),
+        halted_s=_halted(ctrl, qpos, dt),
         loads=_loads(sequence),
     )
 
@@ -160,15 +177,54 @@ def _follows(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:
     return most, -least
 
 
-def _slope(ctrl: Array, qpos: Array, lag: Array, speed: Array) -> Array:
+def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Array:
     """Slope of the state over the command of `lag` rows ago; where a fast joint's lag is unknown, nothing is said."""
     slope = np.full(len(lag), np.nan)
+    slow = [lowpass(x, dt, SLOW_HERTZ) for x in (ctrl, qpos)] if len(ctrl) * dt > 3 / SLOW_HERTZ else None
     for j in np.flatnonzero((np.ptp(ctrl, axis=0) > SLOPE_RANGE) & ((lag > 0) | (speed < FAST))):
-        steps = round(float(lag[j]))
-        u, v = ctrl[: len(ctrl) - steps, j].astype(float), qpos[steps:, j].astype(float)
-        u = u - u.mean()
-        slope[j] = u @ v / (u @ u)
+        steps, found = round(float(lag[j])), []
+        for a, b in ((ctrl, qpos), *([slow] if slow and np.ptp(slow[0][:, j]) > SLOPE_RANGE else [])):
+            u, v = a[: len(a) - steps, j].astype(float), b[steps:, j].astype(float)
+            u = u - u.mean()
+            found.append(float(u @ v / (u @ u)))
+        slope[j] = min(found, key=lambda x: abs(x - 1))  # what a resonance makes of it is no scale
     return slope
+
+
+def _kind(sequence: Sequence) -> dict[str, Array]:
+    """What the command is like: the position soon after, the velocity, or the torque?"""
+    every = max(1, round(0.02 / sequence.dt))
+    ctrl, qpos = (x[::every].astype(float) for x in (sequence.ctrl, sequence.qpos))
+    speed, lags = np.gradient(qpos, axis=0), range(0, min(round(MAX_LAG_S / 0.02), len(qpos) // 2), 2)
+    beside, fast = [], []
+    for lag in lags:
+        u, q = ctrl[: len(ctrl) - lag], qpos[lag:]
+        both = u.T @ q / len(u)  # (n, n)
+        for scale in (1.0, np.degrees(1), np.radians(1)):  # units, signs and names are other checks' matters
+            away = scale**2 * (u**2).mean(axis=0)[:, None] + (q**2).mean(axis=0) - 2 * scale * np.abs(both)
+            beside.append((np.maximum(away, 0) / np.maximum(q.var(axis=0), 1e-12)).min(axis=1))
+        fast.append(_correlation(u, speed[lag:]))
+    near = np.where(np.ptp(qpos, axis=0) > 0.05, np.sqrt(np.min(beside, axis=0)), np.nan)
+    torque = np.full(near.shape, np.nan) if sequence.tau is None else _correlation(ctrl, sequence.tau[::every])
+    return {"beside": near, "as_velocity": np.max(fast, axis=0), "as_torque": torque}
+
+
+def _correlation(a: Array, b: Array) -> Array:
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    power = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return np.asarray((a * b).sum(axis=0) / np.where(power > 0, power, np.inf))
+
+
+def _halted(ctrl: Array, qpos: Array, dt: float) -> float:
+    """The brakes are on, or the drives off: two joints at least are told to move."""
+    w = max(1, round(STAND_S / dt))
+    stands = np.zeros(len(qpos), bool)
+    stands[w:] = (np.abs(qpos[w:] - qpos[:-w]) < STAND).all(axis=1)
+    told = max(2.0, 0.5 * (np.ptp(ctrl, axis=0) > BLOCKED_CHANGE).sum())
+    late = round(MAX_LAG_S / dt)
+    runs = [r for r in _runs(stands) if r.stop - r.start > 2 * late]
+    runs = [r for r in runs if (np.ptp(ctrl[r.start : r.stop - late], axis=0) > BLOCKED_CHANGE).sum() >= told]
+    return max((r.stop - r.start for r in runs), default=0) * dt
 
 
 def _jumps(qpos: Array, dt: float) -> Array:
@@ -225,7 +281,9 @@ def _frozen(sequence: Sequence) -> float:
     """A resting robot repeats its positions; one whose every signal repeats while it is told to move is not read."""
     state = [getattr(sequence, name) for name in ("qpos", "qvel", "tau", "temperature")]
     same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
-    told = [r for r in _runs(same) if np.ptp(sequence.ctrl[r.start : r.stop + 1], axis=0).max() > FROZEN_CHANGE]
+    late = round(MAX_LAG_S / 2 / sequence.dt)
+    asked = lambda r: np.ptp(sequence.ctrl[r.start : max(r.stop - late, r.start) + 1], axis=0).max()  # noqa: E731
+    told = [r for r in _runs(same) if asked(r) > FROZEN_CHANGE]
     return max((r.stop - r.start for r in told), default=0) * sequence.dt
 
 
@@ -263,16 +321,19 @@ def _runs(mask: Array) -> list[slice]:
 def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
     if sequence.tau is None:
         return None
-    from scipy.ndimage import median_filter
+    from scipy.ndimage import maximum_filter1d, median_filter
 
     tau = sequence.tau
     size = np.abs(tau)
-    usual = median_filter(size, size=(max(3, round(SPIKE_WINDOW_S / sequence.dt)), 1), mode="nearest")
+    window = max(3, round(SPIKE_WINDOW_S / sequence.dt))
+    usual = median_filter(size, size=(window, 1), mode="nearest")
+    jumps = np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1) > STEPPED
+    calm = maximum_filter1d(jumps, 2 * window + 1) == 0
     return Torque(
         low=tau.min(axis=0),
         high=tau.max(axis=0),
         over_limit=(size > robot.effort_limit * (1 + TORQUE_NOISE)).sum(axis=0),
-        spikes=(size - usual > SPIKE_SHARE * robot.effort_limit).sum(axis=0),
+        spikes=((size - usual > SPIKE_SHARE * robot.effort_limit) & calm[:, None]).sum(axis=0),
         flat=np.array(
             [
                 sum(r.stop - r.start for r in _runs(column == column.max()) if r.stop - r.start >= FLAT)

@@ -1,4 +1,5 @@
-"""AlignedSim: the simulator that behaves like the robot. A target becomes target + Δa on its way to the servos.
+"""AlignedSim: the simulator that behaves like the robot. An identified robot's does of itself; with a model a target
+becomes target + Δa on its way to the servos.
 
 In the simulator that the model was trained in, Δa is the model's; in another one, what makes it move as the corrected
 one would (deploy/transfer.py).
@@ -19,7 +20,7 @@ from gaponet.sim.batch import BatchSim, Condition
 class AlignedSim:
     """num_envs aligned simulations, one control period per step; the same as sim.replay with the model's corrector.
 
-        sim = AlignedSim(load_robot("h1_2"), GapModel.load("run"), payload_mass=3.0)
+        sim = AlignedSim(load_robot("./my_h1_2"), payload_mass=3.0)  # and GapModel.load("run"), where a model helps
         sim.reset(qpos)
         sim.step(target)          # for one control period
         sim.qpos, sim.qvel
@@ -30,7 +31,7 @@ class AlignedSim:
     def __init__(
         self,
         robot: RobotSpec,
-        model: Reference | None,
+        model: Reference | None = None,
         payload_mass: Array | float = 0.0,
         payload_side: str = "both",
         dt: float | None = None,
@@ -45,8 +46,8 @@ class AlignedSim:
 
         Args:
             robot: The simulator. In one that the model was not trained in, commands are transferred.
-            model: What training made; or an identified robot without a model, which the simulator then moves like; None
-                for the simulator as it is behind the same calls.
+            model: What training made; or an identified robot, which the simulator then moves like; None for the
+                simulator as it is.
             payload_mass: kg in each hand of payload_side, one number or one per simulation.
             payload_side: "both", or the side of one mount.
             dt: Control period, s; default the robot's.
@@ -77,8 +78,8 @@ class AlignedSim:
             raise UsageError(f"joint '{missing[0]}' is corrected by the model and cannot be locked")
         self.op = np.array([self.joint_names.index(name) for name in robot.operated])
         self.loop, self.transfer = None, None
-        if isinstance(model, GapModel) and self._knows(model, own if told else None):
-            self.loop = model.loop(self.num_envs, model.context(own, robot))
+        if isinstance(model, GapModel) and not told and model.corrects(robot) and periods_of(model, self.dt) == 1:
+            self.loop = model.loop(self.num_envs)
         elif model is not None:
             inverted = of_simulator(self.sim, robot, own, locked, inverse, nthread)
             self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
@@ -141,14 +142,6 @@ class AlignedSim:
         if self.transfer is not None:
             target[:] = self.transfer.command(sim.qpos, sim.qvel, target)
         sim.step(target)
-
-    def _knows(self, model: GapModel, carried: list[Condition] | None) -> bool:
-        """Whether the model was trained in this simulator, at this rate; carried: what it has in its hands instead."""
-        if not model.corrects(self.robot) or periods_of(model, self.dt) > 1:
-            return False
-        family = model.family
-        empty = carried is not None and not any(c.payload_mass for c in carried)
-        return carried is None or (family is not None and family.unladen > 0 and empty)
 
     def _past(self, target: Array) -> Array:
         return np.repeat(target[:, None], self._depth, axis=1)

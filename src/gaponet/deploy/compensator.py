@@ -1,11 +1,12 @@
 """The inverse use: commands u that make the robot do what it was asked.
 
-A shadow, the nominal simulator, is given a′ and shows how the robot should move. The robot that is given u moves like
-the nominal simulator that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
+A shadow, the simulator of the robot as it is known (nominal, identified or calibrated), is given a′ and shows how the
+robot should move. Without a model u = a′: the feed-forward of what is known. With one, the robot that is given u moves
+like the shadow that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
 
     aim "target":     a′ = a + τ / kp, τ the torque with which the shadow would move as the targets do: gravity, and
                       with dynamics what their velocity and acceleration ask for (feedforward.py)
-    aim "simulator":  a′ = a, so that the robot does what the nominal simulator does, sag and lag included
+    aim "simulator":  a′ = a, so that the robot does what the simulator does, sag and lag included
 
 G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and
 what is sent does not depend on what is measured: there is no loop that could become unstable, and noise does not reach
@@ -26,14 +27,13 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
-from gaponet.errors import ModelError, UsageError
-from gaponet.model.artifact import GapModel
+from gaponet.errors import ModelError, RobotError, UsageError
+from gaponet.model.artifact import RECORDED_TOLERANCE, GapModel
 from gaponet.model.calibration import Calibration
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 
-INVERSE = "inverse"  # folder of the learned inverse beside the model (training/learned_inverse.py)
 SETTLE = 100  # control periods in which the shadow comes to rest at a start
 
 
@@ -42,10 +42,7 @@ class CompensatorConfig:
     """Settings of the compensator."""
 
     aim: Literal["target", "simulator"] = "target"
-    """target: the commanded positions. simulator: what the nominal simulator makes of them."""
-    inverse: Literal["fixed_point", "learned"] = "fixed_point"
-    """How u + G(u) = a′ is solved. learned: by one answer of a network that was fitted to the fixed point (gaponet
-    export RUN --to inverse)."""
+    """target: the commanded positions. simulator: what the simulator makes of them."""
     dynamics: bool = False
     """Whether, with aim target, what moving asks for is fed forward, not only what holding does. For smooth targets:
     planned motions halve their error with it, but 5 mrad of noise on targets becomes 0.2 rad on commands."""
@@ -54,7 +51,7 @@ class CompensatorConfig:
     gain: float = 0.5
     """γ of an iteration; 0.5 converges wherever a change of u changes u + G(u) by a factor between 0 and 4."""
     iterations: int = 2
-    """Iterations per control period, which begin at the last period's answer; 0 leaves the model out."""
+    """Iterations per control period, which begin at the last period's answer."""
     feedback: float = 0.5
     """Rate at which the remaining error is integrated, 1/s; 0 for none."""
     feedback_time: float = 0.5
@@ -67,21 +64,25 @@ class CompensatorConfig:
     """Time in which compensation is blended in after a start, s."""
     lead: int = 0
     """How many control periods early targets are given, where the motion is known ahead. Zero is causal."""
+    payload_max: float = 3.0
+    """Largest payload that is taken or estimated without a model, kg; a model knows which it was trained with."""
 
     def __post_init__(self) -> None:
         if not (
             0 < self.gain <= 1
-            and self.limit > 0
-            and min(self.iterations, self.feedback, self.feedback_time, self.blend, self.lead) >= 0
-            and self.acceleration_time >= 0
+            and min(self.limit, self.iterations) > 0
+            and min(self.feedback, self.feedback_time, self.blend, self.lead) >= 0
+            and min(self.acceleration_time, self.payload_max) >= 0
         ):
-            raise UsageError("compensator: gain must be in (0, 1], limit positive, the rest not negative")
+            raise UsageError(
+                "compensator: gain must be in (0, 1], limit and iterations positive, the rest not negative"
+            )
 
 
 class Compensator:
     """Targets → commands for one robot, or num_envs of them. Causal: past states, the present target.
 
-        compensate = Compensator(robot, model)
+        compensate = Compensator(load_robot("./my_so101"))  # and a model, where one helps
         compensate.reset(target, payload_mass=3.0)
         u = compensate.step(target, qpos)      # once per control period; send u instead of target
 
@@ -91,7 +92,7 @@ class Compensator:
     def __init__(
         self,
         robot: RobotSpec,
-        model: GapModel,
+        model: GapModel | None = None,
         config: CompensatorConfig = CompensatorConfig(),
         dt: float | None = None,
         num_envs: int | None = None,
@@ -103,34 +104,30 @@ class Compensator:
     ) -> None:
         """
         Args:
-            robot: The robot. How it should move is known from the simulator that the model was trained in, whichever
-                other one is given here; with aim simulator no other one is taken.
-            model: What training made.
+            robot: The robot as it is known: nominal, identified or calibrated. With a model, how it should move is
+                known from the simulator that the model was trained in, whichever other one is given here; with aim
+                simulator no other one is taken.
+            model: What training made; None for the feed-forward of the robot alone.
             config: How the robot is made to follow.
             dt: Control period, s; default the robot's.
             num_envs: Robots side by side; None for one, with arrays (n,).
             payload_side: The hands that carry the payload: "both", or the side of one mount.
-            payload_step: Masses that the shadow can carry are this far apart, up to the heaviest trained on, kg.
+            payload_step: Masses that the shadow can carry are this far apart, up to the heaviest trained on (without a
+                model, config.payload_max), kg.
             nthread: Threads of the shadow simulators.
-            extrapolate: Take payloads beyond those trained on, up to the model's payload_max.
+            extrapolate: Take payloads beyond those trained on, up to the model's payload_max, and servos of other
+                gains.
             calibration: What `calibrate` found for the unit that is commanded; the shadow is then that unit.
         """
         self.dt = robot.dt if dt is None else dt
-        model.require_rate(self.dt)
-        if not model.corrects(robot):
-            if config.aim == "simulator":
-                raise ModelError(
-                    f"{model.path}: aim simulator is the simulator trained in, {model.card['simulator']}; for "
-                    f"{robot.folder} train there, or give RUN/robot, or aim at the target"
-                )
-            robot = model.simulator()
-        if model.config.delta_hold > 1:
-            raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
+        heaviest = config.payload_max
+        if model is not None:
+            robot = _corrected(model, robot, self.dt, config)
+            heaviest = model.config.payload_max if extrapolate else model.heaviest
         robot = robot if calibration is None else calibration.robot(robot)
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
         self.extrapolate = extrapolate
         self.num_envs = num = 1 if num_envs is None else num_envs
-        heaviest = model.config.payload_max if extrapolate else model.heaviest
         heaviest = heaviest if robot.payload_mounts else 0.0
         self.masses = np.linspace(0.0, heaviest, 1 + int(np.ceil(heaviest / payload_step - 1e-9)))
         locked = idle_joints(robot, robot.operated)
@@ -143,7 +140,7 @@ class Compensator:
         self.low, self.high = robot.qpos_range[self.op].T
         self.kp, self.zero = robot.kp[self.op], robot.offset[self.op]
         self.bias: Array = self.shadow.batch.bind("qfrc_bias")
-        self.loop = (_learned_inverse(model) if config.inverse == "learned" else model).loop(num)
+        self.loop = None if model is None else model.loop(num)
         self.moving = Feedforward(self.shadow, self.at, robot, self.dt, self.config.acceleration_time)
         self.estimate = PayloadEstimate(self.shadow, self.at, robot, len(self.masses), self.dt)
         self._carried = np.full(num, -1)
@@ -151,9 +148,24 @@ class Compensator:
     # ---- use
 
     def require_gains(self, joint_names: tuple[str, ...], kp: Array, kd: Array) -> None:
-        """Refuse servos with gains (n) other than those that the data were recorded with, unless `extrapolate`."""
-        if not self.extrapolate:
+        """Refuse servos with gains (n) other than those that the data were recorded with, unless `extrapolate`.
+
+        Without a model, those are the robot's own before identification.
+        """
+        if self.extrapolate:
+            return
+        if self.model is not None:
             self.model.require_gains(joint_names, kp, kd)
+            return
+        known = self.robot.nominal or self.robot
+        for joint, i in zip(known.operated, known.operated_index, strict=True):
+            for name, gains in (("kp", kp), ("kd", kd)):
+                was, now = float(getattr(known, name)[i]), float(gains[joint_names.index(joint)])
+                if abs(now - was) > RECORDED_TOLERANCE * max(was, now):
+                    raise RobotError(
+                        f"{known.folder}: {name} of {joint} is {was:g} there, the servo has {now:.4g}; set the servo, "
+                        "or robot.toml and identify on logs made with it, or extrapolate (--extrapolate)"
+                    )
 
     def reset(self, target: Array, payload_mass: Array | float | None = None) -> None:
         """Begin at rest at a target, uncompensated; commands blend in from there.
@@ -166,7 +178,7 @@ class Compensator:
             ModelError: A payload beyond those trained on, without `extrapolate`.
             UsageError: A target or payload that is not a number.
         """
-        self.told = payload_mass is not None or len(self.masses) == 1
+        self.announced = payload_mass is not None or len(self.masses) == 1
         self.estimate.reset(self.num_envs)
         if payload_mass is None:
             self._carry(np.zeros(self.num_envs))
@@ -176,7 +188,8 @@ class Compensator:
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
         self._asked = a
-        self.loop.reset()
+        if self.loop is not None:
+            self.loop.reset()
         self.offset = np.zeros((self.num_envs, len(self.op)))
         self.integral, self.missing, self.sent = np.zeros_like(self.offset), np.zeros_like(self.offset), a[:, self.op]
         self.periods = 0
@@ -189,8 +202,20 @@ class Compensator:
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """A payload was picked up or put down, kg, one number or (num_envs,); errors as of `reset`."""
-        self.model.require_payload(payload_mass, self.extrapolate)
+        self.require_payload(payload_mass)
         self._carry(np.array(np.broadcast_to(np.asarray(payload_mass, float), self.num_envs)))
+
+    def require_payload(self, payload_mass: Array | float) -> None:
+        """Refuse a payload, kg, that is none, or that the model or the shadow does not know."""
+        if self.model is not None:
+            self.model.require_payload(payload_mass, self.extrapolate)
+            return
+        mass = np.asarray(payload_mass, float)
+        if not ((mass >= 0) & (mass <= self.config.payload_max)).all():
+            raise UsageError(
+                f"payload_mass is {payload_mass}; give kg, 0 when empty, up to {self.config.payload_max:g}, or raise "
+                "payload_max (--compensation.payload-max)"
+            )
 
     def _carry(self, payload_mass: Array) -> None:
         """The shadow carries the nearest of `masses`."""
@@ -234,6 +259,11 @@ class Compensator:
         return out[0] if self.single else out
 
     @property
+    def doubt(self) -> str:
+        """That one robot holds another payload than was told, by what its servos have given of late; or nothing."""
+        return self.estimate.contradicts(float(self.payload_mass[0])) if self.announced and self.single else ""
+
+    @property
     def aimed(self) -> Array:
         """Where the robot should have been at the last step, operated joints, rad."""
         return self._aimed[0][0] if self.single else self._aimed[0]
@@ -241,20 +271,20 @@ class Compensator:
     # ---- parts
 
     def _wanted(self, a: Array) -> Array:
-        """a′: what the nominal simulator is given."""
+        """a′: what the shadow is given."""
         if self.config.aim == "simulator":
             return np.clip(a, self.low, self.high)
         tau = self.bias[: self.num_envs, self.at]
         if self.config.dynamics:
-            tau = tau + self.moving.torque()
+            tau = tau + self.moving.torque(tau)
         return np.clip(a + tau / self.kp - self.zero, self.low, self.high)
 
     def _solve(self, wanted: Array) -> Array:
-        """u with u + G(u) = wanted, G at the shadow."""
+        """u with u + G(u) = wanted, G at the shadow; wanted itself without a model."""
         loop, gain, self.wanted = self.loop, self.config.gain, wanted
+        if loop is None:
+            return wanted
         q, v = (x[: self.num_envs, self.at] for x in (self.shadow.qpos, self.shadow.qvel))
-        if self.config.inverse == "learned":
-            return loop.answer(q, v, wanted, self.payload_mass)
         return loop.solve(q, v, wanted, self.payload_mass, self.offset, gain, self.config.iterations)
 
     def _observe(self, q: Array, v: Array | None, tau: Array | None) -> None:
@@ -271,8 +301,10 @@ class Compensator:
             limited = np.clip(grown, -config.feedback_limit, config.feedback_limit)
             self.missing = np.where(seen[:, None], missing, self.missing)
             self.integral = np.where(seen[:, None], limited, self.integral)
-        if not self.told:
+        if not self.announced:
             self._carry(self.estimate.update(q, v, self.sent, tau, seen))
+        elif self.single and len(self.masses) > 1:
+            self.estimate.update(q, v, self.sent, tau, seen)
 
     def _shadow_qpos(self) -> Array:
         return self.shadow.qpos[: self.num_envs, self.at]
@@ -296,12 +328,16 @@ class Compensator:
         return values.reshape(shape)
 
 
-def _learned_inverse(model: GapModel) -> GapModel:
-    """The network beside a model that inverts it, and no other."""
-    folder = model.path / INVERSE
-    if not folder.is_dir():
-        raise ModelError(f"{model.path} has no learned inverse; make one: gaponet export RUN --to inverse")
-    inverse = GapModel.load(folder)
-    if inverse.card.get("inverse_of") != model.weights_hash():
-        raise ModelError(f"{folder} was learned from other weights; make it anew: gaponet export RUN --to inverse")
-    return inverse
+def _corrected(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
+    """The simulator in which a model is asked: the given one, or that of its training; refuses what cannot be."""
+    model.require_rate(dt)
+    if model.config.delta_hold > 1:
+        raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
+    if model.corrects(robot):
+        return robot
+    if config.aim == "simulator":
+        raise ModelError(
+            f"{model.path}: aim simulator is the simulator trained in, {model.card['simulator']}; for "
+            f"{robot.folder} train there, or give RUN/robot, or aim at the target"
+        )
+    return model.simulator()

@@ -1,4 +1,5 @@
-"""What moving asks for beyond holding: inertia, damping and friction at the targets' velocity and acceleration.
+"""What moving asks for beyond holding: inertia, damping and friction (by the servo's law where it was identified), at
+the targets' velocity and acceleration. A late servo's delay is not led: that overshoots (docs/log.md).
 
 Both come from the last targets, so this is causal; a noise of the targets is amplified by inertia / (kp dt²), which the
 low-pass of the acceleration lessens.
@@ -9,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.robot import RobotSpec
+from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
+from gaponet.sim.servo import friction_limit, present
 
 SPEED, ACCELERATION = 4.0, 40.0  # rad/s, rad/s²: as far as targets are believed; a step of theirs asks for more
 FRICTION_SPEED = 0.05  # rad/s at which three quarters of the friction are fed forward; none where nothing moves
@@ -25,14 +27,14 @@ class Feedforward:
         Args:
             sim: Its present state gives the inertia.
             at: Operated joints among the simulation's.
-            robot: For its velocity feedback.
+            robot: For its velocity feedback and law of friction.
             dt: Control period, s.
             acceleration_time: Low-pass, s.
         """
-        model = next(iter(sim.models.values()))
+        model, op = next(iter(sim.models.values())), robot.operated_index
         self.dt, self.share = dt, min(1.0, dt / max(acceleration_time, dt))
-        self.damping = robot.kd[robot.operated_index] + model.dof_damping[at]
-        self.friction = model.dof_frictionloss[at]
+        self.damping = robot.kd[op] + model.dof_damping[at]
+        self.friction, self.law = model.dof_frictionloss[at], present({name: getattr(robot, name)[op] for name in LAW})
         self.inertia = Inertia(sim.batch, model, at)
 
     def reset(self, target: Array) -> None:
@@ -47,8 +49,9 @@ class Feedforward:
         self.qacc = self.qacc + self.share * (qacc - self.qacc)
         self.target = target.copy()
 
-    def torque(self) -> Array:
-        """N·m, (num, n operated)."""
-        friction = self.friction * np.tanh(self.qvel / FRICTION_SPEED)
+    def torque(self, holding: Array | float = 0.0) -> Array:
+        """N·m, (num, n operated), on top of `holding`, what gravity asks for."""
         inertial = np.einsum("kij,kj->ki", self.inertia.matrix(len(self.qacc)), self.qacc)
-        return inertial + self.damping * self.qvel + friction
+        moving = inertial + self.damping * self.qvel
+        most = friction_limit(self.law, self.friction, self.qvel, holding + moving, holding)
+        return np.asarray(moving + most * np.tanh(self.qvel / FRICTION_SPEED))

@@ -13,8 +13,11 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
+from gaponet.deploy.transfer import Reference
 from gaponet.errors import UsageError, missing_extra
 from gaponet.model.artifact import GapModel
+from gaponet.parts import take
+from gaponet.robot import load_robot
 
 try:
     import gymnasium
@@ -78,13 +81,35 @@ class TrackingEnv(gymnasium.Env):
         return np.concatenate([q, self.sim.qvel[op], *ahead]).astype(np.float32)
 
 
+def tracking(
+    robot: str, model: str | None = None, motions: ListOf[str] = (), payload_mass: float = 0.0, **options: Any
+) -> TrackingEnv:
+    """gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
+
+    Args:
+        robot: Name, or folder with a slash; an identified one is played as identified.
+        model: Run or artifact that aligns; without one the robot is played as it is.
+        motions: Names of motions (gaponet_robots.motion.library); default all.
+        payload_mass: kg in each hand.
+        options: Of TrackingEnv.
+    """
+    spec = load_robot(robot)
+    library = take("PROVIDES", "motions", "a library of motions")(spec, max_payload=payload_mass)
+    references = [library.make(name).sample(spec.dt) for name in motions or library.names()]
+    network = None if model is None else GapModel.load(model)
+    return TrackingEnv(AlignedSim(spec, network, payload_mass), references, **options)
+
+
+gymnasium.register("gaponet/Tracking-v0", entry_point="gaponet.deploy.gym:tracking")
+
+
 class AlignedActions(gymnasium.Wrapper):
     """Any gymnasium environment on MuJoCo (unwrapped.model, .data, .dt) whose actions are targets in rad: aligned."""
 
     def __init__(
-        self, env: gymnasium.Env, model: GapModel, payload_mass: float, prefix: str = "", extrapolate: bool = False
+        self, env: gymnasium.Env, model: Reference, payload_mass: float, prefix: str = "", extrapolate: bool = False
     ) -> None:
-        """Transfers or refuses as deploy.mujoco_loop does."""
+        """Transfers or refuses as deploy.mujoco_loop does; model is an identified robot, or a model on top of one."""
         super().__init__(env)
         scene: Any = env.unwrapped
         self.align = MujocoAligner(model, scene.model, float(scene.dt), payload_mass, prefix, extrapolate)

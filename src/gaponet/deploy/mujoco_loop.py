@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.deploy.transfer import Inverse, Transfer, periods_of
+from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
 from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
+from gaponet.robot import RobotSpec
 from gaponet.robot_folder import keeper, keeps_robot
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Probed, alike
@@ -23,18 +24,18 @@ GAIN_TOLERANCE = 1e-3  # of kp and kd
 class MujocoAligner:
     """ctrl → ctrl + Δa for a model with a position actuator on each operated joint; one MjData, one control period.
 
-    align = MujocoAligner(GapModel.load("run"), mj_model, dt=0.02, payload_mass=3.0)
+    align = MujocoAligner(load_robot("./my_h1_2"), mj_model, dt=0.02, payload_mass=3.0)  # or GapModel.load("run")
     data.ctrl[:] = align(data, target)                    # once per control period
     mujoco.mj_step(mj_model, data, round(0.02 / mj_model.opt.timestep))
 
-    A scene whose robot does not move as in the simulator of training gets the commands that make it do so
-    (deploy/transfer.py): other gains, friction, inertias, actuators, a payload that it does not have. Its base and
-    whatever else is in it are taken as they stand in each period.
+    A scene whose robot does not move as the identified one, or as in the simulator of training, gets the commands that
+    make it do so (deploy/transfer.py): other gains, friction, inertias, actuators, a payload that it does not have. Its
+    base and whatever else is in it are taken as they stand in each period.
     """
 
     def __init__(
         self,
-        model: GapModel,
+        model: Reference,
         mj_model: mujoco.MjModel,
         dt: float,
         payload_mass: float,
@@ -45,8 +46,8 @@ class MujocoAligner:
         """Refuse a scene without the joints trained on, too far from the simulator of training; other rates, payloads.
 
         Args:
-            model: What training made. Where no run or export keeps its simulator, the scene must have the gains trained
-                with.
+            model: The identified robot that the scene is to move like; or what training made, on top of one: where no
+                run or export keeps its simulator, the scene must have the gains trained with.
             mj_model: The compiled scene.
             dt: Control period, s.
             payload_mass: kg in each hand of the robot that the scene is to move like.
@@ -54,25 +55,28 @@ class MujocoAligner:
             extrapolate: Take a payload beyond those trained on, and a scene beyond those measured.
             inverse: How a scene is inverted: in closed form, which needs position actuators, or by answers of copies.
         """
-        model.require_payload(payload_mass, extrapolate)
-        self.payload_mass = payload_mass
+        own = model.card["joint_names"] if isinstance(model, GapModel) else model.operated
+        place = model.path if isinstance(model, GapModel) else model.folder
+        self.payload_mass, self.loop = payload_mass, None
         known = [mj_model.joint(j).name for j in range(mj_model.njnt)]
-        for name in model.card["joint_names"]:
+        for name in own:
             if prefix + name not in known:
                 raise ModelError(
-                    f"{model.path}: corrects joint '{prefix + name}', the scene has {', '.join(known)}; give prefix"
+                    f"{place}: moves joint '{prefix + name}', the scene has {', '.join(known)}; give prefix"
                 )
         self.transfer: Transfer | None = None
         self._stand: Callable[[mujoco.MjData], None] = lambda data: None
-        if not keeps_robot(keeper(model.path)):
-            _require_gains(model, mj_model, prefix)
+        told = Condition(payload_mass, "both", dt)
+        if isinstance(model, GapModel):
+            model.require_payload(payload_mass, extrapolate)
+        if isinstance(model, RobotSpec) or keeps_robot(keeper(model.path)):
+            self._invert(model, mj_model, told, prefix, extrapolate, inverse)
         else:
-            self._invert(model, mj_model, Condition(payload_mass, "both", dt), prefix, extrapolate, inverse)
-        if self.transfer is None:
+            _require_gains(model, mj_model, prefix)
+        if self.transfer is None and isinstance(model, GapModel):
             model.require_rate(dt)
-            told = model.context([Condition(payload_mass, "both", dt)])  # it moves as the simulator of the run
-            self.loop = model.loop(context=told)
-        joints = model.card["joint_names"] if self.transfer is None else self.transfer.joint_names
+            self.loop = model.loop()  # it moves as the simulator of the run
+        joints = own if self.transfer is None else self.transfer.joint_names
         names = [prefix + name for name in joints]
         self.qpos = np.array([mj_model.joint(name).qposadr[0] for name in names])
         self.qvel = np.array([mj_model.joint(name).dofadr[0] for name in names])
@@ -87,12 +91,12 @@ class MujocoAligner:
         """Targets to apply, (nu,) rad, given those asked for; once per control period."""
         out = np.array(ctrl, float)
         q, v, a = data.qpos[None, self.qpos], data.qvel[None, self.qvel], out[None, self.actuator]
-        if self.transfer is None:
+        if self.loop is not None:
             if self._fresh:
                 self.loop.reset()
             self.loop.delta(q, v, a, self.payload_mass)
             out[self.actuator] = self.loop.applied[0]
-        else:
+        elif self.transfer is not None:  # else the scene moves as the robot of itself
             if self._fresh:
                 self.transfer.reset(slice(None), q, v, a[:, None])
             self._stand(data)
@@ -101,10 +105,10 @@ class MujocoAligner:
         return out
 
     def _invert(
-        self, model: GapModel, scene: mujoco.MjModel, told: Condition, prefix: str, extrapolate: bool, how: Inverse
+        self, model: Reference, scene: mujoco.MjModel, told: Condition, prefix: str, extrapolate: bool, how: Inverse
     ) -> None:
-        """Transfer, unless the scene moves as the simulator that the model was trained in."""
-        robot = model.simulator()
+        """Transfer, unless the scene moves as the robot, or as the simulator that the model was trained in."""
+        robot = model.simulator() if isinstance(model, GapModel) else model
         driven = {scene.joint(j).name for j in scene.actuator_trnid[:, 0]}
         locked = tuple(name for name in robot.joint_names if prefix + name not in driven)
         reference = BatchSim(robot, [told], 1, locked)
@@ -112,7 +116,8 @@ class MujocoAligner:
         inverse: ClosedForm | Probed
         if how == "closed":
             inverse = of_scene(scene, joints, told.dt)
-            if periods_of(model, told.dt) == 1 and alike(inverse, ClosedForm.of(reference), reference.range):
+            as_is = periods_of(model, told.dt) == 1 if isinstance(model, GapModel) else not robot.has_law
+            if as_is and alike(inverse, ClosedForm.of(reference), reference.range):
                 return
             self._stand = inverse.stand
         else:

@@ -74,7 +74,7 @@ class Transfer:
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.every = 1 if model is None else max(periods_of(model, c.dt) for c in dict.fromkeys(conditions))
-        self.loop = None if model is None else model.loop(self.num_envs, model.context(conditions))
+        self.loop = None if model is None else model.loop(self.num_envs)
         self.payload_mass = np.array([c.payload_mass for c in conditions])
         self._delta = np.zeros((self.num_envs, len(self.op)))
         self._offset = np.zeros((self.num_envs, sim.n))  # of the last command from where the joint was, rad

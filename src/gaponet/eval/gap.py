@@ -1,4 +1,5 @@
-"""Where the gap comes from: what each step from the nominal simulator to the trained model removes, and the floor."""
+"""Where the gap comes from: what each step from the nominal simulator to the identified one, and to a model on top of
+it, removes; and the floor."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,10 @@ from gaponet.data.repeatability import Repetitions, periods, summary
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.eval.evaluate import choose, corrected_robot
+from gaponet.eval.candidate import Candidate, choose
 from gaponet.metrics import Run, metrics, runs, standard_error
-from gaponet.model.artifact import GapModel
+from gaponet.metrics import summary as errors_of
 from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.plot.methods import method
 from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.kept import nominal_of
@@ -30,40 +29,41 @@ from gaponet.sim.replay import Corrector, replay
 
 
 def gap_by_step(
-    run: Path,
+    one: Candidate,
     dataset: Dataset,
-    robot: RobotSpec,
     motions: tuple[str, ...] = (),
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Mean |error| left after each step, in free run over whole motions that the run never saw.
+    """Mean |error| left after each step, in free run over whole motions that the robot folder or the run never saw.
 
-    Steps: nominal; delay (fitted on the training motions); offset (delay and offset); where the run starts from an
-    identified simulator its CAUSES, one after the other, and that friction holds ("creep": "friction" itself creeps as
-    MuJoCo's does); the run's model. Standard errors are over motions, of what a step removes motion by motion (paired);
+    Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset); of an identified
+    simulator its CAUSES, one after the other, and that friction holds ("creep": "friction" itself creeps as MuJoCo's
+    does); of a run, its model. Standard errors are over motions, of what a step removes motion by motion (paired);
     what causes remove depends on their order. "unexplained" is what is left above the floor.
 
     Args:
-        run: Run folder; its split, baseline, simulator and model apply.
-        robot: The dataset's, which must be the one that the run keeps: the baseline is the run's.
+        one: An identified robot, or a run: its recordings, baseline, simulator and model apply.
 
     Returns:
-        {"left": {step: rad}, "removed": {step: [rad, standard error]}, "unexplained": rad, "by_joint": {joint: the same
-        and "floor"}, "by_payload": {kg: {step: rad}}, "floor": {"encoder": rad, "repeatability": rad, "both": rad},
-        …}; a floor that is unknown is None, and so is what is left above it.
+        {"methods": {nominal, identified, …: metrics.summary}, "left": {step: rad}, "removed": {step: [rad, standard
+        error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}},
+        "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; a floor that is unknown is None, and so is
+        what is left above it.
     """
+    robot = one.robot
     dataset.require_robot(robot)
-    simulator = corrected_robot(run, robot)
-    nominal = nominal_of(simulator)
-    model = GapModel.load(run)
-    entries, unseen = choose([run], dataset, motions)
+    nominal = nominal_of(robot)
+    entries, unseen = choose([one.folder], dataset, motions)
     sequences = dataset.sequences(entries)
     steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    fitted = DelayOffset.read(run)
-    only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
-    steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
-    steps += [(cause, physics, None) for cause, physics in causes(simulator)]
-    steps.append((method(model.config.kind, simulator), simulator, model.corrector(simulator)))
+    if one.model is not None:
+        fitted = DelayOffset.read(one.folder)
+        only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
+        steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
+    found = causes(robot)
+    steps += [(cause, physics, None) for cause, physics in found]
+    if one.model is not None:
+        steps.append((one.method, robot, one.corrector()))
     done = {}
     for name, physics, corrector in steps:
         told = noted(progress, name)
@@ -76,7 +76,10 @@ def gap_by_step(
     floors = floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
     floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
     last = list(done)[-1]
+    methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
+    methods |= ({"identified": found[-1][0]} if found else {}) | ({one.method: last} if one.model is not None else {})
     return {
+        "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
         "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
         "removed": removed(done),
         "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
@@ -99,6 +102,10 @@ def gap_by_step(
         "virtual": any(s.meta.virtual for s in sequences),
         "unseen": unseen,
         "sequences": len(sequences),
+        "hours": sum(e.rows * e.dt for e in entries) / 3600,
+        "simulator_hash": model_hash(nominal),
+        "simulators": {"nominal": model_hash(nominal)}
+        | ({"identified": model_hash(robot)} if found else {}),
         "dataset": dataset.path.name,
         "robot": robot.name,
     }  # fmt: skip

@@ -11,7 +11,7 @@ from typing_extensions import TypedDict
 
 from gaponet.arrays import Array
 from gaponet.errors import ModelError
-from gaponet.plot.methods import IDENTIFIED, METHODS
+from gaponet.methods import IDENTIFIED, METHODS
 from gaponet.structure import Count, Json, Number, parse_json, read_json, read_npz
 
 MEND = "give a complete run folder of gaponet train, or evaluate again"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gaponet.plot.methods import title
-from gaponet.plot.table import Table
+from gaponet.methods import title
+from gaponet.spread import Table
 
 
 def mrad(value: float | None) -> str:

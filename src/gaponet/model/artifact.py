@@ -18,7 +18,6 @@ from typing_extensions import TypedDict
 from gaponet.arrays import Array
 from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError, UsageError
-from gaponet.family.draw import Family
 from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
 from gaponet.model.config import ModelConfig
@@ -26,13 +25,17 @@ from gaponet.model.corrector import DeltaCorrector
 from gaponet.model.loop import DeltaLoop
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import keeper, keeps_robot, kept_robot
-from gaponet.structure import Json, Name, Number, read_format, read_json, validated
+from gaponet.structure import Json, Name, Number, Sha256, read_format, read_json, validated
 
 if TYPE_CHECKING:
-    from gaponet.sim.batch import Condition
+    pass
 
 WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
 RECORDED_TOLERANCE = 0.02  # relative, of gains
+# Switches of earlier versions that cards still name, and the value that they would have today.
+RETIRED = {
+    "payload_trunk": True, "payload_predictor": True, "sensor_hold": 1, "context": "none", "branch": "unstacked",
+}  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 
 
@@ -57,7 +60,6 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
         ],
         "simulator": model_hash(robot),
         "model": asdict(config),
-        "simulator_only": config.asks_simulator,  # a bound to compare with, not for a robot
     } | facts
 
 
@@ -128,7 +130,6 @@ class Card(TypedDict):
     interrupted: NotRequired[bool]
     stages: NotRequired[Stages]
     dataset_hash: NotRequired[str]
-    family: NotRequired[Family | None]
     seed: NotRequired[int]
     hours: NotRequired[float]
     steps: NotRequired[int]
@@ -136,10 +137,10 @@ class Card(TypedDict):
     excess_delay: NotRequired[float]
     parity_rad: NotRequired[float]
     motions: NotRequired[dict[str, tuple[str, ...]]]
-    val_mpjae: NotRequired[dict[Literal["model", "nominal"], Number]]
+    val_mpjae: NotRequired[dict[Literal["model", "nominal", "start"], Number]]
     sensor_r2: NotRequired[SensorR2 | None]
     versions: NotRequired[dict[str, str]]
-    sha256: NotRequired[dict[str, str]]
+    sha256: NotRequired[dict[str, Sha256]]
 
 
 def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
@@ -151,6 +152,11 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     mend = "restore it or train again"
     read_format(Card, file, FORMAT, ModelError, mend)
     card = read_json(dict[str, Any], file, ModelError, mend)
+    for field, value in RETIRED.items():
+        if (had := card["model"].pop(field, value)) != value:
+            raise ModelError(f"{file}: trained with {field} {had}, which gaponet has no more; train again without it")
+    if card.pop("family", None):
+        raise ModelError(f"{file}: trained in a family of simulators, which gaponet has no more; see gaponet.Transfer")
     config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
     n = len(card["joint_names"])
     lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
@@ -224,48 +230,15 @@ class GapModel:
         limits = self.card.get("qpos_range", [[None, None]] * len(self.card["joint_names"]))
         return np.array([[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits])
 
-    def loop(self, num_envs: int = 1, context: Array | None = None) -> DeltaLoop:
+    def loop(self, num_envs: int = 1) -> DeltaLoop:
         """The corrections of num_envs robots, with a past of their own: loop.delta(qpos, qvel, ctrl, payload_mass).
 
         Joints are those of the card (joint_names), in that order.
-
-        Args:
-            num_envs: How many.
-            context: Which simulators they are, as `context` says, for a model that is told.
-
-        Raises:
-            ModelError: The model asks the simulator, or is told which it is; a control loop has none.
         """
-        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer, context=context)
-
-    @property
-    def family(self) -> Family | None:
-        """The family of simulators that it was trained in, if any."""
-        told = self.card.get("family")
-        return validated(Family, told, self.path / CARD, ModelError) if told else None
-
-    def context(self, conditions: list[Condition], robot: RobotSpec | None = None) -> Array | None:
-        """What the model is told of simulators, (num, n · context_dim); None where it is told nothing.
-
-        Args:
-            conditions: What they carry, and the control period.
-            robot: The simulator; default the nominal one of its run.
-        """
-        from gaponet.family.context import context
-
-        if self.config.context == "none":
-            return None
-        reference = self.simulator()
-        nominal = reference.nominal or reference
-        return context(self.config.context, nominal, reference if robot is None else robot, conditions)
+        return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
     def corrects(self, robot: RobotSpec) -> bool:
-        """Whether this is the simulator that it was trained in, or one of its family; refuses another robot."""
-        return not self._stranger(robot)
-
-    def _stranger(self, robot: RobotSpec) -> str:
-        """Why a simulator is none that the model was trained in; "" where it is."""
-        from gaponet.family.context import outside
+        """Whether this is the simulator that it was trained in; refuses another robot."""
         from gaponet.sim.model import model_hash
 
         card = self.card
@@ -274,22 +247,18 @@ class GapModel:
                 f"{self.path}: made for {card['robot']} with joints {', '.join(card['joint_names'])}; "
                 f"this is {robot.name} with {', '.join(robot.operated)}. Use the robot the model was trained for"
             )
-        if card["simulator"] == model_hash(robot):
-            return ""
-        family = self.family
-        if family is None or not keeps_robot(keeper(self.path)):
-            return "MJCF, gains or limits differ, or it is of before friction held"
-        return outside(family, self.simulator(), robot)
+        return bool(card["simulator"] == model_hash(robot))
 
     def require(self, robot: RobotSpec, dt: float | None = None) -> None:
         """Refuse a robot, simulator, gains or rate the model was not trained on."""
         from gaponet.sim.model import model_hash
 
-        if why := self._stranger(robot):
+        if not self.corrects(robot):
             trained, asked = self.card["simulator"], model_hash(robot)
             raise ModelError(
                 f"{self.path}: trained in simulator {trained}, but robot '{robot.name}' in {robot.folder} is {asked} "
-                f"({why}); use the robot folder that the run keeps, or train again"
+                "(MJCF, gains or limits differ, or it is of before friction held); use the robot folder that the run "
+                "keeps, or train again"
             )
         if dt is not None:
             self.require_rate(dt)
@@ -353,13 +322,7 @@ class GapModel:
     def corrector(self, robot: RobotSpec) -> DeltaCorrector:
         """The corrections for sim.replay and AlignedSim; refuses a robot the model was not trained on."""
         self.require(robot)
-        points = None
-        if self.config.learns_points:
-            points, n = OnnxNetwork(self.path / WEIGHTS, output="offsets"), len(self.card["joint_names"])
-            shape = (self.config.num_probes, n)
-            require_answer(points, self.config.input_dim(n), shape, self.config.probe_large, self.path / WEIGHTS)
-        told = lambda conditions: self.context(conditions, robot)  # noqa: E731
-        return DeltaCorrector(self.infer, self.config, robot, points, told)
+        return DeltaCorrector(self.infer, self.config, robot)
 
     def weights_hash(self) -> str:
         """First 12 hex digits of the SHA-256 of model.onnx."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,9 +14,11 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.errors import ModelError
 from gaponet.model.fused import FusedForward, read_weights
+from gaponet.process.sandbox import inside
 
 ROWS, ROWS_SHARED = 64, 256  # of a batch at once, by one thread and by several: what lies between layers stays in cache
 Backend = Literal["onnxruntime", "numpy"]
+TRUSTED: set[str] = set()  # hashes of the ONNX files that were written by this process, or tried
 
 
 @dataclass(frozen=True)
@@ -55,11 +58,35 @@ class FunctionNetwork:
         return Bound(x, delta, run)
 
 
+def require_tried(path: Path) -> None:
+    """Refuse an ONNX file that does not answer in the sandbox; each content is tried once in a process.
+
+    Raises:
+        ModelError: No ONNX file, or it takes a gigabyte, or for ever: a network of kilobytes can.
+    """
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if digest not in TRUSTED:
+        _try(path)
+        TRUSTED.add(digest)
+
+
+@inside(ModelError, "onnxruntime")
+def _try(path: Path) -> None:
+    network = OnnxNetwork(path, trusted=True)
+    for answer in network.session.get_outputs():
+        network.output = answer.name
+        for x in (0.0, 1.0, -1.0):
+            network(np.full((2, network.session.get_inputs()[0].shape[1]), x, np.float32))
+
+
 class OnnxNetwork:
     """An ONNX file on onnxruntime."""
 
-    def __init__(self, path: Path, threads: int = 1, output: str = "delta") -> None:
-        """threads 0 uses all cores; one is quickest for one robot. Models with learned points also have "offsets"."""
+    def __init__(self, path: Path, threads: int = 1, output: str = "delta", trusted: bool = False) -> None:
+        """threads 0 uses all cores; one is quickest for one robot. Models with learned points also have "offsets".
+
+        A file that is not `trusted` is tried first (require_tried).
+        """
         self.output = output
         try:
             import onnxruntime as ort
@@ -67,6 +94,8 @@ class OnnxNetwork:
             raise ModelError(
                 "onnxruntime is not installed; run: pip install 'gaponet[deploy]', or load with backend='numpy'"
             ) from None
+        if not trusted:
+            require_tried(path)
         options = ort.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3

@@ -24,7 +24,9 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.files import writing
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.refit import WINDOW, refit
+from gaponet.sim.free_runs import Prior
+from gaponet.sim.refit import WINDOW, Refitted, refit
+from gaponet.sim.replay import Corrector
 from gaponet.structure import read_json
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
@@ -91,27 +93,50 @@ def calibrate(
         unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
         progress: Called with evaluations done, at most, RMS error in rad.
     """
-    units = sorted({s.meta.unit_id for s in sequences})
-    if len(units) != 1:
-        raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
-    payloads = sorted({s.meta.payload_mass for s in sequences})
-    if unknown_payload and len(payloads) > 1:
-        raise UsageError(
-            f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
-            "one and the same: give recordings of one mass"
-        )
-    found = refit(
-        sequences, simulator, max(1, round(seconds / WINDOW)), FIELDS, model.corrector(simulator), PRIOR, EVALUATIONS,
-        unknown_payload, progress=progress,
-    )  # fmt: skip
+    unit = one_unit(sequences)
+    found = fit(simulator, sequences, seconds, unknown_payload, model.corrector(simulator), progress)
     servos = {
         j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
         for j in simulator.operated
     }
     logs = tuple(s.content_hash() for s in sequences)
     return Calibration(
-        units[0], model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
+        unit, model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
         found.payload_std,
+    )  # fmt: skip
+
+
+def one_unit(sequences: ListOf[Sequence]) -> str:
+    """The unit whose recordings these are."""
+    units = sorted({s.meta.unit_id for s in sequences})
+    if len(units) != 1:
+        raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
+    return units[0]
+
+
+def fit(
+    simulator: RobotSpec,
+    sequences: ListOf[Sequence],
+    seconds: float,
+    unknown_payload: bool = False,
+    corrector: Corrector | None = None,
+    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+    believed: bool = True,
+) -> Refitted:
+    """Fit one unit's parameters near a simulator's own, with a correction or without; arguments as of `calibrate`.
+
+    believed: whether kd is what the servos have.
+    """
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    if unknown_payload and len(payloads) > 1:
+        raise UsageError(
+            f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
+            "one and the same: give recordings of one mass"
+        )
+    prior = Prior(simulator, dict.fromkeys(FIELDS, PRIOR))
+    return refit(
+        sequences, simulator, max(1, round(seconds / WINDOW)), FIELDS, corrector, prior, EVALUATIONS,
+        unknown_payload, progress=progress, believed=believed,
     )  # fmt: skip
 
 

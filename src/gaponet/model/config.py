@@ -11,11 +11,10 @@ from gaponet.errors import UsageError
 
 Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "fno", "inverse"]
 OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
-CONTEXT = {"none": 0, "parameters": 7, "fingerprint": 36}  # numbers per joint (family/context.py)
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
-    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max", "delta_hold", "sensor_hold",
+    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max", "delta_hold",
     "transformer_width", "transformer_layers", "transformer_heads", "fno_width", "fno_layers", "fno_modes",
 )  # fmt: skip
 
@@ -36,10 +35,6 @@ class ModelConfig:
     """Control periods between past frames."""
     payload_input: bool = True
     """Whether the payload mass is observed."""
-    payload_trunk: bool = True
-    """Whether the trunk is asked at the payload as well as at the action, where it is observed."""
-    payload_predictor: bool = True
-    """Whether the sensor predictor sees the payload, where it is observed."""
     payload_max: Annotated[float, Interval(gt=0, le=100)] = 3.0
     """Mass that counts as 1 at the input, kg."""
     delta_max: Annotated[float, Interval(gt=0, le=10)] = 0.3
@@ -52,26 +47,16 @@ class ModelConfig:
     """Probe that reads gains and friction, rad."""
     probe_large: Annotated[float, Interval(ge=0, le=10)] = 0.4
     """Probe that reads inertia, payload and saturation, rad."""
-    sensors: Literal["predicted", "oracle", "learned", "off"] = "predicted"
-    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only. oracle: the
-    simulator itself is asked at every state. learned: it is asked at targets that a network chooses. The last two need
-    the simulator's whole state and m more simulations: to compare with, of no use on a robot."""
+    sensors: Literal["predicted", "off"] = "predicted"
+    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only."""
     sensor_target: Literal["delta", "absolute"] = "delta"
     """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
-    sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
-    """Control periods that the sensors are held; predicted ones stay those of the observation at the last refresh. With
-    delta_hold they are refreshed at the next decision."""
-    context: Literal["none", "parameters", "fingerprint"] = "none"
-    """What the branch is told of the simulator it is in, where --family draws many. parameters: its numbers.
-    fingerprint: its answers to a few steps, asked once. With either, a model is for simulators, not for a robot."""
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""
     coupling: Literal["joint", "full"] = "joint"
     """joint: branch and trunk are shared by the joints and take one joint at a time; postures never recorded do not
     lead them astray (docs/log.md). full: the paper's, every joint sees every joint. The mlp is always full."""
-    branch: Literal["unstacked", "stacked"] = "unstacked"
-    """unstacked: one branch net emits all p features. stacked: p nets of the same hidden layers emit one each."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
@@ -107,10 +92,6 @@ class ModelConfig:
             )
         if self.kind == "shared_mlp" and self.coupling == "full":
             raise UsageError("shared_mlp takes one joint at a time; with full coupling the plain network is mlp")
-        if self.context != "none" and not self.joint_wise:
-            raise UsageError(
-                f"context {self.context} is told one joint at a time: to gaponet or shared_mlp, not {self.kind}"
-            )
         if self.transformer_width % self.transformer_heads:
             raise UsageError(
                 f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
@@ -130,27 +111,6 @@ class ModelConfig:
         """m probes, each answered by n positions and n velocities."""
         return self.num_probes * 2 * n
 
-    @property
-    def context_dim(self) -> int:
-        """Numbers per joint that say which simulator it is."""
-        return CONTEXT[self.context]
-
-    @property
-    def asks_simulator(self) -> bool:
-        """Whether the sensors are the simulator's own answers, a part of x."""
-        return self.kind in OPERATORS and self.sensors in ("oracle", "learned")
-
-    @property
-    def learns_points(self) -> bool:
-        """Whether a network chooses where the simulator is asked."""
-        return self.asks_simulator and self.sensors == "learned"
-
-    @property
-    def keeps_observation(self) -> bool:
-        """Whether x carries the observation of the last refresh, for what the sensors are predicted or chosen from."""
-        return self.kind in OPERATORS and self.sensors in ("predicted", "learned") and self.sensor_hold > 1
-
     def input_dim(self, n: int) -> int:
-        """Numbers in x = [o_t | a_t | o_refresh or S_t | context, where there is one]."""
-        more = self.observation_dim(n) * self.keeps_observation + self.sensor_dim(n) * self.asks_simulator
-        return self.observation_dim(n) + n + more + self.context_dim * n
+        """Numbers in x = [o_t | a_t]."""
+        return self.observation_dim(n) + n

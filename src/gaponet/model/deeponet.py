@@ -15,7 +15,6 @@ from gaponet.model.baselines.transformer import DeltaTransformer
 from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, Standardise, dense, size
 from gaponet.model.observation import Layout
-from gaponet.model.points import ProbePoints, Surrogate
 
 
 class SensorPredictor(nn.Module):
@@ -24,7 +23,7 @@ class SensorPredictor(nn.Module):
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
         at = Layout(config, n)
-        self.seen = at.observation if config.payload_predictor else slice(0, at.past.stop)  # the payload comes last
+        self.seen = at.observation
         self.outputs = Standardise(config.sensor_dim(n))
         self.net = dense(self.seen.stop, config.sensor_hidden, 2 * config.sensor_dim(n))
 
@@ -40,18 +39,6 @@ class SensorPredictor(nn.Module):
         return linear(hidden(features[:, self.seen]), head.weight.chunk(2)[0], head.bias.chunk(2)[0])
 
 
-class Stacked(nn.Module):
-    """p nets that emit one feature of every joint each, where one net would emit p (Lu et al. 2021)."""
-
-    def __init__(self, nets: list[nn.Sequential]) -> None:
-        super().__init__()
-        self.nets = nn.ModuleList(nets)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(…, inputs) → (…, outputs of one net, p)."""
-        return torch.stack([net(x) for net in self.nets], dim=-1)
-
-
 class OperatorNet(DeltaNet):
     """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), a DeepONet.
 
@@ -65,26 +52,14 @@ class OperatorNet(DeltaNet):
         super().__init__(config, n)
         if config.sensors == "predicted":
             self.predictor = SensorPredictor(config, n)
-        elif config.sensors == "learned":
-            self.predictor, self.points = Surrogate(config, n), ProbePoints(config, n)
-        elif config.sensors == "oracle":
-            self.answers = Standardise(config.sensor_dim(n))
-        if config.context_dim:
-            self.context = Standardise(config.context_dim * n)
         self.sees_observation = config.branch_history or config.sensors == "off"
-        self.asks_payload = config.payload_input and config.payload_trunk
         self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)
         sensed, seen, asked = self.input_dims(config, n)
         outputs = config.num_basis * (1 if self.per_joint else n)
         inputs = sensed * (config.sensors != "off") + seen * self.sees_observation + n * self.per_joint
-        inputs += config.context_dim
         self.branch_inputs = inputs
-        if config.branch == "stacked":
-            nets = [dense(inputs, config.branch_hidden, outputs // config.num_basis) for _ in range(config.num_basis)]
-            self.branch: nn.Module = Stacked(nets)
-        else:
-            self.branch = dense(inputs, config.branch_hidden, outputs)
+        self.branch: nn.Module = dense(inputs, config.branch_hidden, outputs)
         self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
         # Supervised fitting samples the predictor (sample_sensors), so that the branch does not trust a number that the
@@ -94,27 +69,16 @@ class OperatorNet(DeltaNet):
     @staticmethod
     def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
         """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
-        payload, asked = int(config.payload_input), int(config.payload_input and config.payload_trunk)
+        payload = int(config.payload_input)
         if config.joint_wise:
-            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + asked
-        return config.sensor_dim(n), config.observation_dim(n), 2 * n + asked
-
-    def fit_inputs(self, x: Tensor) -> None:
-        """Statistics of the features, of answers where the simulator is asked at fixed targets, and of which it is."""
-        super().fit_inputs(x)
-        if self.config.sensors == "oracle":
-            self.answers.fit(x[:, self.features.layout.answers], floor=1e-6)
-        if self.config.context_dim:
-            self.context.fit(x[:, self.features.layout.context], floor=1e-5)
+            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + payload
+        return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
 
     def prepare(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t | more], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
+        """x = [o_t | a_t], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
         z = self.features(x)
-        sensors = self.sensors(x, z) if self.config.sensors != "off" else None
+        sensors = self.sensors(z) if self.config.sensors != "off" else None
         see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
-        if self.config.context_dim:
-            told = self.context(x[:, self.features.layout.context]).clamp(-5.0, 5.0)
-            see = torch.cat([see, told.reshape(-1, self.n, self.config.context_dim)], dim=-1)
         return torch.cat([see, ask], dim=-1)
 
     def correct(self, prepared: Tensor) -> Tensor:
@@ -125,32 +89,18 @@ class OperatorNet(DeltaNet):
         branch, trunk = self.branch(see).reshape(shape), self.trunk(ask).reshape(shape)
         return self.bounded((branch * trunk).sum(-1) + self.bias)
 
-    def sensors(self, x: Tensor, z: Tensor) -> Tensor:
+    def sensors(self, z: Tensor) -> Tensor:
         """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
-        answers = x[:, self.features.layout.answers]
-        if self.config.sensors == "oracle":
-            return self.answers(answers).clamp(-5.0, 5.0)
-        refreshed = self.features.at_refresh(x) if self.config.keeps_observation else z
-        if self.config.sensors == "learned":
-            if not self.sample_sensors:
-                each = answers.reshape(-1, self.config.num_probes, 2 * self.n)
-                return self.predictor.outputs(each).clamp(-5.0, 5.0).flatten(1)
-            mean, log_var = (y.flatten(1) for y in self.predictor(refreshed, self.points(refreshed)))
-        elif not self.sample_sensors:
-            return self.predictor.mean(refreshed)
-        else:
-            mean, log_var = self.predictor(refreshed)
+        if not self.sample_sensors:
+            return self.predictor.mean(z)
+        mean, log_var = self.predictor(z)
         return mean + torch.randn_like(mean) * (0.5 * log_var).exp()
-
-    def offsets(self, x: Tensor) -> Tensor:
-        """Where learned points ask the simulator, relative to q_t, (B, m, n) rad."""
-        return self.points(self.features.at_refresh(x) if self.config.keeps_observation else self.features(x))
 
     def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self.features.layout
         see = ([] if sensors is None else [sensors]) + ([z[:, at.observation]] if self.sees_observation else [])
         # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
-        ask = [z[:, at.q], z[:, at.action]] + ([z[:, at.payload]] if self.asks_payload else [])
+        ask = [z[:, at.q], z[:, at.action]] + ([z[:, at.payload]] if self.config.payload_input else [])
         return torch.cat(see, dim=1), torch.cat(ask, dim=1)
 
     def _joint_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -162,7 +112,7 @@ class OperatorNet(DeltaNet):
             see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
         if self.sees_observation:
             see += [self.features.joint_wise(z), *payload]
-        ask = [which, z[:, at.action].unsqueeze(2), *(payload if self.asks_payload else [])]
+        ask = [which, z[:, at.action].unsqueeze(2), *payload]
         return torch.cat(see, dim=2), torch.cat(ask, dim=2)
 
 

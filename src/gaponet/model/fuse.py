@@ -31,11 +31,6 @@ def fuse(net: nn.Module) -> dict[str, Array] | None:
 
 def _plain(net: OperatorNet) -> bool:
     """Whether the operator is made of the parts that this file knows, and of nothing else."""
-    c = net.config
-    if c.branch != "unstacked" or c.asks_simulator or c.keeps_observation or c.context_dim:
-        return False
-    if c.payload_input and not (c.payload_trunk and c.payload_predictor):
-        return False
     parts = {name.split(".")[0] for name in net.state_dict()}
     return parts <= {"features", "predictor", "branch", "trunk", "bias", "bounded", "net"}
 

@@ -69,24 +69,15 @@ class Features(nn.Module):
 
     def relative(self, x: Tensor) -> Tensor:
         """(B, dim of x) → (B, dim): positions and targets of the past, and a_t, minus q_t."""
-        at = self.layout
-        return self._relative(x[:, at.observation], x[:, at.action])
-
-    def _relative(self, o: Tensor, action: Tensor) -> Tensor:
         n, at = self.n, self.layout
-        q = o[:, at.q]
+        o, q = x[:, at.observation], x[:, at.q]
         frames = o[:, at.past].reshape(-1, self.history, 3, n)
         shift = torch.stack([q, torch.zeros_like(q), q], dim=1).unsqueeze(1)  # (B, 1, 3, n)
-        return torch.cat([o[:, at.state], (frames - shift).flatten(1), o[:, at.payload], action - q], dim=1)
+        return torch.cat([o[:, at.state], (frames - shift).flatten(1), o[:, at.payload], x[:, at.action] - q], dim=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
         return self.standardise(self.relative(x)).clamp(-5.0, 5.0)
-
-    def at_refresh(self, x: Tensor) -> Tensor:
-        """The features as they were when the sensors were last refreshed; the action's columns mean nothing."""
-        relative = self._relative(x[:, self.layout.refresh], x[:, self.layout.action])
-        return self.standardise(relative).clamp(-5.0, 5.0)
 
     def joint_wise(self, z: Tensor) -> Tensor:
         """State and past of each joint, (B, dim) → (B, n, 2 + 3H)."""
@@ -111,7 +102,7 @@ class Bounded(nn.Module):
 
 
 class DeltaNet(nn.Module):
-    """A network that corrects: x = [o_t | a_t | more] → Δa, (B, n) rad, within ±Δ_max.
+    """A network that corrects: x = [o_t | a_t] → Δa, (B, n) rad, within ±Δ_max.
 
     In two parts: `prepare`, which PPO leaves as it is and therefore does once for each sample, and `correct`.
     """

@@ -3,9 +3,7 @@
 o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
-x = [ o_t | a_t | o_r | S_t | c ] is what a network is given: o_r, the observation of the last sensor refresh, where
-sensors are predicted and held; S_t, the simulator's answers to the probes, where it is asked; c, which simulator it is,
-joint by joint, where many were trained in. Most models have none of them.
+x = [ o_t | a_t ] is what a network is given.
 """
 
 from __future__ import annotations
@@ -20,17 +18,14 @@ from gaponet.model.config import ModelConfig
 
 
 class Layout:
-    """Where in x things are, as slices of its columns; [o_t | a_t] of a network's features has the same places."""
+    """Where in x things are, as slices of its columns; a network's features have the same places."""
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n,
-                 o * config.keeps_observation, config.sensor_dim(n) * config.asks_simulator,
-                 config.context_dim * n)  # fmt: skip
-        self.q, self.v, self.past, self.payload, self.action, self.refresh, self.answers, self.context = (
-            slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0))
-        )
+        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n)
+        places = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
+        self.q, self.v, self.past, self.payload, self.action = places
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 

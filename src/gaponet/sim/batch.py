@@ -131,6 +131,7 @@ class BatchSim:
         first = self.models[conditions[0]]
         stiffer = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._stiffer = np.array([stiffer[c] for c in conditions])
+        self._kd = np.array([robots[c].kd for c in conditions])
         self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
@@ -204,7 +205,7 @@ class BatchSim:
         Args:
             joints: k names.
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of zero, delay (up to
-                the robot's) and LAW, each (num_envs, k).
+                the robot's) and LAW, each (num_envs, k). A damping below zero takes from the servo's own kd.
         """
         model, batch = next(iter(self.models.values())), self.batch
         dof = np.array([model.joint(j).dofadr[0] for j in joints])
@@ -213,7 +214,10 @@ class BatchSim:
         kp = values["kp"] * self._stiffer[:, self.robot.index(joints)]
         gain[:, act, 0], bias[:, act, 1] = kp, -kp
         bias[:, act, 0] = kp * values["offset"]
-        for name in ("damping", "frictionloss", "armature"):
+        kd = self._kd[:, self.robot.index(joints)]
+        bias[:, act, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
+        batch.expand("dof_damping")[:, dof] = np.maximum(values["damping"], 0.0)
+        for name in ("frictionloss", "armature"):
             batch.expand(f"dof_{name}")[:, dof] = values[name]
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, act] = values["delay"]

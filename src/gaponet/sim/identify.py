@@ -1,49 +1,51 @@
 """System identification: the servo parameters with which the simulator, running free, follows the recordings best.
 
-Per operated joint: gain, damping, dry friction, armature, zero offset, command delay; then, each only where it lowers
-the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). Fitted on windows of 8 s,
-every joint on its own beside the recording (sim/joint_runs.py), by least squares from several starts
-(sim/multistart.py); then what the robot touches, in the simulator of the whole robot (sim/touching.py).
+Per operated joint: kp, total damping, dry friction, armature, zero offset, command delay; then, each only where it
+lowers the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). First every joint on
+its own beside the recording (sim/joint_runs.py), from several starts; then all of them together in the simulator of the
+whole robot (sim/free_runs.py), from there and from the robot's file: least squares both times (sim/multistart.py).
+Validation motions choose among the given robot and what was found on the way; last comes what the robot touches
+(sim/touching.py).
 """
 
 from __future__ import annotations
 
-import itertools
+import time
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import encoder_step
 from gaponet.metrics import standard_error
 from gaponet.robot import LAW, RobotSpec
+from gaponet.sim.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
+from gaponet.sim.free_runs import FreeRuns
 from gaponet.sim.joint_runs import SOFT, JointRuns
-from gaponet.sim.model import build_model
-from gaponet.sim.multistart import better_half, descend
+from gaponet.sim.multistart import better_half, descend, slopes
 from gaponet.sim.refit import cut
-from gaponet.sim.shared import ITERATIONS as SHARED_ITERATIONS
+from gaponet.sim.replay import replay
 from gaponet.sim.shared import far_from_published, same_servos, share
-from gaponet.sim.touching import GENERATIONS as TABLE_GENERATIONS
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 from gaponet.text import measured
 
 Array = np.ndarray
-Values = dict[str, Array]  # field → (n,) of the operated joints
 Std = dict[str, dict[str, float]]  # joint → field → standard error
 
-WINDOWS = 40
+WINDOWS, WHOLE = 40, 8  # windows of joints on their own, and of the whole robot
 STARTS, SPREAD = 4, 2.0  # of each search, and how far apart in the parameters' scales
 SHORT = 0.5  # s: a search begins with runs so short
 SEARCH = (10, 8, 15)  # iterations: of all starts on short runs, of all on whole windows, of the better half
-FIRST_DELAY = 0.02  # s: a delay of zero hides what it does
-MAX_DELAY = 0.15  # s
-AGAIN, AGAIN_STEPS, BESIDE = 8, 6, 1.0  # fits for the standard errors, their iterations, how far beside they begin
+TOGETHER = (2, 6)  # iterations of the whole robot: from both starts, from the better one
+ENOUGH = 2e-3  # of the whole robot's cost: a fall that is worth another iteration
+POLISH = 2  # iterations of the whole robot with a term of the law
+CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
-PRICES = {"kp": 2e-3, "armature": 2e-4}  # of e times the given one: both trade against all the others
-CLASSIC = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
+BELIEF = {"kp": 0.5, "armature": 1.5}  # standard deviation of the logarithm of a file's value
+TOLD = 0.1  # the same of a kp that recordings state
+BETTER = 0.99  # of the given robot's error: less is an improvement
+PARTS = {"joints": 0.3, "whole": 0.4}  # of a budget; terms of the law share what is left
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
     "load": ("friction_motor",),
@@ -53,16 +55,23 @@ TERMS: dict[str, tuple[str, ...]] = {
     "encoder": ("encoder_step",),
 }
 DEFAULT_TERMS = ("stribeck", "load")
-# The search's axes: what a motion shows is a torque over kp, whatever kp is.
-LOGARITHM = ("kp", "stribeck_speed")
-OVER_KP = ("damping", "frictionloss", "armature", "stribeck", "min_torque", "effort_limit")
+ALONE = ("effort_limit", "encoder_step")  # fields that only joints on their own are searched for
+CHECK = {
+    "kp": "check its unit (N·m/rad) and the payload that was told",
+    "damping": "check kp's unit, and that commands are positions",
+    "frictionloss": "check kp's unit, and that nothing held the joint",
+    "armature": "check the masses in the MJCF and kp's unit",
+    "offset": "check the joint's zero and its sign",
+    "delay": "check that commands and states have one clock",
+    "effort_limit": "check effort_limit in robot.toml",
+}
 
 Progress = Callable[[float, float, str], None]  # iterations done, in all, what is fitted and its error
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A term of the servo's law, with the errors of the recordings that judged it, (motions,) rad."""
+    """A candidate beside another one, with the errors of the recordings that judged them, (motions,) rad."""
 
     name: str
     before: Array
@@ -86,23 +95,61 @@ class Identified:
     """The fitted robot and what is known about the fit.
 
     Attributes:
-        robot: The same robot with identified parameters.
-        before, after: Mean |error| of the windows, rad, joints on their own.
-        warnings: What the recordings do not determine, or what ended at a bound.
+        robot: The same robot with identified parameters; as it was given where nothing did better.
+        before, after: Mean |error| of the motions that judged, rad: of the given robot, of this one.
+        chosen: What did best: given, joints (each on its own), whole (all together), or mixed.
+        warnings: What ended at a bound, what to look at, and what the recordings do not determine (last).
         std: Joint → field → standard error; none of a shared law.
         tried: The terms of the law in the order tried.
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
+        by_joint: Joint → mean |error| before and after, rad.
     """
 
     robot: RobotSpec
     before: float
     after: float
+    chosen: str
     warnings: tuple[str, ...]
     std: Std
     tried: tuple[Tried, ...]
     touch: Touch | None
     shared: tuple[Tried, ...] = ()
+    by_joint: dict[str, tuple[float, float]] | None = None
+
+    @property
+    def better(self) -> bool:
+        """Whether it is another robot than the given one."""
+        return self.chosen != "given" or bool(self.touch and self.touch.kept)
+
+
+class Clock:
+    """How far a fit is, told with what is fitted; and, where its time is limited, when a search has had its part."""
+
+    def __init__(self, seconds: float | None, iterations: int, progress: Progress) -> None:
+        self.began, self.seconds, self.iterations, self.progress = time.monotonic(), seconds, iterations, progress
+        self.done, self.end = 0, np.inf
+
+    def share(self, part: float, done: int) -> None:
+        """The next search may take this part of the time that is left; so many iterations were before it."""
+        gone = time.monotonic() - self.began
+        self.end = np.inf if self.seconds is None else gone + part * max(self.seconds - gone, 0.0)
+        self.done = done
+
+    def over(self) -> bool:
+        """Whether the present search has had its time."""
+        return time.monotonic() - self.began > self.end
+
+    def tell(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], None]:
+        """To be called in each iteration with every joint's cost, (n,)."""
+
+        def told(cost: Array) -> None:
+            each = 1e3 * SOFT * np.sqrt(2 * cost / np.maximum(rows, 1))
+            note = f"{what}: {each.mean():.2f} mrad, {joints[int(each.argmax())]} {each.max():.2f}"
+            self.done += 1
+            self.progress(min(self.done, self.iterations), self.iterations, note)
+
+        return told
 
 
 def identify(
@@ -115,169 +162,225 @@ def identify(
     shared: bool = False,
     nthread: int = 0,
     progress: Progress = lambda done, total, note: None,
+    budget: float | None = None,
+    stops: bool = False,
 ) -> Identified:
     """Fit the parameters of all operated joints.
 
     Args:
         sequences: Recordings to fit on; validation and test motions stay out.
-        robot: Where to start from; its payloads' masses are taken as true.
-        validation: Recordings that judge the terms; without them every term is kept.
+        robot: Where to start from; its payloads' masses are taken as true, its gains where recordings state them.
+        validation: Recordings that judge; without them the fitted windows do.
         windows: Free runs of 8 s, taken evenly from the recordings.
         terms: Of the servo's law, from TERMS, in the order in which they are tried.
         table: Look for a table under the robot's tips.
         shared: In the end give joints with one type of servo (robot.servos) one law.
-        nthread: Threads for the table, 0 for all cores.
+        nthread: Threads, 0 for all cores.
         progress: Called in each iteration.
+        budget: s that the searches may take (not the table's); without one all iterations are made, and the result
+            is the same on every machine.
+        stops: Give joints that stayed behind several commands a stop there.
     """
-    each, same = sum(SEARCH), same_servos(robot) if shared else {}
-    before_shared = each * (1 + len(terms)) + AGAIN_STEPS
-    before_table = before_shared + SHARED_ITERATIONS * len(same)
-    total = before_table + TABLE_GENERATIONS * bool(table and robot.tips)
-
-    def tell(what: str, done: int) -> Callable[[float], None]:
-        step = itertools.count(done + 1)
-        return lambda error: progress(min(next(step), total), total, f"{what} {error * 1e3:.2f} mrad")
-
-    robot = with_stops(robot, sequences)
+    steps = np.cumsum([sum(SEARCH), sum(TOGETHER), *[sum(SEARCH) + POLISH] * len(terms)]).tolist()
+    clock = Clock(budget, steps[-1], progress)
+    progress(0, clock.iterations, "inertias along the recordings")
+    given, met = robot, with_stops(robot, sequences)
+    robot = met  # for the fit; a stop that nobody confirmed is taken back in the end
     heights = tip_heights(sequences, robot)
     below = touching_below(robot, heights)
+    bounds = Bounds(robot, sequences)
     parts = cut(sequences, windows)
-    fit = Fit(JointRuns(parts, robot, below), robot, sequences)
-    start = fit.start()
-    before = fit.mean_error(start)
-    values = fit.search(CLASSIC, start, tell("servos", 0))
-    judge = JointRuns(list(validation), robot, below) if validation else None
+    fit = Fit(JointRuns(parts, robot, below, nthread), robot, bounds)
+    judge = Judge(list(validation), robot, below, nthread) if validation else Judge(parts, robot, below, nthread)
+
+    clock.share(PARTS["joints"], 0)
+    balanced = fit.runs.regressed()
+    scaled = {f: x * (np.divide(bounds.first["kp"], balanced["kp"], out=np.ones(bounds.n), where=balanced["kp"] > 0)
+                      if f not in ("offset", "delay") else 1.0) for f, x in balanced.items()}  # fmt: skip
+    starts = [
+        {f: np.where(balanced["kp"] > 0, x - bounds.spare * (f == "damping"), bounds.start[f]) for f, x in b.items()}
+        for b in (balanced, scaled)
+    ]
+    alone = fit.search(CLASSIC, bounds.start, clock, "joints, each on its own", starts)
+    whole = fit.whole(nthread)
+    clock.share(PARTS["whole"] / (1 - PARTS["joints"]), steps[0])
+    first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
+    together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
+    chosen, values = judge.best({"given": bounds.first, "joints": alone, "whole": together})
+
     tried = []
-    for i, term in enumerate(terms, 1):
-        richer = fit.with_term(values, term)
-        richer = fit.search(fit.fields_of(richer), richer, tell(term, each * i))
-        if judge is None:
-            values = richer
-            continue
-        tried.append(Tried(term, *(motion_errors(judge, v) for v in (values, richer))))
+    for i, term in enumerate(terms):
+        clock.share(1 / (len(terms) - i + 1), steps[1 + i])
+        base = values if chosen != "given" else together
+        richer = fit.search(TERMS[term], base | {f: bounds.guess[f] for f in TERMS[term]}, clock, term)
+        if not set(TERMS[term]) & set(ALONE):
+            searched = fit.fields_of(richer)
+            x = whole.axes(searched, richer).of(richer)[None]
+            richer = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
+        tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
         if tried[-1].kept:
-            values = richer
-    std = fit.uncertainty(values, tell("standard errors", before_shared - AGAIN_STEPS))
+            chosen, values = "whole" if chosen == "given" else chosen, richer
+    std, over_kp = whole.uncertainty(values)
     common = []
-    for k, (servo, places) in enumerate(same.items()):
-        armature, step = float(fit.first["armature"][places].mean()), before_shared + SHARED_ITERATIONS * k
-        mine = share(fit.runs, values, places, armature, tell(f"one {servo}", step))
-        common.append(Tried(servo, *(motion_errors(judge or fit.runs, v) for v in (values, mine))))
-        values, std = mine, std | {robot.operated[i]: {} for i in places}
-    found = fit.robot(values)
-    touch = None
+    for servo, places in (same_servos(robot) if shared else {}).items():
+        armature = float(bounds.start["armature"][places].mean())
+        mine = share(fit.runs, values, places, armature, lambda error: None)
+        common.append(Tried(servo, judge.errors(values), judge.errors(mine)))
+        values, std, chosen = mine, std | {robot.operated[i]: {} for i in places}, "whole"
+
+    found, touch = fit.robot(values) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
-        touch = fit_table(low, found, lowest, nthread, tell("table", before_table))
+        note = lambda error: progress(clock.iterations, clock.iterations, f"table {error * 1e3:.2f} mrad")  # noqa: E731
+        touch = fit_table(low, found, lowest, nthread, note)
         found = touch.robot
-    doubts = (*fit.doubts(values, std), *far_from_published(found))
-    return Identified(found, before, fit.mean_error(values), doubts, std, tuple(tried), touch, tuple(common))
+    before, after = (judge.by_joint(v) for v in (bounds.first, values))
+    doubts = (
+        *fit.bounds_met(values),
+        *asked_stops(given, met),
+        *far_from_published(found),
+        *fit.undetermined(values, std, over_kp),
+    )
+    if not stops:
+        found = replace(found, stop_low=given.stop_low, stop_high=given.stop_high)
+        found = given if chosen == "given" and not (touch and touch.kept) else found
+    by_joint = {j: (float(a), float(b)) for j, a, b in zip(robot.operated, before, after, strict=True)}
+    began, ended = (float(judge.errors(v).mean()) for v in (bounds.first, values))
+    return Identified(found, began, ended, chosen, doubts, std, tuple(tried), touch, tuple(common), by_joint)
 
 
-class Axes:
-    """Fields as the search sees them: (…, n, P), in units in which a change of one is a large one."""
+class Judge:
+    """Motions that were not fitted, whole, in the simulator of the whole robot."""
 
-    def __init__(self, fit: Fit, fields: ListOf[str], rest: Values) -> None:
-        self.names, self.rest = list(dict.fromkeys(fields)), rest
-        low, high, self.unit = (np.stack([fit.limits[f][i] for f in self.names], axis=1) for i in range(3))
-        self.low, self.high = low / self.unit, high / self.unit
+    def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
+        self.runs = FreeRuns(sequences, robot, nthread, CLASSIC, touch=touching_rows(sequences, robot, below))
+        each = [self.runs.window == i for i in range(len(sequences))]
+        self.motions = [rows for rows in each if rows.any()]
+        self.known: dict[bytes, Array] = {}
 
-    def of(self, values: Values) -> Array:
-        """From values, inside the bounds."""
-        kp = values["kp"]
-        seen = [
-            np.log(np.maximum(values[f], 1e-9)) if f in LOGARITHM else values[f] / kp ** (f in OVER_KP)
-            for f in self.names
-        ]
-        return np.clip(np.stack(seen, axis=-1) / self.unit, self.low, self.high)
+    def _sums(self, values: Values) -> tuple[Array, Array]:
+        """Sums of |error| over counted rows, rad, and how many, of motions and joints, (motions, n) each."""
+        key = b"".join(f.encode() + values[f].tobytes() for f in sorted(values))
+        if key not in self.known:
+            size = np.abs(self.runs.run({f: v[None] for f, v in values.items()}))[0]
+            self.known[key] = np.stack([size[:, rows].sum(axis=1) for rows in self.motions])
+        return self.known[key], np.stack([self.runs.recorded[:, rows].sum(axis=1) for rows in self.motions])
 
-    def values(self, x: Array) -> Values:
-        """To values; fields that are not searched stay."""
-        own = dict(zip(self.names, np.moveaxis(x * self.unit, -1, 0), strict=True))
-        found = {f: np.broadcast_to(v, x.shape[:-1]) for f, v in self.rest.items()} | own
-        found |= {f: np.exp(own[f]) for f in LOGARITHM if f in own}
-        return found | {f: own[f] * found["kp"] for f in OVER_KP if f in own}
+    def errors(self, values: Values) -> Array:
+        """Mean |error| of each motion, (motions,) rad."""
+        total, count = self._sums(values)
+        return np.asarray(total.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
+
+    def by_joint(self, values: Values) -> Array:
+        """Mean |error| of each joint, (n,) rad."""
+        total, count = self._sums(values)
+        return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
+
+    def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
+        """Name and values of what does best; the first unless it is beaten by more than a hundredth."""
+        names = list(candidates)
+        joints = np.array([self.by_joint(v) for v in candidates.values()])
+        which = joints.argmin(axis=0)
+        if len(set(which.tolist())) > 1:  # what did best for each joint: may do best for all
+            fields = set.intersection(*(set(v) for v in candidates.values()))
+            rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
+            candidates = candidates | {"mixed": {f: x[which, np.arange(len(which))] for f, x in rows.items()}}
+        costs = {name: float(self.errors(v).mean()) for name, v in candidates.items()}
+        name = min(costs, key=lambda name: costs[name])
+        name = name if costs[name] < BETTER * costs[names[0]] else names[0]
+        return name, candidates[name]
+
+
+def touching_rows(sequences: ListOf[Sequence], robot: RobotSpec, below: float) -> Array | None:
+    """Rows in which a tip is below a height, (sequences, rows)."""
+    if not robot.tips:
+        return None
+    heights = tip_heights(sequences, robot)
+    rows = max(map(len, heights))
+    return np.array([np.r_[h < below, np.zeros(rows - len(h), bool)] for h in heights])
 
 
 class Fit:
-    """The windows of a fit, and what a parameter may be."""
+    """Windows of recordings, joints on their own or the whole robot, and what a parameter may be."""
 
-    def __init__(self, runs: JointRuns, robot: RobotSpec, sequences: ListOf[Sequence]) -> None:
-        self.runs, self.base, self.op, self.n = runs, robot, robot.operated_index, len(robot.operated)
-        model = build_model(replace(robot, table=None))
-        dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
-        kp, limit = robot.kp[self.op], robot.effort_limit[self.op]
-        self.armature = model.dof_armature[dof]
-        self.first: Values = {
-            "kp": kp, "damping": model.dof_damping[dof], "frictionloss": model.dof_frictionloss[dof],
-            "armature": np.maximum(self.armature, 1e-3),
-            **{f: getattr(robot, f)[self.op] for f in ("offset", "delay", "effort_limit", *LAW)},
-        }  # fmt: skip
-        counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in self.op])
-        one, heavy = np.ones(self.n), self.first["armature"] / kp
-        # Field → lowest, highest, and a change that is a large one, (n,) each, on the search's axes.
-        self.limits: dict[str, tuple[Array, Array, Array]] = {
-            "kp": (np.log(0.2 * kp), np.log(8.0 * kp), 0.3 * one),
-            "damping": (0 * one, 0.5 * one, 0.015 * one),
-            "frictionloss": (0 * one, 0.2 * one, 0.005 * one),
-            "armature": (0.02 * heavy, 10 * heavy, 0.4 * heavy),
-            "offset": (-0.2 * one, 0.2 * one, 0.01 * one),
-            "delay": (0 * one, MAX_DELAY * one, 0.005 * one),
-            "stribeck": (0 * one, 0.1 * one, 0.002 * one),
-            "stribeck_speed": (np.log(0.005) * one, 0 * one, 0.3 * one),
-            "friction_motor": (0 * one, 0.8 * one, 0.05 * one),
-            "friction_external": (0 * one, 0.8 * one, 0.05 * one),
-            "min_torque": (0 * one, 0.05 * one, 0.002 * one),
-            "effort_limit": (0.05 * limit / kp, 5 * limit / kp, 0.2 * limit / kp),
-            "encoder_step": (counts, counts, one),
-        }
-        self.guess = {"stribeck": 0.003 * kp, "stribeck_speed": 0.05 * one, "friction_motor": 0.05 * one,
-                      "friction_external": 0.02 * one, "effort_limit": 0.6 * limit,  # one that is too high is not felt
-                      "min_torque": 0.003 * kp, "encoder_step": counts}  # fmt: skip
+    def __init__(self, runs: JointRuns, robot: RobotSpec, bounds: Bounds, whole: FreeRuns | None = None) -> None:
+        self.runs, self.base, self.bounds, self.company = runs, robot, bounds, whole
+        self.n = len(robot.operated)
+        self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
 
-    def start(self) -> Values:
-        """The given robot, a little late."""
-        own = self.first | {"delay": np.maximum(self.first["delay"], FIRST_DELAY)}
-        return {f: own[f] for f in CLASSIC} | {f: own[f] for f in LAW if own[f].any()}
+    def whole(self, nthread: int) -> Fit:
+        """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
+        parts = self.runs.parts
+        some = np.unique(np.arange(WHOLE) * len(parts) // WHOLE)
+        runs = FreeRuns([parts[i] for i in some], self.base, nthread, CLASSIC, touch=self.runs.touch[some])
+        fit = Fit(self.runs, self.base, self.bounds, runs)
+        fit.noise = self.noise
+        return fit
+
+    def axes(self, fields: ListOf[str], rest: Values) -> Axes:
+        """Of these fields."""
+        return Axes(self.bounds, fields, rest)
 
     def fields_of(self, values: Values) -> list[str]:
-        """Names, classic ones first."""
-        return [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values]
+        """Names that the whole robot can be searched for, classic ones first."""
+        return [f for f in (*CLASSIC, *LAW) if f in values and f not in ALONE]
 
-    def with_term(self, values: Values, term: str) -> Values:
-        """Values with a first guess at a term's fields."""
-        return values | {f: self.guess[f] for f in TERMS[term]}
-
-    def search(self, fields: ListOf[str], start: Values, tell: Callable[[float], None]) -> Values:
-        """Fit these fields from a start, and from STARTS − 1 beside it; those of `start` not among them stay."""
-        axes = Axes(self, fields, start)
+    def search(
+        self, fields: ListOf[str], start: Values, clock: Clock, what: str, others: ListOf[Values] = ()
+    ) -> Values:
+        """Fit the classic fields, those of the law that `start` has and these, every joint on its own, from a start,
+        from at most two others, and from some beside the first, STARTS in all."""
+        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in start or f in fields]
+        axes = self.axes(names, start)
         rng = np.random.default_rng(0)
         x = np.repeat(axes.of(start)[None], STARTS, axis=0)
         x[1:] += SPREAD * rng.standard_normal(x[1:].shape)
+        for i, one in enumerate(others):
+            x[2 + i] = axes.of(one)
         x = np.clip(x, axes.low, axes.high)
         for runs, iterations in zip((self.runs.shortened(SHORT), self.runs, self.runs), SEARCH, strict=True):
-            errors = partial(lambda runs, xs: self.errors(axes.values(xs), runs), runs)
-            x, cost = descend(x, axes.low, axes.high, errors, iterations, self.telling(runs, tell))
+            tell = clock.tell(what, self.base.operated, runs.rows)
+            errors = lambda xs, runs=runs: self.errors(axes.values(xs), runs)  # noqa: E731
+            x, cost = descend(x, axes.low, axes.high, errors, iterations, tell, clock.over)
+            self.learn(cost.min(axis=0), runs.rows)
             if runs is self.runs:
                 x = better_half(x, cost)
         return {f: v[0].copy() for f, v in axes.values(x[:1]).items()}
 
-    def telling(self, runs: JointRuns, tell: Callable[[float], None]) -> Callable[[Array], None]:
-        """Costs, (n,), told as a root mean square in rad."""
-        rows = max(int(runs.counted.sum()), 1)
-        return lambda cost: tell(SOFT * float(np.sqrt(2 * cost.mean() / rows)))
+    def descend(
+        self, fields: ListOf[str], rest: Values, x: Array, iterations: ListOf[int], clock: Clock, what: str
+    ) -> Values:
+        """Fit these fields in the simulator of the whole robot, from starts on their axes, of which half go on."""
+        assert self.company is not None
+        runs, axes = self.company, self.axes(fields, rest)
+        tell = clock.tell(what, self.base.operated, runs.rows)
+        for i, count in enumerate(iterations):
+            errors = lambda xs: self.errors(axes.values(xs), runs)  # noqa: E731
+            x, cost = descend(x, axes.low, axes.high, errors, count, tell, clock.over, ENOUGH)
+            self.learn(cost.min(axis=0), runs.rows)
+            if i < len(iterations) - 1:
+                # Of every joint the better start; all of one start where that does better together.
+                x = np.concatenate([better_half(x, cost)[:1], x[[cost.sum(axis=1).argmin()]]])
+                x = x[:1] if np.array_equal(x[0], x[1]) else x
+        return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
 
-    def errors(self, values: Values, runs: JointRuns) -> Array:
-        """Of (k, n) values, (k, n, windows · rows), in SOFT; then, two more, what kp and armature cost."""
-        found = np.moveaxis(runs.errors(values), (1, 3, 2, 0), (0, 1, 2, 3)) / np.float32(SOFT)
-        given = {f: np.where(v > 0, v, np.nan) for f, v in (("kp", self.first["kp"]), ("armature", self.armature))}
-        far = [np.nan_to_num(np.log(values[f] / v)) * np.sqrt(2 * PRICES[f]) for f, v in given.items()]
-        far = np.sqrt(runs.counted.sum()) * np.stack(far, axis=-1)
-        return np.concatenate([found.reshape(*found.shape[:2], -1), far], axis=2, dtype=np.float32)
+    def learn(self, cost: Array, rows: Array) -> None:
+        """What the best fit leaves of each joint says how much a file's value weighs."""
+        self.noise = np.maximum(SOFT * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
 
-    def mean_error(self, values: Values) -> float:
-        """Of the windows, rad."""
-        return float(motion_errors(self.runs, values).mean())
+    def errors(self, values: Values, runs: JointRuns | FreeRuns) -> Array:
+        """Of (k, n) values, (k, n, rows), in SOFT; then, two more, how far kp and armature are from the file's: a
+        second of recording counts as one independent measurement."""
+        if isinstance(runs, JointRuns):
+            found = runs.errors(values)
+            found = found.reshape(*found.shape[:2], -1)
+        else:
+            found = runs.run(values)
+        told = {"kp": TOLD if self.bounds.stated else BELIEF["kp"], "armature": BELIEF["armature"]}
+        given = {f: np.where(self.bounds.first[f] > 0, self.bounds.first[f], np.nan) for f in told}
+        weight = self.noise / SOFT * np.sqrt(1 / max(self.runs.dt, 0.01))
+        far = [np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / v)) * weight / told[f] for f, v in given.items()]
+        return np.concatenate([found / np.float32(SOFT), np.stack(far, axis=-1)], axis=2, dtype=np.float32)
 
     def robot(self, values: Values) -> RobotSpec:
         """The robot with these values."""
@@ -286,52 +389,93 @@ class Fit:
             {j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in enumerate(joints)}
         )
 
-    def uncertainty(self, values: Values, tell: Callable[[float], None] = lambda error: None) -> Std:
-        """Standard errors, joint → field: how far from these values fits end that begin beside them and give every
-        window a random weight (a Bayesian bootstrap, Rubin 1981), without PRICES. Slopes would say less: the surface is
-        rough."""
-        names = [f for f in self.fields_of(values) if f != "encoder_step"]
-        axes, windows = Axes(self, names, values), self.runs.counted.shape[1]
-        rng = np.random.default_rng(1)
-        weight = np.sqrt(rng.dirichlet(np.ones(windows), AGAIN) * windows).astype(np.float32)
-        weight = np.append(np.repeat(weight, len(self.runs.ctrl), axis=1), np.zeros((AGAIN, 2), np.float32), axis=1)
-
-        def errors(xs: Array) -> Array:
-            found = self.errors(axes.values(xs), self.runs)
-            return found * np.tile(weight, (len(xs) // AGAIN, 1))[:, None]
-
-        x = axes.of(values) + BESIDE * rng.standard_normal((AGAIN, self.n, len(names)))
-        x = np.clip(x, axes.low, axes.high)
-        x, _ = descend(x, axes.low, axes.high, errors, AGAIN_STEPS, self.telling(self.runs, tell))
-        ends = axes.values(x)
-        std = {f: np.sqrt(np.square(ends[f] - values[f]).mean(axis=0)) for f in names}
-        return {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(self.base.operated)}
-
-    def doubts(self, values: Values, std: Std) -> tuple[str, ...]:
-        """Parameters at a bound, and those whose standard error is as large as what they may mean."""
-        names, found = [f for f in self.fields_of(values) if f != "encoder_step"], []
-        axes = Axes(self, names, values)
+    def uncertainty(self, values: Values) -> tuple[Std, Std]:
+        """Standard errors, joint → field, of the values and of those that are searched over kp: from the slopes at the
+        end and how much windows pull against each other (a sandwich estimate, windows as clusters), together with how
+        far one more step would go."""
+        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        axes, runs = self.axes(names, values), self.runs if self.company is None else self.company
         x = axes.of(values)
-        edge = ((x - axes.low < 0.02) & (axes.low != 0)) | (axes.high - x < 0.02)
-        ahead = axes.values(x + 1)
+        here, jac = (y[0] for y in slopes(x[None], axes.high, lambda xs: self.errors(axes.values(xs), runs)))
+        weight = 1 / np.sqrt(1 + here**2)
+        pull = jac * (weight * here)[..., None]  # (n, rows + 2, P)
+        window = runs.window
+        parts = max(1, -(-CLUSTERS // (int(window.max()) + 1)))  # of a window, where there are few
+        order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
+        edges = np.flatnonzero(np.diff(window[order], prepend=-1))
+        count = np.diff(np.append(edges, len(window)))
+        turn[order] = np.concatenate([np.arange(c) * parts // c for c in count])
+        cluster = window * parts + turn
+        clusters = int(cluster.max()) + 1
+        each = np.zeros((self.n, clusters, len(names)))
+        np.add.at(each, (slice(None), cluster), pull[:, :-2])  # type: ignore[arg-type]
+        each = each - each.mean(axis=1, keepdims=True)
+        held = (axes.low == axes.high)[..., None] * np.eye(len(names))
+        normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
+        spread = np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - len(names), 1))
+        inverse = np.linalg.pinv(normal + 1e12 * held, hermitian=True)
+        step = np.clip((inverse @ pull.sum(axis=1)[..., None])[..., 0], -1, 1)
+        cov = inverse @ spread @ inverse + step[..., :, None] * step[..., None, :]
+        # What no row has to say of a parameter is as unknown as before: then it is the file's, or nobody's.
+        lost = np.einsum("...ii->...i", normal) < 1e-9
+        width = np.sqrt(np.einsum("...ii->...i", cov)) + np.where(lost & (axes.low < axes.high), 1e3, 0)
+        ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
+        by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
+        std = {
+            f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + np.abs(g).max(axis=1) * lost.any(axis=1)
+            for f, g in by.items()
+        }
+        joints = self.base.operated
+        found = {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)}
+        return found, {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)}
+
+    def bounds_met(self, values: Values) -> tuple[str, ...]:
+        """Every parameter at a bound, with what to check; no friction, armature or delay at all are ordinary."""
+        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        axes, found = self.axes(names, values), []
+        x = axes.of(values)
         for i, joint in enumerate(self.base.operated):
-            wide = []
             for k, f in enumerate(names):
-                value, error = values[f][i], std[joint].get(f, 0.0)
-                if edge[i, k]:
-                    found.append(f"{joint}: {f} ended at its bound ({value:.4g}); the model's form does not fit")
-                elif error > WIDE * max(abs(value), ahead[f][i] - value):
-                    wide.append(f"{f} {measured(value, error)}")
-            if wide:
-                found.append(f"{joint}: not determined by these logs: {', '.join(wide)}")
+                held = axes.low[i, k] == axes.high[i, k]
+                below = x[i, k] - axes.low[i, k] < 0.02 and (f == "damping" or axes.low[i, k] != 0)
+                if held or not (below or axes.high[i, k] - x[i, k] < 0.02):
+                    continue
+                if f == "damping" and below and not self.bounds.spare[i] and self.base.kd[self.base.operated_index[i]]:
+                    what = "0 beside the kd that the recordings state; less would fit better: check that kd"
+                elif f == "damping" and below:
+                    what = "none at all; check that commands are what the servo was given, and their clock"
+                else:
+                    end, check = "least" if below else "most", CHECK.get(f, "the law does not fit")
+                    what = f"{values[f][i]:.4g}, the {end} that is tried; {check}"
+                found.append(f"{joint}: {f} ended at its bound: {what}")
         return tuple(found)
 
-
-def motion_errors(runs: JointRuns, values: Values) -> Array:
-    """Mean |error| of each window over counted rows and joints, (windows,) rad; windows without such rows left out."""
-    errors = np.abs(runs.errors({f: v[None] for f, v in values.items()}))[:, 0].mean(axis=2)
-    counted = runs.counted.sum(axis=0)
-    return np.asarray(errors.sum(axis=0)[counted > 0] / counted[counted > 0])
+    def undetermined(self, values: Values, std: Std, over_kp: Std) -> tuple[str, ...]:
+        """Joints that stood, and parameters whose standard error is as large as what they may mean."""
+        names, found = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"], []
+        axes = self.axes(names, values)
+        x = axes.of(values)
+        ahead = axes.values(x + 1)
+        for i, joint in enumerate(self.base.operated):
+            if self.bounds.still[i]:
+                found.append(
+                    f"{joint}: not determined by these logs: no command moves it by {STILL:g} rad; it keeps the file's "
+                    "values but for its offset and, where others load it, kp; record a motion that moves it"
+                )
+                continue
+            wide, alone = [], []
+            for k, f in enumerate(names):
+                value, error = values[f][i], std[joint].get(f, 0.0)
+                if error > WIDE * max(abs(value), ahead[f][i] - value):
+                    wide.append(f"{f} {measured(value, error)}")
+                    ratio = over_kp.get(joint, {}).get(f, np.inf)
+                    if f not in OVER_KP or ratio > WIDE * max(abs(x[i, k]), 1.0):
+                        alone.append(f)
+            together = set(alone) == {"kp"} and len(wide) > 1
+            as_set = "; known as multiples of kp: take the values as a set" if together else ""
+            if wide:
+                found.append(f"{joint}: not determined by these logs: {', '.join(wide)}{as_set}")
+        return tuple(found)
 
 
 STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and differ there; rows that must show it
@@ -352,3 +496,38 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
             if met and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
     return robot.with_servos(servos) if servos else robot
+
+
+def asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
+    """Where joints stayed behind several commands: a question, since what was met may have been anything."""
+    found = []
+    for joint, i in zip(given.operated, given.operated_index, strict=True):
+        for name, which in (("stop_low", 0), ("stop_high", 1)):
+            stop = float(getattr(met, name)[i])
+            if np.isfinite(stop) and stop != getattr(given, name)[i]:
+                usual = given.qpos_range[i, which]
+                found.append(
+                    f"{joint}: stayed at {stop:.3f} rad where commands went on towards {usual:.3f}: if that is a stop, "
+                    "identify with --stops; if something was in its way, leave those motions out"
+                )
+    return found
+
+
+def whole_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
+    """Mean |error| of each whole motion in free run, operated joints, (motions,) rad."""
+    twins, op = replay(sequences, robot, nthread=nthread, lock_idle=True), robot.operated_index
+    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]
+    return np.nan_to_num(np.array(errors), nan=np.pi)
+
+
+def no_gain(found: Identified, robot: RobotSpec, given: Array, left: Array) -> str:
+    """Why an identification writes nothing, and what to record."""
+    by_joint = found.by_joint or {}
+    worst = sorted(by_joint, key=lambda joint: -by_joint[joint][0])[:3]
+    told = ", ".join(f"{joint} {1e3 * by_joint[joint][0]:.2f}" for joint in worst)
+    why = f"; {found.warnings[0]}" if found.warnings else ""
+    return (
+        f"nothing is written: nothing that was fitted follows the {len(given)} validation motion(s) better than "
+        f"{robot.name} as it is ({1e3 * given.mean():.2f} mrad, best fit {1e3 * left.mean():.2f}; worst {told}). "
+        f"Record gaponet excite's motions, every joint over its range, slow and fast, and look at gaponet doctor{why}"
+    )

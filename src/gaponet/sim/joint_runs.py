@@ -9,19 +9,33 @@ whole robot, and its error by joint to a few per cent (tests/sim/test_joint_runs
 from __future__ import annotations
 
 import copy
+import os
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.optimize import nnls
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import friction_limit, present, servo_torque
+from gaponet.sim.servo import SLOWEST, friction_limit, present, servo_torque
+
+try:
+    njit: Any = import_module("numba").njit
+except ImportError:  # an extra: what it compiles is eight times as fast as numpy
+    njit = None
 
 Array = np.ndarray
 
 SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
+THIN = 0.01  # s between rows that are compared
+MOST, SLIPS, LATEST = 20_000, 0.02, 0.1  # of a regression: rows, rad/s at which friction is whole, s of delay
+BEYOND = 7.0  # rad: the stops of a joint without any
+KERNEL = ("kp", "damping", "frictionloss", "armature", "offset", "delay", "effort_limit", *LAW)  # order of its values
 SETTLE = 0.1  # s: velocities at a window's start are measured ones
 CUTOFF = 10.0  # Hz, of the other joints' accelerations: above the arms' bandwidth
 TURN = 0.02  # rad: for the derivative of gravity's torque
@@ -30,34 +44,46 @@ TURN = 0.02  # rad: for the derivative of gravity's torque
 class JointRuns:
     """Windows of recordings, n operated joints; rows in which the robot may touch something are passed over."""
 
-    def __init__(self, parts: list[Sequence], robot: RobotSpec, below: float = -np.inf) -> None:
+    def __init__(self, parts: list[Sequence], robot: RobotSpec, below: float = -np.inf, nthread: int = 0) -> None:
         """
         Args:
             parts: Windows at one control period.
             robot: Stops, zeros, limits and inertias are its own.
             below: Height (m) under which a tip counts as touching.
+            nthread: Threads of the compiled runs, 0 for all cores.
         """
-        self.robot, self.op = robot, robot.operated_index
+        self.parts, self.robot, self.op = parts, robot, robot.operated_index
+        self.nthread = nthread or os.cpu_count() or 1
         self.dt = float(np.median([p.dt for p in parts]))
         self.count = robot.steps_per(self.dt)
+        self.thin = max(1, round(THIN / self.dt))
         rows = max(map(len, parts))
         made: dict[tuple[float, str], Along] = {}
         for p in parts:
             key = (p.meta.payload_mass, p.meta.payload_side)
             if key not in made:
                 made[key] = Along(robot, build_model(robot, *key, self.dt, bare=True))
-        along = [made[p.meta.payload_mass, p.meta.payload_side].follow(p) for p in parts]
+        along = [made[p.meta.payload_mass, p.meta.payload_side].follow(p, self.thin) for p in parts]
         low, high = robot.qpos_range[self.op].T
-        stack = lambda xs: np.stack([_held(x, rows) for x in xs], axis=1)  # noqa: E731
+        # (n, windows, rows) each, so that a run reads what lies side by side.
+        stack = lambda xs: np.stack([_held(x, rows) for x in xs]).transpose(2, 0, 1).astype(np.float32)  # noqa: E731
         self.ctrl = stack([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
-        self.qpos = stack([p.qpos[:, self.op].astype(float) for p in parts])
-        self.qvel = stack([p.qvel[:, self.op].astype(float) for p in parts])
-        # In the middle of each period.
-        middle = lambda x: 0.5 * (x + np.concatenate([x[1:], x[-1:]]))  # noqa: E731
-        self.inertia, self.weight, self.pull, self.slope = (middle(stack([a[i] for a in along])) for i in range(4))
-        self.at = middle(self.qpos)
-        self.touch = stack([a[4] for a in along]) < below  # (rows, windows)
+        self.qpos = stack([p.qpos[:, self.op] for p in parts])
+        self.qvel = stack([p.qvel[:, self.op] for p in parts])
+        # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' pull, its slope.
+        middle = lambda x: 0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1))  # noqa: E731
+        inertia, weight, pull, slope = (middle(stack([a[i] for a in along])) for i in range(4))
+        self.tables = np.stack([inertia, weight - slope * middle(self.qpos), pull, slope])
+        # A run that leaves what joints can do stops there, and none flies away.
+        reached = self.qpos.min(axis=(1, 2)), self.qpos.max(axis=(1, 2))
+        self.stops = np.stack([
+            np.minimum(np.where(np.isfinite(low), low, -BEYOND), reached[0]),
+            np.maximum(np.where(np.isfinite(high), high, BEYOND), reached[1]),
+        ], axis=1).astype(np.float32)  # fmt: skip
+        self.touch = np.stack([_held(a[4], rows) for a in along]) < below  # (windows, rows)
         self.lengths = np.array([len(p) for p in parts])
+        # Joints of which a window holds nothing, (n, windows): their error says nothing.
+        self.recorded = np.array([[j not in p.meta.unrecorded for p in parts] for j in robot.operated])
         self.counted = self._counted()
         # Gains while recording: kp as a multiple of the robot's own, kd in N·m·s/rad, (windows, n).
         set_to = [robot.with_gains(*p.meta.known_gains) for p in parts]
@@ -65,71 +91,121 @@ class JointRuns:
         self.kd = np.array([r.kd[self.op] for r in set_to])
 
     def _counted(self) -> Array:
-        """Rows that count, (rows, windows): after the start has settled, away from what may be touched."""
-        rows, after = len(self.touch), round(SETTLE / self.dt)
-        near = np.array([self.touch[max(0, t - after) : t + 1].any(axis=0) for t in range(rows)])
-        time = np.arange(rows)[:, None]
-        return np.asarray((time > max(after, 1)) & (time < self.lengths) & ~near)
+        """Rows that count, (windows, rows): after the start has settled, away from what may be touched."""
+        rows, after = self.touch.shape[1], round(SETTLE / self.dt)
+        near = np.array([self.touch[:, max(0, t - after) : t + 1].any(axis=1) for t in range(rows)]).T
+        time = np.arange(rows)
+        counted = (time > max(after, 1)) & (time < self.lengths[:, None]) & ~near
+        return np.asarray(counted[:, :: self.thin])
+
+    @property
+    def window(self) -> Array:
+        """Window of each row of flattened errors, (windows · rows,)."""
+        return np.repeat(np.arange(len(self.counted)), self.counted.shape[1])
+
+    @property
+    def rows(self) -> Array:
+        """Rows that count, of each joint, (n,)."""
+        return np.asarray((self.counted & self.recorded[..., None]).sum(axis=(1, 2)))
 
     def shortened(self, seconds: float) -> JointRuns:
         """The same windows, put back on the recording every so many seconds: a smoother surface to descend on."""
         short = copy.copy(self)
         short.touch = self.touch.copy()
-        short.touch[:: max(round(seconds / self.dt), 1)] = True
+        short.touch[:, :: max(round(seconds / self.dt), 1)] = True
         short.counted = short._counted()
         return short
 
+    def regressed(self) -> dict[str, Array]:
+        """kp, total damping, dry friction, armature, offset and delay with which the recorded accelerations balance
+        best, (n,) each: linear but for the delay, biased by noise, and owing nothing to any file's gains."""
+        n = len(self.op)
+        found = {f: np.zeros(n) for f in ("kp", "damping", "frictionloss", "armature", "offset", "delay")}
+        period = np.concatenate([np.arange(length) for length in self.lengths])
+        window = np.repeat(np.arange(len(self.lengths)), self.lengths)
+        part = slice(None, None, max(1, len(period) // MOST))
+        for j in range(n):
+            smooth = [lowpass(self.qpos[j, w, :k, None].astype(float), self.dt, CUTOFF)[:, 0]
+                      for w, k in enumerate(self.lengths)]  # fmt: skip
+            q = np.concatenate(smooth)
+            v = np.concatenate([np.gradient(x, self.dt) for x in smooth])
+            a = np.concatenate([np.gradient(np.gradient(x, self.dt), self.dt) for x in smooth])
+            inertia, weight, pull, slope = self.tables[:, j, window, period]
+            asked = inertia * a + weight + slope * q + pull
+            least = np.inf
+            for delay in np.arange(0.0, LATEST, max(self.dt / 2, 5e-3)):
+                rows = period - delay / self.dt
+                whole = np.floor(rows).astype(int)
+                aim = [self.ctrl[j, window, np.clip(whole + i, 0, self.lengths[window] - 1)] for i in (0, 1)]
+                error = aim[0] + (rows - whole) * (aim[1] - aim[0]) - q
+                columns = np.stack([error, -v, -np.tanh(v / SLIPS), -a, np.ones_like(q), -np.ones_like(q)], axis=1)
+                size = np.sqrt(np.square(columns[part]).mean(axis=0)) + 1e-12
+                x, left = nnls(columns[part] / size, asked[part])
+                x = x / size
+                if left < least and x[0] > 0:
+                    least = left
+                    for f, value in zip(found, (*x[:4], (x[4] - x[5]) / x[0], delay), strict=True):
+                        found[f][j] = value
+        return found
+
     def errors(self, values: dict[str, Array]) -> Array:
-        """q_sim − q_real of parameters (k, n) each, (rows, k, windows, n) rad; zero where rows do not count.
+        """q_sim − q_real of parameters (k, n) each, (k, n, windows, rows) rad; zero where rows do not count.
 
         Args:
-            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and
-                any of effort_limit and LAW.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of
+                effort_limit and LAW. A damping below zero takes from the servo's own kd.
         """
+        out = _compiled(self, values) if advance is not None else self._arrays(values)
+        return np.asarray(out * (self.counted & self.recorded[..., None]))
+
+    def _arrays(self, values: dict[str, Array]) -> Array:
+        """The runs in numpy: every array has the shape of the state and its precision, since broadcasting costs more
+        than the sums."""
         k = len(values["kp"])
-        shape = (k, *self.qpos.shape[1:])
-        # Every array has the shape of the state and its precision: broadcasting costs more than the sums.
-        v = {name: _filled(x[:, None], shape) for name, x in values.items()}
+        shape = (k, *self.qpos.shape[:2])
+        v = {name: _filled(x[:, :, None], shape) for name, x in values.items()}
         law = present({name: v[name] for name in LAW if name in v})
-        kp, kd = v["kp"] * _filled(self.stiffer, shape), _filled(self.kd, shape)
-        own, mass, offset, dry = v["damping"], v["armature"], v["offset"], v["frictionloss"]
-        damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op], shape))
+        kp, kd = v["kp"] * _filled(self.stiffer.T, shape), _filled(self.kd.T, shape)
+        kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
+        own, mass, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
+        damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
         h = np.float32(self.dt / self.count)
-        given = [x.astype(np.float32) for x in (self.inertia, self.weight, self.pull, self.slope, self.at)]
-        driven, late = bool(self.kd.any()), bool(values["delay"].any())
-        q, w = _filled(self.qpos[0], shape), _filled(self.qvel[0], shape)
-        out = np.zeros((len(self.ctrl), *shape), np.float32)
-        for t in range(len(out) - 1):
-            inertia, weight, pull, slope, at = (x[t] for x in given)
-            heavy = inertia + mass
+        low, high = (_filled(x[:, None], shape) for x in self.stops.T)
+        driven = bool(kd.any())
+        q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
+        out = np.zeros((*shape, self.counted.shape[1]), np.float32)
+        for t in range(self.qpos.shape[2] - 1):
+            inertia, weight, pull, slope = self.tables[..., t]
+            heavy, slope = inertia + mass, _filled(slope, shape)
             turn, stop = h / (heavy + h * damping), heavy / -h
-            weight, slope = weight - slope * at, _filled(slope, shape)
-            for part in range(self.count):
-                aim = (self._target(t, part, values["delay"]) if late else self.ctrl[t]).astype(np.float32)
-                torque = servo_torque(law, kp, aim + offset, q)
+            aims = self._targets(t, values["delay"]) + offset
+            for aim in aims:
+                torque = servo_torque(law, kp, aim, q)
                 torque = np.minimum(np.maximum(torque - kd * w if driven else torque, -limit), limit)
                 load = slope * q + weight
                 most = friction_limit(law, dry, w, torque, load)
                 net = torque - load - pull - own * w
                 w = w + turn * (net + np.minimum(np.maximum(stop * w - net, -most), most))
                 q = q + h * w
-            touch = self.touch[t + 1]
+                w = np.where(q < low, np.maximum(w, 0), np.where(q > high, np.minimum(w, 0), w))
+                q = np.minimum(np.maximum(q, low), high)
+            touch = self.touch[:, t + 1]
             if touch.any():  # goes on from the recording
-                q[:, touch], w[:, touch] = self.qpos[t + 1, touch], self.qvel[t + 1, touch]
-            out[t + 1] = q - self.qpos[t + 1]
-        return out * self.counted[:, None, :, None]
-
-    def _target(self, t: int, part: int, delay: Array) -> Array:
-        """The command in force in a physics step, (k or 1, windows, n); a part of it where it changes on the way."""
-        at = part / self.count - delay / self.dt  # rows from t
-        row = np.floor(at)
-        late = np.clip((at - row - 1) * self.count + 1, 0, 1)
-        out = np.zeros((len(delay), *self.ctrl[t].shape))
-        for r in range(int(row.min()), int(row.max()) + 2):
-            share = np.where(row == r, 1 - late, 0.0) + np.where(row + 1 == r, late, 0.0)
-            if share.any():
-                out += share[:, None] * self.ctrl[min(max(t + r, 0), len(self.ctrl) - 1)]
+                q[..., touch], w[..., touch] = self.qpos[:, touch, t + 1], self.qvel[:, touch, t + 1]
+            if (t + 1) % self.thin == 0:
+                out[..., (t + 1) // self.thin] = q - self.qpos[..., t + 1]
         return out
+
+    def _targets(self, t: int, delay: Array) -> Array:
+        """The commands in force in the physics steps of a period, (count, k, n, windows); a part of each where they
+        change on the way."""
+        at = np.arange(self.count)[:, None, None] / self.count - delay / self.dt  # rows from t
+        row = np.floor(at).astype(int)
+        share = np.maximum((at - row - 1) * self.count + 1, 0)[..., None].astype(np.float32)
+        last, joint = self.lengths - 1, np.arange(len(self.op))[:, None]
+        window = np.arange(len(self.lengths))
+        first, then = (self.ctrl[joint, window, np.clip(t + row[..., None] + more, 0, last)] for more in (0, 1))
+        return np.asarray((1 - share) * first + share * then)
 
 
 class Along:
@@ -141,37 +217,117 @@ class Along:
         # Forces at a posture, without what a servo does and what a table does.
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
 
-    def follow(self, part: Sequence) -> tuple[Array, ...]:
+    def follow(self, part: Sequence, thin: int = 1) -> tuple[Array, ...]:
         """Inertia of each operated joint without armature, kg·m², the torques that gravity and Coriolis forces and that
         the other joints' accelerations ask of it, N·m, the slope of the former over the joint's angle, N·m/rad, (rows,
-        n) each; lowest tip, (rows,) m."""
+        n) each; lowest tip, (rows,) m. Every `thin` rows, and between them on a line."""
         model, data, op = self.model, self.data, self.op
         smooth = lowpass(part.qpos.astype(float), part.dt, CUTOFF)
         qvel = differentiate(smooth, part.dt)
         qacc = differentiate(qvel, part.dt)
-        inertia, weight, pull, slope = (np.empty((len(part), len(op))) for _ in range(4))
-        tip, full = np.full(len(part), np.inf), np.empty((model.nv, model.nv))
-        for t in range(len(part)):
+        at = np.arange(0, len(part) + thin, thin).clip(max=len(part) - 1)
+        inertia, weight, pull, slope = (np.empty((len(at), len(op))) for _ in range(4))
+        tip, full = np.full(len(at), np.inf), np.empty((model.nv, model.nv))
+        for i, t in enumerate(at):
             here = self._bias(part.qpos[t], qvel[t])
             mujoco.mj_fullM(model, data, full)
             own = full.diagonal().copy()
-            inertia[t] = (own - model.dof_armature)[op]
-            weight[t], pull[t] = here[op], (full @ qacc[t] - own * qacc[t])[op]
+            inertia[i] = (own - model.dof_armature)[op]
+            weight[i], pull[i] = here[op], (full @ qacc[t] - own * qacc[t])[op]
             for body, place, radius in self.tips:
                 z = data.xpos[body, 2] + data.xmat[body].reshape(3, 3)[2] @ place - radius
-                tip[t] = min(tip[t], z)
-            if t % SPARSE == 0:
+                tip[i] = min(tip[i], z)
+            if i % SPARSE == 0:
                 for k, j in enumerate(op):
                     turned = part.qpos[t].astype(float)
                     turned[j] += TURN
-                    slope[t : t + SPARSE, k] = (self._bias(turned, qvel[t])[j] - here[j]) / TURN
-        return inertia, weight, pull, slope, tip
+                    slope[i : i + SPARSE, k] = (self._bias(turned, qvel[t])[j] - here[j]) / TURN
+        rows = np.arange(len(part))
+        between = lambda x: np.stack([np.interp(rows, at, y) for y in x.T], axis=1)  # noqa: E731
+        tables = [x if thin == 1 else between(x) for x in (inertia, weight, pull, slope, tip[:, None])]
+        return (*(x[: len(part)] for x in tables[:4]), tables[4][: len(part), 0])
 
     def _bias(self, qpos: Array, qvel: Array) -> Array:
         self.data.qpos[:], self.data.qvel[:] = qpos, qvel
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         return self.data.qfrc_bias.copy()
+
+
+def _advance(
+    first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
+    lengths: Any, stiffer: Any, kd: Any, stops: Any, dt: float, count: int, thin: int, out: Any,
+) -> None:  # fmt: skip
+    """Fill rows `first` to `last` of out (k·n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them."""
+    n, windows = qpos.shape[:2]
+    h = dt / count
+    for item in range(first, last):
+        c, j, p = item // (n * windows), item // windows % n, item % windows
+        kp, own, dry, mass = values[c, j, 0] * stiffer[p, j], values[c, j, 1], values[c, j, 2], values[c, j, 3]
+        offset, delay, limit = values[c, j, 4], values[c, j, 5] / dt, values[c, j, 6]
+        rest, speed, by_motor, by_load = (
+            values[c, j, 7],
+            max(values[c, j, 8], SLOWEST),
+            values[c, j, 9],
+            values[c, j, 10],
+        )
+        least, step = values[c, j, 11], values[c, j, 12]
+        brake = max(kd[p, j] + min(own, 0.0), 0.0)
+        own = max(own, 0.0)
+        q, w = float(qpos[j, p, 0]), float(qvel[j, p, 0])
+        rows = lengths[p]
+        for t in range(rows - 1):
+            inertia, weight, pull = tables[0, j, p, t] + mass, tables[1, j, p, t], tables[2, j, p, t]
+            slope = tables[3, j, p, t]
+            turn = h / (inertia + h * (own + brake))
+            for part in range(count):
+                at = t + part / count - delay  # the command in force; a part of each where it changes on the way
+                row = int(np.floor(at))
+                share = max((at - row - 1) * count + 1, 0.0)
+                aim = (1 - share) * ctrl[j, p, min(max(row, 0), rows - 1)]
+                aim += share * ctrl[j, p, min(max(row + 1, 0), rows - 1)]
+                load = slope * q + weight
+                if law:
+                    read = np.round(q / step) * step if step > 0 else q
+                    torque = kp * (aim + offset - read)
+                    if least > 0:
+                        torque = np.copysign(max(abs(torque), least), torque) if abs(torque) > 0.5 * step * kp else 0.0
+                    torque = min(max(torque - brake * w, -limit), limit)
+                    most = dry + abs(by_motor * torque + by_load * load)
+                    if rest > 0:
+                        most += rest * np.exp(-abs(w) / speed)
+                else:
+                    torque, most = min(max(kp * (aim + offset - q) - brake * w, -limit), limit), dry
+                net = torque - load - pull - own * w
+                w += turn * (net + min(max(-inertia / h * w - net, -most), most))
+                q += h * w
+                if q < stops[j, 0]:
+                    q, w = stops[j, 0], max(w, 0.0)
+                elif q > stops[j, 1]:
+                    q, w = stops[j, 1], min(w, 0.0)
+            if touch[p, t + 1]:  # goes on from the recording
+                q, w = float(qpos[j, p, t + 1]), float(qvel[j, p, t + 1])
+            if (t + 1) % thin == 0:
+                out[item, (t + 1) // thin] = q - qpos[j, p, t + 1]
+
+
+advance = njit(cache=True, nogil=True)(_advance) if njit else None
+
+
+def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
+    """The runs of candidates, shared by threads."""
+    assert advance is not None
+    k, (n, windows), run = len(values["kp"]), runs.qpos.shape[:2], advance
+    own = {"effort_limit": runs.robot.effort_limit[runs.op]}
+    packed = np.stack([np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL], axis=-1)
+    law = any(values[f].any() for f in LAW if f in values)
+    out = np.zeros((k * n * windows, runs.counted.shape[1]), np.float32)
+    cuts = np.linspace(0, len(out), runs.nthread + 1).astype(int)
+    rest = (packed, law, runs.tables, runs.ctrl, runs.qpos, runs.qvel, runs.touch, runs.lengths, runs.stiffer, runs.kd,
+            runs.stops, runs.dt, runs.count, runs.thin, out)  # fmt: skip
+    with ThreadPoolExecutor(runs.nthread) as pool:
+        list(pool.map(lambda a, b: run(a, b, *rest), cuts[:-1].tolist(), cuts[1:].tolist()))
+    return out.reshape(k, n, windows, -1)
 
 
 def _filled(x: Array, shape: tuple[int, ...]) -> Array:

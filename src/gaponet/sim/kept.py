@@ -33,10 +33,15 @@ def require_kept(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint
     if not keeps_robot(holder):
         return robot
     kept = kept_robot(holder, robot.name)
-    ours, theirs = model_hash(nominal_of(kept)), model_hash(nominal_of(robot))
+    return require_same(kept, robot, holder, error, f"--robot {holder / KEPT} where that is the right one, or {hint}")
+
+
+def require_same(own: RobotSpec, robot: RobotSpec, folder: Path, error: type[GAPONetError], use: str) -> RobotSpec:
+    """Own, the robot in a folder; refused where it and the other one differ before identification."""
+    ours, theirs = model_hash(nominal_of(own)), model_hash(nominal_of(robot))
     if ours != theirs:
         raise error(
-            f"{holder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "
-            f"gains or inertias. Use --robot {holder / KEPT} where that is the right one, or {hint}"
+            f"{folder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "
+            f"gains or inertias. Use {use}"
         )
-    return kept
+    return own

@@ -15,7 +15,7 @@ from gaponet.arrays import Array
 
 STEP = 0.1  # of a parameter's scale, for forward differences
 SHARES = np.array([1e-3, 0.1, 1.0, 30.0])  # of the damping that was best last, tried out together
-FLAT = 1e-4  # ends when no start's cost falls by a larger share
+FLAT = 1e-4
 
 Errors = Callable[[Array], Array]  # candidates (k, n, P) → errors (k, n, m), 1 where they begin to count linearly
 
@@ -27,8 +27,12 @@ def descend(
     errors: Errors,
     iterations: int,
     progress: Callable[[Array], None] = lambda cost: None,
+    out_of_time: Callable[[], bool] = lambda: False,
+    flat: float = FLAT,
 ) -> tuple[Array, Array]:
     """Starts, moved downhill, and their costs (soft squares, summed), (S, n).
+
+    Problems may disturb each other a little: where that made a start worse as a whole, what it was is given back.
 
     Args:
         x: S starts of n problems of P parameters, (S, n, P), in units in which a change of one is a large one.
@@ -36,15 +40,22 @@ def descend(
         errors: Of candidates.
         iterations: At most; each tries S·(P + 1 + len(SHARES)) candidates.
         progress: Called after each with the least cost of every problem, (n,).
+        out_of_time: Asked before each but the first.
+        flat: Ends when no start's cost falls by a larger share.
     """
     damping = np.full(x.shape[:2], 1e-2)
     best = np.full(x.shape[:2], np.inf)
-    for _ in range(iterations):
+    kept, least_of = x, np.full(x.shape[:2], np.inf)
+    for i in range(iterations):
+        if i and out_of_time():
+            break
         here, jac = slopes(x, high, errors)
         weight = 1 / np.sqrt(1 + here**2)
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
         slope = (np.swapaxes(jac, -1, -2) @ (weight * here)[..., None])[..., 0].astype(float)
         best = soft(here)
+        less = best.sum(axis=1) < least_of.sum(axis=1)
+        kept, least_of = np.where(less[:, None, None], x, kept), np.where(less[:, None], best, least_of)
         tried = np.stack([step(normal, slope, low - x, high - x, s * damping) for s in SHARES]) + x
         costs = soft(_every(errors, tried))
         which, least = costs.argmin(axis=0), costs.min(axis=0)
@@ -54,9 +65,11 @@ def descend(
         fell = np.where(better, 1 - least / np.maximum(best, 1e-300), 0.0)
         best = np.minimum(least, best)
         progress(best.min(axis=0))
-        if (fell < FLAT).all():
+        if (fell < flat).all():
             break
-    return x, best
+    best = soft(_every(errors, x[None]))[0]
+    less = best.sum(axis=1) < least_of.sum(axis=1)
+    return np.where(less[:, None, None], x, kept), np.where(less[:, None], best, least_of)
 
 
 def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:

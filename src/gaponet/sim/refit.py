@@ -16,16 +16,16 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
-from gaponet.sim.free_runs import FreeRuns
+from gaponet.sim.free_runs import FreeRuns, Prior, rms
 from gaponet.sim.replay import Corrector
 
 WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
-SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does not decide
+SHORTEST = 0.8  # s
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Parameters (P,), errors (m,) and Jacobian (m, P) at the end, and how many evaluations it took."""
+    """Parameters (P,), errors (n, rows) and Jacobian (n, rows, fields) at the end, and how many evaluations it took."""
 
     x: Array
     errors: Array
@@ -56,11 +56,12 @@ def refit(
     windows: int,
     fields: tuple[str, ...],
     corrector: Corrector | None,
-    prior: float,
+    prior: Prior | None,
     evaluations: int,
     unknown_payload: bool = False,
     nthread: int = 0,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+    believed: bool = True,
 ) -> Refitted:
     """Fit parameters of all operated joints at once.
 
@@ -70,17 +71,17 @@ def refit(
         windows: Free runs of 8 s, taken evenly from the recordings.
         fields: Which parameters; the others stay the robot's.
         corrector: Corrects the targets on the way, as in replay.
-        prior: Price of leaving the robot's own values, rad per scale. All joints together leave them for a twentieth of
-            it, gains and zero offsets apart.
+        prior: What leaving a robot's values costs.
         evaluations: At most so many.
         unknown_payload: Do not believe the recordings' payload mass; fit one for all of them.
         nthread: Threads, 0 for all cores.
         progress: Called with evaluations done, at most, and the present RMS error in rad.
+        believed: Whether kd is what the servos have.
     """
     parts = cut(sequences, windows)
-    problem = FreeRuns(parts, robot, nthread, fields, corrector, prior, unknown_payload)
+    problem = FreeRuns(parts, robot, nthread, fields, corrector, prior, unknown_payload, believed)
     fit = descend(problem, problem.start(), evaluations, 1e-3, progress)
-    before, after = problem.rms(problem.errors(problem.own()[None])[0]), problem.rms(fit.errors)
+    before, after = rms(problem.errors(problem.own()[None])[0]), rms(fit.errors)
     mass = {"payload_mass": float(fit.x[-1]), "payload_std": jackknife(problem, fit)} if unknown_payload else {}
     return Refitted(problem.robot_of(fit.x), before, after, **mass)
 
@@ -91,9 +92,9 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
     for s in sequences:
         rows = min(round(WINDOW / s.dt), len(s))
         parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
-    parts = [p for p in parts if p.duration > 1.0]
+    parts = [p for p in parts if p.duration >= SHORTEST]
     if not parts:
-        raise UsageError("no recording is longer than a second; identification needs longer ones")
+        raise UsageError(f"no recording is as long as {SHORTEST:g} s; identification needs longer ones")
     return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
 
 
@@ -102,12 +103,11 @@ def jackknife(problem: FreeRuns, fit: Fit) -> float:
 
     The model's own errors last as long as a motion, so that rows of a window say little about each other.
     """
-    jac, error = fit.jac, fit.errors
-    weight = weights(error)
     moved = []
     for window in range(len(problem.parts)):
-        keep = weight * np.r_[problem.window != window, np.ones(len(error) - problem.rows, bool)]
-        moved.append(np.linalg.lstsq(jac.T @ (keep[:, None] * jac), -jac.T @ (keep * error))[0][-1])
+        keep = problem.window != window
+        matrix, side = problem.normal(fit.x, fit.errors[:, keep], fit.jac[:, keep])
+        moved.append(np.linalg.lstsq(matrix, -side)[0][-1])
     m = len(moved)
     return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")
 
@@ -135,32 +135,22 @@ def descend(
     errors = problem.errors(x[None])[0]
     jac = problem.jacobian(x, errors)
     damping, count, fresh = 1e-2, 1, True
-    progress(count, evaluations, problem.rms(errors))
+    progress(count, evaluations, rms(errors))
     while count < evaluations:
         if not fresh:
             jac, fresh = problem.jacobian(x, errors), True
-        weight = weights(errors)
-        normal, slope = jac.T @ (weight[:, None] * jac), jac.T @ (weight * errors)
+        normal, slope = problem.normal(x, errors, jac)
         normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12
         root = np.linalg.cholesky(normal).T
         step = lsq_linear(root, -np.linalg.solve(root.T, slope), (low - x - 1e-12, high - x + 1e-12)).x
         trial = np.clip(x + step, low, high)
         tried = problem.errors(trial[None])[0]
         count += 1
-        gained = 1 - _soft(tried) / _soft(errors)
+        gained = 1 - problem.cost(trial, tried) / problem.cost(x, errors)
         damping = max(damping / 10, 1e-3) if gained > 0 else damping * 30
         if gained > 0:
             x, errors, fresh = trial, tried, False
-        progress(count, evaluations, problem.rms(errors))
+        progress(count, evaluations, rms(errors))
         if 0 <= gained < tolerance or damping > 10:
             break
     return Fit(x, errors, jac, count)
-
-
-def weights(errors: Array) -> Array:
-    """Weights of the errors that give the soft_l1 loss."""
-    return np.asarray(1 / np.sqrt(1 + (errors / SOFT) ** 2))
-
-
-def _soft(errors: Array) -> float:
-    return float((np.sqrt(1 + (errors / SOFT) ** 2) - 1).sum())

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from collections.abc import Sequence as ListOf
 from concurrent.futures import Executor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Protocol
 
@@ -24,6 +25,7 @@ CHUNK = 256  # simulations side by side
 BATCH = 64  # sequences paired together; what an interruption can cost
 
 Progress = Callable[[int, int], None]  # control steps done, total
+Clamped = tuple[tuple[str, float], ...]  # joints and where they stand, rad
 
 
 class Corrector(Protocol):
@@ -59,7 +61,8 @@ def replay(
     Returns:
         One twin per sequence, in order.
     """
-    locked: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
+    idle: list[tuple[str, ...]] = _idle_limbs(sequences, robot) if lock_idle else [()] * len(sequences)
+    locked = [_held(s, robot, limbs) for s, limbs in zip(sequences, idle, strict=True)]
     total = sum(len(s) - 1 for s in sequences)
     done = 0
     twins: dict[int, Twin] = {}
@@ -70,7 +73,8 @@ def replay(
             if progress is not None:
                 progress(before + k, total)
 
-        runs = _free_run(part, robot, corrector, nthread, tell, locked[chunk[0]], creeps)
+        clamped = locked[chunk[0]]
+        runs = _free_run(part, robot, corrector, nthread, tell, clamped, creeps)
         twins |= dict(zip(chunk, runs, strict=True))
         done += sum(len(s) - 1 for s in part)
     return [twins[i] for i in range(len(sequences))]
@@ -79,6 +83,17 @@ def replay(
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
     """Joints of limbs that no command of these sequences moves away from home and that have no operated joint."""
     return tuple(sorted(set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index))
+
+
+def _held(sequence: Sequence, robot: RobotSpec, idle: tuple[str, ...]) -> Clamped:
+    """Joints that are clamped in a free run, and where, rad: idle limbs at home, and what was not recorded where it was
+    said to stand."""
+    unknown = sequence.meta.unrecorded
+    names = tuple(j for j in robot.joint_names if j in idle or j in unknown)
+    at = sequence.qpos[0].astype(float)
+    return tuple(
+        (j, float(at[i] if j in unknown else robot.qpos_home[i])) for i, j in enumerate(robot.joint_names) if j in names
+    )
 
 
 def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str, ...]]:
@@ -94,7 +109,7 @@ def _idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> list[tuple[str
     return idle
 
 
-def _chunks(sequences: ListOf[Sequence], locked: list[tuple[str, ...]]) -> Iterator[list[int]]:
+def _chunks(sequences: ListOf[Sequence], locked: list[Clamped]) -> Iterator[list[int]]:
     """Sequences with the same limbs locked and of like length together, so that few simulations wait for a long one."""
     for limbs in dict.fromkeys(locked):
         group = [i for i, mine in enumerate(locked) if mine == limbs]
@@ -109,18 +124,36 @@ def _free_run(
     corrector: Corrector | None,
     nthread: int,
     progress: Callable[[int], None],
-    locked: tuple[str, ...],
+    clamped: Clamped,
     creeps: bool,
 ) -> list[Twin]:
-    """Sequences in order of falling length: those still running are always a prefix."""
-    lengths = np.array([len(s) for s in sequences])
+    """Sequences that have the same joints clamped."""
+    digest, locked, home = model_hash(robot), tuple(j for j, _ in clamped), np.array(robot.qpos_home)
+    home[robot.index(locked)] = [at for _, at in clamped]
+    robot = replace(robot, qpos_home=home)
     sim = BatchSim(robot, [Condition.of(s, robot) for s in sequences], nthread, locked)
     if creeps:
         loosen_friction(sim.batch)
-    free = robot.index(sim.joint_names)
-    ctrl = np.zeros((lengths[0], len(sequences), len(robot.joint_names)))
+    out = rollout(sim, sequences, corrector, progress)
+    return [Twin(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
+
+
+def rollout(
+    sim: BatchSim,
+    sequences: ListOf[Sequence],
+    corrector: Corrector | None = None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Array:
+    """Step a batch, one simulation per sequence, from the recorded start under the recorded commands.
+
+    Returns:
+        qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad; joints that are locked
+        stand at sim.robot.qpos_home. Rows of a sequence that is over are where it stood, and say nothing.
+    """
+    lengths, free = np.array([len(s) for s in sequences]), sim.robot.index(sim.joint_names)
+    ctrl = np.zeros((lengths.max(), len(sequences), len(sim.robot.joint_names)))
     out = np.zeros((4, *ctrl.shape))
-    out[0] = robot.qpos_home
+    out[0] = sim.robot.qpos_home
     for i, s in enumerate(sequences):
         ctrl[: len(s), i] = s.ctrl
     first = [np.stack([getattr(s, name)[0, free] for s in sequences]) for name in ("qpos", "qvel")]
@@ -128,21 +161,20 @@ def _free_run(
     out[0, 0][:, free], out[1, 0][:, free] = sim.qpos, sim.qvel
     if corrector is not None:
         corrector.reset(sequences)
-    running = (lengths[None, :] > np.arange(1, lengths[0])[:, None]).sum(axis=1)  # at each step
-    everyone, finished = np.arange(len(sequences)), 0
-    for t, k in enumerate(running):
+    finished, last = 0, len(ctrl) - 2
+    for t in range(last + 1):
+        ids = np.flatnonzero(lengths > t + 1)  # still running
         target = ctrl[t]
         if corrector is not None:
             target = corrector.correct(t, target, out[0, t], out[1, t])
-        sim.step(target[:, free], None if k == sim.num_envs else everyone[:k])
+        sim.step(target[:, free], None if len(ids) == sim.num_envs else ids)
         for channel, now in enumerate((sim.qpos, sim.qvel, sim.torque)):
             out[channel, t + 1][:, free] = now
         out[3, t] = target
-        finished += int(k)
-        if t % 200 == 0 or t == len(running) - 1:
+        finished += len(ids)
+        if t % 200 == 0 or t == last:
             progress(finished)
-    digest = model_hash(robot)
-    return [Twin(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
+    return out
 
 
 def pair_dataset(
@@ -163,7 +195,7 @@ def pair_dataset(
     todo = sorted((e for e in entries or dataset.entries if not dataset.has_twin(e, digest)), key=lambda e: e.rows)
     if not todo:
         return 0
-    with dataset.writing():
+    with dataset.making_twins():
         _pair(dataset, robot, todo, progress or (lambda done, total: None), lock_idle, executor)
     return len(todo)
 

@@ -96,13 +96,13 @@ def share(runs: JointRuns, values: Values, places: list[int], armature: float, t
     def errors(xs: Array) -> Array:
         """(k, 1, P) → (k, 1, rows) in SOFT, and the price of an armature other than thought."""
         found = spread(xs[:, 0])
-        rows = np.moveaxis(runs.errors(found)[..., places], 1, 0).reshape(len(xs), -1) / np.float32(SOFT)
-        far = np.sqrt(2 * HEAVY * m * runs.counted.sum()) * np.log(found["armature"][:, places[:1]] / armature)
+        rows = runs.errors(found)[:, places].reshape(len(xs), -1) / np.float32(SOFT)
+        far = np.sqrt(2 * HEAVY * m * runs.rows.max()) * np.log(found["armature"][:, places[:1]] / armature)
         return np.concatenate([rows, far], axis=1, dtype=np.float32)[:, None]
 
     first = np.stack([x[soft(errors(x[:, None])).argmin()] for x in starts])[:, None]
     low, high = np.maximum(first.min(axis=0) - wide, least), first.max(axis=0) + wide
-    scale = m * max(int(runs.counted.sum()), 1)
+    scale = m * max(int(runs.rows.max()), 1)
     x, cost = descend(
         first, low, high, errors, ITERATIONS, lambda cost: tell(SOFT * float(np.sqrt(2 * cost.min() / scale)))
     )

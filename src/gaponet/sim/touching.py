@@ -21,7 +21,7 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import soft
-from gaponet.sim.replay import idle_limbs
+from gaponet.sim.replay import idle_limbs, rollout
 from gaponet.sim.table import write_table
 
 Array = np.ndarray
@@ -163,15 +163,11 @@ class Scene:
 
     def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:
         self.parts, self.robot, self.nthread, self.op = parts, robot, nthread, robot.operated_index
-        self.locked = idle_limbs(parts, robot)
-        self.free = robot.index([j for j in robot.joint_names if j not in self.locked])
-        self.at = np.searchsorted(self.free, self.op)
-        rows = len(parts[0])
-        held = lambda x: np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])  # noqa: E731
-        self.ctrl = np.stack([held(s.ctrl[:, self.free]) for s in parts], axis=1).astype(float)
-        self.real = np.stack([held(s.qpos[:, self.op]) for s in parts], axis=1)
-        lengths = np.array([len(s) for s in parts])
-        time = np.arange(1, rows)[:, None]
+        self.locked, lengths = idle_limbs(parts, robot), np.array([len(s) for s in parts])
+        self.real = np.zeros((lengths.max(), len(parts), len(self.op)))  # zero where it does not count
+        for i, s in enumerate(parts):
+            self.real[: len(s), i] = s.qpos[:, self.op]
+        time = np.arange(1, lengths.max())[:, None]
         self.counted = (time >= SETTLE / parts[0].dt) & (time < lengths)
 
     def errors(self, xs: Array) -> Array:
@@ -184,16 +180,9 @@ class Scene:
         write_table(sim.batch, model, rows[:, 0], rows[:, 1], np.exp(rows[:, 2]))
         dof = np.array([model.joint(j).dofadr[0] for j in self.robot.operated])
         sim.batch.expand("qpos0")[:, dof] -= rows[:, 3:]
-        ctrl = np.tile(self.ctrl, (1, k, 1))
-        q0, v0 = (
-            np.tile(np.stack([getattr(s, f)[0, self.free] for s in self.parts]), (k, 1)) for f in ("qpos", "qvel")
-        )
-        sim.reset(slice(None), q0, v0, past=ctrl[0][:, None])
-        out = np.empty((len(ctrl) - 1, k, m, len(self.op)), np.float32)
-        for t in range(len(out)):
-            sim.step(ctrl[t])
-            out[t] = sim.qpos[:, self.at].reshape(k, m, -1) - self.real[t + 1]
-        return out * self.counted[:, None, :, None]
+        qpos = rollout(sim, self.parts * k)[0, 1:][..., self.op]
+        error = qpos.reshape(len(qpos), k, m, -1) - self.real[1:, None]
+        return np.asarray(error * self.counted[:, None, :, None], np.float32)
 
     def soft_errors(self, xs: Array) -> Array:
         """The same in SOFT, (k, rows)."""

@@ -62,7 +62,7 @@ def set_rng(rng: np.random.Generator, text: str) -> None:
 
 def env_state(env: DeltaEnv) -> StateDict:
     """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
-    arrays = {name: getattr(env, name) for name in ROWS} | _inputs(env) | env.sim.state()
+    arrays = {name: getattr(env, name) for name in ROWS} | {"frames": env.loop.history.frames} | env.sim.state()
     return {
         "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
         "reward": (float(env.reward_sum), env.reward_count),
@@ -70,18 +70,12 @@ def env_state(env: DeltaEnv) -> StateDict:
     }
 
 
-def _inputs(env: DeltaEnv) -> dict[str, Any]:
-    """What the next observation remembers."""
-    return {"frames": env.loop.history.frames, "age": env.loop.age, "more": env.loop.more}
-
-
 def restore_env(env: DeltaEnv, state: StateDict) -> None:
     """Undo env_state in an environment made alike."""
     arrays = {name: x.numpy() for name, x in state["arrays"].items()}
     for name in ROWS:
         getattr(env, name)[:] = env.sim.array(arrays[name])
-    for name, x in _inputs(env).items():
-        x[:] = like(x, arrays[name])
+    env.loop.history.frames[:] = like(env.loop.history.frames, arrays["frames"])
     env.sim.set_state(arrays)
     env.reward_sum, env.reward_count = state["reward"]
     set_rng(env.rng, state["rng"])

@@ -14,7 +14,6 @@ from gaponet.errors import UsageError
 from gaponet.model.config import Layers, ModelConfig
 
 if TYPE_CHECKING:
-    from gaponet.family.draw import Family
     from gaponet.robot import RobotSpec
     from gaponet.training.budget import Budget
 
@@ -107,9 +106,6 @@ class TrainConfig:
     """Seed of everything random."""
     episode_s: Annotated[float, Interval(gt=0, le=1e5)] = 40.0
     """Longest episode, s; stiction makes errors accumulate, so short episodes flatter."""
-    family: str = ""
-    """Train in many simulators drawn around this one: a .toml file, or a family of the package, wide. Each environment
-    is one of them; take more of them (--warm-start.num-envs 768), and --model.context for a model that knows which."""
     split: str = ""
     """Split file of gaponet data split; default: by motion, a fixed rule."""
     holdout_payloads: tuple[float, ...] = ()
@@ -127,25 +123,6 @@ class TrainConfig:
     device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
     """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'); warp-cpu: the same on the CPU, slowly, to
     test it. Scores, identification and robots stay on C MuJoCo."""
-
-    @property
-    def drawn(self) -> Family | None:
-        """The family trained in, if any; refuses what goes with none, or does not go with one."""
-        from gaponet.family.draw import load_family
-
-        if not self.family:
-            if self.model.context_dim:
-                raise UsageError(f"--model.context {self.model.context}: there is one simulator to know; give --family")
-            return None
-        for said, what in (
-            (self.model.asks_simulator, f"--model.sensors {self.model.sensors}"),
-            (self.model.delta_hold > 1, f"--model.delta-hold {self.model.delta_hold}"),
-            (self.mixed_gains, "--mixed-gains"),
-            (self.model.kind == "inverse", "--model inverse"),
-        ):
-            if said:
-                raise UsageError(f"--family {self.family}: does not go with {what}; leave one of them out")
-        return load_family(self.family)
 
     def network_device(self) -> str:
         """Where networks are trained, in torch's words; refuses a GPU that is not there, or what it takes."""

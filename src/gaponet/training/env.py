@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,9 @@ import torch
 from gaponet.arrays import Array, copy_of, indices, library, rows_of, single, zeros_like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
-from gaponet.family.context import context
-from gaponet.family.draw import Members
 from gaponet.model.config import ModelConfig
-from gaponet.model.loop import Ask, DeltaLoop
+from gaponet.model.loop import DeltaLoop
 from gaponet.model.observation import frames_before
-from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
@@ -40,7 +36,7 @@ class DeltaEnv:
 
     A step is a decision: its correction is held for config.delta_hold control periods; its reward is their mean.
 
-    Observation groups: "actor" = x = [o_t | a_t], and more for some models; "critic" = the recorded state now, recorded
+    Observation groups: "actor" = x = [o_t | a_t]; "critic" = the recorded state now, recorded
     positions and commands to come, payload, rate (training only: the recorded state never reaches the actor). An
     environment keeps its payload, rate and gains for life, in proportion to the frames recorded under them. A motion's
     end is a time-out, not a failure.
@@ -56,12 +52,11 @@ class DeltaEnv:
         reward: RewardConfig,
         seed: int = 0,
         nthread: int = 0,
-        members: Members | None = None,
         device: str = "cpu",
     ) -> None:
         """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
 
-        With members each environment is one simulator of a family. On "cpu" C MuJoCo steps and arrays are numpy's; on
+        On "cpu" C MuJoCo steps and arrays are numpy's; on
         "cuda" or "warp-cpu" mujoco_warp does (sim/warp.py), and they are tensors that stay there.
         """
         if not sequences:
@@ -73,17 +68,9 @@ class DeltaEnv:
         self.rng = np.random.default_rng(seed)
         self._load(sequences)
         conditions = [self.conditions[g] for g in self.group]
-        self.drawn, told = members, None
-        if members is None:
-            sim = BatchSim(robot, conditions, nthread, self.locked)
-        else:
-            sim = BatchSim(members.robot(robot), members.conditions(conditions), nthread, self.locked)
-            members.put(sim, robot)
-        if config.context != "none":
-            told = context(config.context, robot.nominal or robot, robot, conditions, members, nthread)
+        sim = BatchSim(robot, conditions, nthread, self.locked)
         self._place(sim, device)
-        ask = self._simulator(conditions, nthread, device) if config.asks_simulator else None
-        self.loop = DeltaLoop(config, sim.range[self.op], num_envs, ask=ask, context=told, of=self.now)
+        self.loop = DeltaLoop(config, sim.range[self.op], num_envs, of=self.now)
         shortest = min(c[2] for c in self.conditions)
         under_way = 1 + int(
             np.ceil(self.sim.robot.delay.max() / shortest)
@@ -143,12 +130,6 @@ class DeltaEnv:
         self.last = place(np.zeros(num, np.int64))
         self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
-
-    def _simulator(self, conditions: list[Condition], nthread: int, device: str) -> Ask:
-        oracle = ProbeOracle(
-            self.robot, self.config, conditions, nthread, self.locked, place=partial(placed, device=device)
-        )
-        return lambda ids, offsets: oracle(self.sim.qpos[ids], self.sim.qvel[ids], offsets, ids)
 
     def reset(self, ids: Array | None = None) -> None:
         """Put environments at uniformly drawn recorded frames, with the frames before as history; ids on the host."""

@@ -8,22 +8,18 @@ band leads along the recording. The label is the one nearest to the command: whe
 
 The plant is stable about u*, so the label stays right when the simulated state has drifted from the recorded one: that
 is what lets a network be fitted on the states that it visits itself.
-
-In a family of simulators τ is the sum of what its links, payload, armature and damping take, each with the member's
-factor, so that the labels of any member follow from one inverse dynamics of the recording.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from gaponet.arrays import Array, host
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.family.draw import Members
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
 from gaponet.sim.model import build_model
@@ -38,13 +34,11 @@ class Motion(NamedTuple):
     qvel: Array
     qacc: Array
     links: Array
-    """Inertia, Coriolis and gravity of the links."""
-    payload: Array
-    """The same of the payload."""
+    """Inertia, Coriolis and gravity of links and payload."""
 
 
 class Plant(NamedTuple):
-    """The numbers of a simulator that its inverse takes, each to be broadcast with (T, n)."""
+    """The numbers of a simulator that its inverse takes, each (n)."""
 
     kp: Array
     kd: Array
@@ -53,10 +47,6 @@ class Plant(NamedTuple):
     armature: Array
     offset: Array
     effort_limit: Array
-    mass: Any = 1.0
-    """Factor of the links'."""
-    laden: Any = 1.0
-    """0 where it has no payload."""
 
 
 def plant_of(robot: RobotSpec) -> Plant:
@@ -72,17 +62,13 @@ def motion_of(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> M
     qpos = lowpass(sequence.qpos.astype(float), sequence.dt, cutoff)
     qvel = differentiate(qpos, sequence.dt)
     qacc = differentiate(qvel, sequence.dt)
-    whole = links = inverse_dynamics(model, qpos, qvel, qacc)
-    if sequence.meta.payload_mass:
-        links = inverse_dynamics(build_model(robot, dt=sequence.dt), qpos, qvel, qacc)
     own = model.dof_armature * qacc + model.dof_damping * qvel
-    return Motion(qpos, qvel, qacc, links - own, whole - links)
+    return Motion(qpos, qvel, qacc, inverse_dynamics(model, qpos, qvel, qacc) - own)
 
 
 def band(motion: Motion, plant: Plant) -> tuple[Array, Array]:
     """The least and the greatest u* of servos that are not late, rad."""
-    tau = plant.mass * motion.links + plant.laden * motion.payload
-    tau = tau + plant.armature * motion.qacc + plant.damping * motion.qvel
+    tau = motion.links + plant.armature * motion.qacc + plant.damping * motion.qvel
     moving = np.tanh(np.abs(motion.qvel) / FRICTION_SPEED)  # 0 at rest: friction is anything within ±limit; 1: all
     tau = tau + moving * np.sign(motion.qvel) * plant.frictionloss
     free = (1.0 - moving) * plant.frictionloss
@@ -114,47 +100,6 @@ def inverse_labels(sequence: Sequence, robot: RobotSpec, limit: float) -> Array:
     return np.clip(delta[:, robot.operated_index], -limit, limit).astype(np.float32)
 
 
-class MemberLabels:
-    """Labels of recordings, one behind the other, in the members of a family: labels[rows], a row for each member."""
-
-    def __init__(self, sequences: ListOf[Sequence], robot: RobotSpec, members: Members, limit: float) -> None:
-        """limit: Of Δa*, rad."""
-        op = robot.operated_index
-        parts = [motion_of(s, robot) for s in sequences]
-        self.motion = Motion(*(np.concatenate([getattr(p, f)[:, op] for p in parts]) for f in Motion._fields))
-        self.ctrl = np.concatenate([s.ctrl[:, op] for s in sequences])
-        length = np.array([len(s) for s in sequences])
-        self.last = np.repeat(np.cumsum(length) - 1, length)  # row of the same recording, of every row
-        own = Plant(*(x[op] for x in plant_of(robot)[:7]))
-        self.plant = Plant(
-            own.kp * members.kp, own.kd * members.damping, own.damping * members.damping,
-            own.frictionloss * members.frictionloss, own.armature * members.armature, own.offset, own.effort_limit,
-            members.mass[:, None], members.laden[:, None].astype(float),
-        )  # fmt: skip
-        self.late, self.limit = robot.delay[op] + members.delay[:, None], limit
-        self.dt = np.repeat([s.dt for s in sequences], length)
-
-    def __getitem__(self, rows: Any) -> Array:
-        """Δa* of one row for each member, (num, n) rad; numpy whatever the rows are."""
-        rows = host(rows)
-        last, late = self.last[rows][:, None], self.late / self.dt[rows][:, None]
-        first = rows[:, None] + late.astype(int)
-        low, high = self._band(np.minimum(first, last))
-        if late.any():
-            after = self._band(np.minimum(first + 1, last))
-            low, high = (a + late % 1 * (b - a) for a, b in zip((low, high), after, strict=True))
-        ctrl = self.ctrl[rows]
-        return np.clip(np.clip(ctrl, low, high) - ctrl, -self.limit, self.limit).astype(np.float32)
-
-    def _band(self, rows: Array) -> tuple[Array, Array]:
-        """rows: (num, n)."""
-        return band(Motion(*(np.take_along_axis(x, rows, axis=0) for x in self.motion)), self.plant)
-
-
-def labels_of(
-    sequences: ListOf[Sequence], robot: RobotSpec, limit: float, members: Members | None
-) -> Array | MemberLabels:
-    """Of every row of recordings, one behind the other; with members, of every row in every one of them."""
-    if members is not None:
-        return MemberLabels(sequences, robot, members, limit)
+def labels_of(sequences: ListOf[Sequence], robot: RobotSpec, limit: float) -> Array:
+    """Of every row of recordings, one behind the other."""
     return np.concatenate([inverse_labels(s, robot, limit) for s in sequences])

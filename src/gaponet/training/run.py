@@ -29,7 +29,6 @@ from gaponet.data.sequence import require_same_gains
 from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
-from gaponet.family.draw import Members
 from gaponet.files import write_text, writing
 from gaponet.model.artifact import GapModel, make_card, recorded_gains
 from gaponet.model.baselines import delay_offset
@@ -51,8 +50,7 @@ from gaponet.training.inverse import labels_of
 from gaponet.training.kept import Kept
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import Learner, Update
-from gaponet.training.sensor_fit import points_of
-from gaponet.training.validation import PAIRS, in_members, mean_error
+from gaponet.training.validation import mean_error
 from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
 
 VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
@@ -97,7 +95,7 @@ class Trainer:
                 "what the robot runs with, or add --mixed-gains to train in simulators of the recordings' own gains"
             )
         require_disjoint(*self.parts.values(), key=lambda entry: entry.hash)
-        self.n, self.family = len(robot.operated), config.drawn
+        self.n = len(robot.operated)
         torch.manual_seed(config.seed)
         torch.set_num_threads(self.own.learner_threads)
         self.net = build_network(config.model, self.n)
@@ -159,7 +157,7 @@ class Trainer:
         config = recipe(self.own)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         limit = 0.99 * self.config.model.delta_max
-        labels = labels_of(self.train_set, self.robot, limit, env.drawn)
+        labels = labels_of(self.train_set, self.robot, limit)
         warm = WarmStart(self.net, env, labels, config, ranks.seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
         rounds: list[StateDict] = []
@@ -209,7 +207,6 @@ class Trainer:
             restore_env(env, self.kept.env)
             torch.set_rng_state(self.rng)
         self.kept.warm = None
-        env.loop.points = points_of(self.net)  # PPO does not move them: what the simulator answers has no gradient
         while self._spent() < 1:
             self.found = learner.update()
             self.kept.updates += 1
@@ -262,29 +259,18 @@ class Trainer:
         export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
 
     def _env(self, num_envs: int, episode_steps: int, seed: int, device: str | None = None) -> DeltaEnv:
-        """num_envs of this rank, which in a family are others than those of the other ranks."""
-        c, first, members = self.own, ranks.rank() * num_envs, self._members(ranks.world() * num_envs, self.config.seed)
-        members = members and members[first : first + num_envs]
-        how = c.reward, ranks.seed(seed), c.threads, members, device or c.device
+        c = self.own
+        how = c.reward, ranks.seed(seed), c.threads, device or c.device
         return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
-
-    def _members(self, num: int, seed: int) -> Members | None:
-        return None if self.family is None else Members.draw(self.family, num, self.n, seed)
 
     # ---- validation, checkpoints, card
 
     def validate(self, net: DeltaNet | None) -> float:
         """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
 
-        Nominal is the simulator before identification, also where training starts from an identified one. With a
-        family both are means over members that no environment is.
+        Nominal is the simulator before identification, also where training starts from an identified one.
         """
         what = self.config.model, net, self.own.threads
-        if (members := self._members(PAIRS, self.config.seed + 1)) is not None:
-            pairs = [(self.val_set[i % len(self.val_set)], i) for i in range(PAIRS)]
-            return ranks.mean_over(
-                pairs, lambda own: in_members([s for s, _ in own], self.robot, *what, members[[i for _, i in own]])
-            )
         robot = self.robot if net is not None else self.robot.nominal or self.robot
         return ranks.mean_over(self.val_set, lambda own: mean_error(own, robot, *what))
 
@@ -354,10 +340,9 @@ class Trainer:
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
-            val_mpjae={"model": self.kept.best, "nominal": self.nominal},
+            val_mpjae={"model": self.kept.best, "nominal": self.nominal, "start": self.kept.progress[0]["val_mpjae"]},
             sensor_r2=self.kept.sensor_r2,
             seed=self.config.seed,
-            family=self.family and asdict(self.family),
             gain=self.kept.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
             steps=self.kept.steps,

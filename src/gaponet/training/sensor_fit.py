@@ -1,7 +1,4 @@
-"""Fit the sensor predictor to what the simulator really answers, at visited and at random states, and say how well.
-
-Learned points (model/points.py) have their surrogate in the predictor's place: the same, asked at random targets.
-"""
+"""Fit the sensor predictor to what the simulator really answers, at visited and at random states, and say how well."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ import torch
 from torch import Tensor
 
 from gaponet.arrays import Array
-from gaponet.family.draw import Members
 from gaponet.model.layers import DeltaNet
 from gaponet.model.loop import Infer
 from gaponet.model.observation import Layout
@@ -33,21 +29,14 @@ class Answers:
 
     Attributes:
         features: Standardised, (k, dim).
-        answers: (k, 2nm), or (k, m, 2n) where offsets are given.
-        offsets: Targets of each state relative to q, (k, m, n) rad, where they are not the fixed probes.
+        answers: (k, 2nm).
     """
 
     features: Tensor
     answers: Tensor
-    offsets: Tensor | None
 
     def __getitem__(self, rows: Any) -> Answers:
-        offsets = None if self.offsets is None else self.offsets[rows]
-        return Answers(self.features[rows], self.answers[rows], offsets)
-
-    def predicted(self, net: DeltaNet) -> tuple[Tensor, Tensor]:
-        """Mean and log-variance, standardised."""
-        return net.predictor(self.features) if self.offsets is None else net.predictor(self.features, self.offsets)
+        return Answers(self.features[rows], self.answers[rows])
 
 
 def sensor_labels(
@@ -60,7 +49,6 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
-    members: Members | None = None,
 ) -> Answers:
     """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
@@ -71,15 +59,10 @@ def sensor_labels(
         net: Its config says the probes.
         x: What the network was given at those states, (k, dim).
         qpos, qvel: All joints that are not locked, (k, n_free).
-        members: Of a family, whose simulator is asked, one for each state.
     """
     rng = np.random.default_rng(seed)
     third = rng.integers(0, 3, len(qpos))
-    oracle, n, at = (
-        ProbeOracle(robot, net.config, conditions, nthread, locked, members=members),
-        net.n,
-        net.features.layout,
-    )
+    oracle, n, at = ProbeOracle(robot, net.config, conditions, nthread, locked), net.n, net.features.layout
     op = oracle.operated
     q, v, x = qpos.copy(), qvel.copy(), x.copy()
     near, far = np.flatnonzero(third == 1), np.flatnonzero(third == 2)
@@ -90,18 +73,10 @@ def sensor_labels(
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
     q[np.ix_(far, op)] += shift
     x[far] += shift_positions(shift, at)
-    offsets = None
-    if net.config.sensors == "learned":
-        limit = net.config.probe_large
-        offsets = rng.uniform(-limit, limit, (len(q), net.config.num_probes, n)).astype(np.float32)
-    answers = oracle(q, v, offsets)
+    answers = oracle(q, v)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
-    return Answers(
-        features.clone(),
-        torch.from_numpy(answers if offsets is not None else answers.reshape(len(q), -1)),
-        None if offsets is None else torch.from_numpy(offsets),
-    )
+    return Answers(features.clone(), torch.from_numpy(answers.reshape(len(q), -1)))
 
 
 def shift_positions(shift: Array, at: Layout) -> Array:
@@ -123,7 +98,7 @@ def fit_predictor(net: DeltaNet, asked: Answers, joints: tuple[str, ...], seed: 
     generator = torch.Generator().manual_seed(seed)
     held = len(asked.features) // 4
     train = asked[held:]
-    predictor.outputs.fit(train.answers.reshape(-1, len(predictor.outputs.mean)), floor=1e-6)
+    predictor.outputs.fit(train.answers, floor=1e-6)
     target = predictor.outputs(train.answers)
     parameters = list(predictor.parameters())
     for p in parameters:
@@ -132,7 +107,7 @@ def fit_predictor(net: DeltaNet, asked: Answers, joints: tuple[str, ...], seed: 
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
         batch = torch.randint(0, len(target), (BATCH,), generator=generator)
-        mean, log_var = train[batch].predicted(net)
+        mean, log_var = predictor(train.features[batch])
         loss = 0.5 * ((mean - target[batch]) ** 2 * (-log_var).exp() + log_var).mean()
         optimiser.zero_grad()
         loss.backward()
@@ -147,24 +122,11 @@ def explained(net: DeltaNet, asked: Answers, joints: tuple[str, ...]) -> Report:
     """R² of the predictor's mean: the share of the answers' variance over these states, averaged over sensor values."""
     with torch.inference_mode():
         truth = net.predictor.outputs(asked.answers)
-        residual = ((asked.predicted(net)[0] - truth) ** 2).mean(0)
+        residual = ((net.predictor(asked.features)[0] - truth) ** 2).mean(0)
         spread = ((truth - truth.mean(0)) ** 2).mean(0).clamp_min(1e-9)
         r2 = (1 - residual / spread).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
         return {"mean": float(r2.mean()), "by_joint": by_joint, "by_probe": r2.mean((1, 2)).tolist()}
-
-
-def points_of(net: DeltaNet) -> Infer | None:
-    """x → offsets, arrays of one kind, of a network that learns where to ask; else None."""
-    if not net.config.learns_points:
-        return None
-
-    def infer(x: Any) -> Any:
-        with torch.inference_mode():
-            offsets = net.offsets(torch.as_tensor(x))  # type: ignore[operator]
-            return offsets.numpy() if isinstance(x, np.ndarray) else offsets
-
-    return infer
 
 
 def torch_infer(net: torch.nn.Module) -> Infer:

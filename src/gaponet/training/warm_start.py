@@ -21,8 +21,7 @@ from gaponet.model.layers import DeltaNet
 from gaponet.training import ranks
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.inverse import MemberLabels
-from gaponet.training.sensor_fit import Report, fit_predictor, points_of, sensor_labels
+from gaponet.training.sensor_fit import Report, fit_predictor, sensor_labels
 
 
 def recipe(config: TrainConfig) -> WarmStartConfig:
@@ -47,15 +46,14 @@ class WarmStart:
         self,
         net: DeltaNet,
         env: DeltaEnv,
-        labels: Array | MemberLabels,
+        labels: Array,
         config: WarmStartConfig,
         seed: int,
         nthread: int = 0,
     ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.config = net, env, config
-        held = held_labels(labels, env.config.delta_hold) if isinstance(labels, np.ndarray) else labels
-        self.labels: Any = env.sim.array(held) if isinstance(held, np.ndarray) else held
+        self.labels: Any = env.sim.array(held_labels(labels, env.config.delta_hold))
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -76,7 +74,6 @@ class WarmStart:
         env, net = self.env, self.net
         env.reset()
         net.eval()
-        env.loop.points = points_of(net)
         xs, ys = [], []
         disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
         hold = env.config.delta_hold
@@ -209,6 +206,5 @@ def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: i
         env.locked,
         seed,
         nthread,
-        None if env.drawn is None else env.drawn[of[shuffled]],
     )
     return fit_predictor(net, asked, env.robot.operated, seed)

@@ -12,6 +12,7 @@ from strange_logs import motion, write_bag
 
 from gaponet.cli.main import main
 from gaponet.data.formats import detect, pickles, read_logs
+from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.errors import LogError, UsageError
 
 WRITERS = {
@@ -31,6 +32,7 @@ def test_the_same_motion_comes_out_of_each(tmp_path, arm, fmt):
     assert np.allclose(log.channels["ctrl"].values, ctrl)
     assert np.allclose(log.channels["qpos"].values, qpos)
     assert np.allclose(log.channels["qpos"].time, 0.02 * np.arange(len(qpos)), atol=1e-6)
+    assert (log.meta.get("kp"), log.meta.get("kd")) == (([20.0, 30.0], [1.0, 1.5]) if fmt == "pace" else (None, None))
 
 
 PAGE = (Path(__file__).parents[3] / "docs" / "logs.md").read_text(encoding="utf-8")
@@ -70,6 +72,12 @@ def test_half_a_file_is_one_clear_error(tmp_path, arm, fmt):
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(LogError, match=file.name + ".*not a "):
         list(read_logs(tmp_path, arm, fmt, allow_pickle=True))
+    if file.suffix in (".pt", ".npz"):  # which say where they end
+        with pytest.raises(LogError, match="it is cut short: copy or record it again"):
+            list(read_logs(tmp_path, arm, fmt))
+        file.write_bytes(b"not a zip file at all")
+        with pytest.raises(LogError, match=r"not a readable .*; is it the right file\?"):
+            list(read_logs(tmp_path, arm, fmt))
 
 
 @pytest.mark.parametrize("fmt", ["pace", "hdf5", "mat"])
@@ -92,6 +100,25 @@ def test_gaponets_motion_file_holds_several_with_their_payloads(tmp_path, arm, o
     assert [log.meta["stated"]["payload_mass"] for _, log in found] == [0.0, 0.2]
     assert [len(log.channels["qpos"].time) for _, log in found] == [40, 37 if objects else 40]
     assert np.allclose(found[0][1].channels["ctrl"].values, motion()[0])
+
+
+def test_windows_in_which_one_joint_moves_are_recordings_of_that_joint(tmp_path, arm):
+    """The others stand where logs.toml says, or at home, and both is noted."""
+    ctrl, qpos = motion()
+    columns = {"positions": qpos, "positions_cmd": ctrl, "velocities": 0 * qpos, "torques": 0 * qpos}
+    np.savez(tmp_path / "motor.npz", joint_sequence=np.array(["elbow", "shoulder"]),
+             **{f"real_dof_{name}": x.T[::-1] for name, x in columns.items()})  # fmt: skip
+    with pytest.raises(LogError, match=r"or rate = 50\.0 \(Hz\)"):
+        list(read_logs(tmp_path, arm))
+    (tmp_path / "logs.toml").write_text("[posture]\nshoulder = 0.3\n")
+    (_, elbow), (name, shoulder) = read_logs(tmp_path, arm, rate=50.0)
+    assert (name, elbow.joint_names, shoulder.joint_names) == ("motor-0001", ("elbow",), ("shoulder",))
+    assert np.allclose(elbow.channels["ctrl"].values[:, 0], ctrl[:, 1])
+    made = [to_sequence(log, arm, SequenceMeta("arm", "a", "m", 0.0)) for log in (elbow, shoulder)]
+    assert [s.meta.unrecorded for s in made] == [("shoulder",), ("elbow",)]
+    assert [s.meta.notes.get("held_at_home") for s in made] == [None, ["elbow"]]
+    assert (made[0].qpos[:, 0] == np.float32(0.3)).all()
+    assert (made[0].qvel[:, 0] == 0).all()
 
 
 def test_every_demonstration_of_robomimic_is_a_recording(tmp_path, arm):
@@ -182,7 +209,7 @@ def test_a_pt_file_that_is_no_tensors_runs_nothing(tmp_path, arm):
 
     for thing in evil(tmp_path):
         torch.save({"time": thing}, tmp_path / "a.pt")
-        with pytest.raises(LogError, match=r"a\.pt: not a readable"):
+        with pytest.raises(LogError, match=r"a\.pt: not a pickle .*; nothing of it was run"):
             list(read_logs(tmp_path, arm))
     big = torch.zeros(1).expand(1 << 40)
     torch.save({"time": big, "dof_pos": big, "des_dof_pos": big}, tmp_path / "a.pt")

@@ -172,7 +172,7 @@ def test_a_broken_file_is_named(motion, so101, file, content, message):
 @pytest.mark.parametrize("file", ["control.csv", "state_motor.csv", "joint_list.txt"])
 def test_a_missing_file_is_named(motion, so101, file):
     (motion / file).unlink()
-    with pytest.raises(LogError, match=f"{file}: missing"):
+    with pytest.raises(LogError, match=f"{file}: (is )?missing"):
         list(read_logs(motion, so101))
 
 
@@ -222,7 +222,7 @@ def test_a_header_with_positions_twice_is_refused(motion, so101):
 
 
 @pytest.mark.parametrize(("column", "unit"), [(1, "rad/s"), (2, "N·m")])
-def test_what_no_joint_does_is_refused(tmp_path, so101, column, unit):
+def test_what_no_joint_does_costs_that_channel_there_and_is_said(tmp_path, so101, column, unit):
     folder = write_so101(tmp_path / "wave")
     state = folder / "state_motor.csv"
     lines = state.read_text().split("\n")
@@ -231,4 +231,9 @@ def test_what_no_joint_does_is_refused(tmp_path, so101, column, unit):
     lines[8] = '","'.join(cells)
     state.write_text("\n".join(lines))
     with pytest.raises(LogError, match=rf"state_motor\.csv:9: .* of shoulder_pan is 1e\+30 {unit}: no joint does that"):
-        list(read_logs(folder, so101))
+        list(read_logs(folder, so101, strict=True))
+    ((_, log),) = read_logs(folder, so101)
+    channel = ("", "qvel", "tau")[column]
+    told = log.meta["notes"]["nonsense"][channel]
+    assert (told["rows"], told["joints"], told["worst"]) == (1, ["shoulder_pan"], 1e30)
+    assert abs(log.channels[channel].values[7, 0]) < 20.0

@@ -221,7 +221,7 @@ def test_a_folder_without_logs_names_the_known_formats(tmp_path, arm):
         list(read_logs(tmp_path, arm))
     with pytest.raises(LogError, match="nowhere: does not exist"):
         list(read_logs(tmp_path / "nowhere", arm))
-    with pytest.raises(LogError, match="unknown format 'ascii'; use one of sage, lerobot"):
+    with pytest.raises(LogError, match="unknown format 'ascii'; use one of sage, table, npz"):
         list(read_logs(tmp_path, arm, "ascii"))
 
 

@@ -120,6 +120,17 @@ def test_meshes_that_are_not_there_are_left_out_and_said(tmp_path):
     assert any("1 mesh(es) are not in" in note and note.endswith("link") for note in made.notes)
 
 
+def test_names_with_a_slash_and_classes_with_a_material_are_taken(tmp_path):
+    model = write_mjcf(tmp_path / "repo")
+    text = model.read_text().replace('"elbow"', '"left/elbow"').replace("<asset>", '<asset><material name="dark"/>')
+    text = text.replace("<default>\n", '<default>\n<default class="dark"><geom material="dark"/></default>\n', 1)
+    model.write_text(text.replace('<body name="wrist"', '<body name="wrist" childclass="dark"'))
+    robot = make(tmp_path, model, joints=("*shoulder", "*elbow", "*roll")).robot
+    assert robot.joint_names == ("shoulder", "left_elbow", "roll")
+    assert build_model(robot, 1.0).nv == 3
+    assert robot.resolve("left/elbow", "a.csv") == "left_elbow"
+
+
 def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
     made = make(tmp_path, write_urdf(tmp_path), kp=("50",))
     assert made.robot.joint_names == ("lift", "bend")

@@ -9,7 +9,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding, names, some
 from gaponet.data.holds import StaticError, join, static_error
-from gaponet.data.signals import FAST
+from gaponet.data.signals import FAST, sharp
 from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
 
@@ -38,11 +38,13 @@ def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"state follows command after (median and range over motions at {FAST} rad/s or faster) {told}: "
         f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
     )
-    own = servo_lag(robot)
-    extra = {name: float(np.median(x)) - own[name] for name, x in found.items() if name in robot.operated}
+    own, jumps = servo_lag(robot), dict(zip(robot.joint_names, sharp([s.response for s in surveys]), strict=True))
+    asked = [name for name in found if name in robot.operated and not jumps[name]]  # of others `timing` sees more
+    extra = {name: float(np.median(found[name])) - own[name] for name in asked}
     usual = float(np.median(list(extra.values()))) if extra else 0.0
-    words = next(word for most, word in DEAD_TIMES if usual <= most)
-    text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {words}"
+    if extra:
+        words = next(word for most, word in DEAD_TIMES if usual <= most)
+        text += f". Beyond what kp and damping make of it that is {usual * 1e3:.0f} ms of dead time: {words}"
     level = "warning" if usual > LONG else "note" if np.median(every) > period else "ok"
     yield Finding(level, "lag", text, tuple(found), {name: lag_values(x) for name, x in found.items()})
     for name, late in extra.items():

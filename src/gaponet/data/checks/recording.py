@@ -12,6 +12,7 @@ from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
 
 COARSE = 3e-3  # rad
+HALTED = 1.0  # s
 ENOUGH = 20  # rows of torque cut off flat
 
 
@@ -72,11 +73,38 @@ def jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "jumps", "no joint jumps")]
 
 
+def nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Was a channel made up for where it could not be?"""
+    told: dict[str, list[Survey]] = defaultdict(list)
+    for s in surveys:
+        for channel in s.entry.meta.notes.get("nonsense", {}):
+            told[channel].append(s)
+    for channel, found in told.items():
+        notes = [s.entry.meta.notes["nonsense"][channel] for s in found]
+        rows, done = sum(n["rows"] for n in notes), ", ".join(dict.fromkeys(n["done"] for n in notes))
+        joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
+        text = (
+            f"{channel} of {some(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} rows "
+            f"of {some([s.motion for s in found])}, a counter or a bad read: there it is {done}"
+        )
+        yield Finding("warning", "nonsense", text, joints, {"rows": rows})
+    if not told:
+        yield Finding("ok", "nonsense", "no channel holds what no joint does")
+
+
 def blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
-    """Did a joint run into a stop?"""
+    """Did a joint run into a stop, or were all of them held?"""
     found = []
+    held = [s for s in surveys if s.halted_s >= HALTED]
+    if held:
+        worst = max(held, key=lambda s: s.halted_s)
+        text = (
+            f"all joints stand still for up to {worst.halted_s:.1f} s while their commands move on in "
+            f"{some([s.motion for s in held])}: an emergency stop, brakes, or drives that were off; cut it out"
+        )
+        found.append(Finding("warning", "stop", text, (), {"seconds": worst.halted_s}))
     for i, name in enumerate(robot.joint_names):
-        hit = [s for s in surveys if s.blocked_s[i] >= 0.5]
+        hit = [s for s in surveys if s.blocked_s[i] >= 0.5 and s not in held]
         if hit:
             worst = max(hit, key=lambda s: s.blocked_s[i])
             text = (

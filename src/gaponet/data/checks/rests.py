@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 
@@ -27,6 +28,8 @@ SOFTNESS = (0.5, 1.8)
 LOAD = 0.01  # rad of nominal sag (rms), below which softness says nothing
 APART = 0.03  # rad between sequences of one robot
 MASS, SHARE = 0.25, 0.5  # of the heaviest label, or kg; of a sequence's misfit that another mass must explain
+EVIDENCE = 10.0  # of other labels: rests times the logarithm by which their scatter falls
+UNITS, CLEAR = 0.006, 6.0  # rad between two groups of recordings, and times the scatter inside them
 PLAIN = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
 USUAL = np.array([0.5, 0.5, 1.0, 0.1])  # how far they may be from it, where rests do not say
 ODD = 10  # sequences that are told apart
@@ -64,7 +67,12 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
     if not judged:
         yield Finding("ok", "rests", "too few rests: offsets, scales, gains and payloads cannot be told; add holds")
         return
-    wrong: list[Finding] = []
+    wrong = _relabelled(surveys, found, judged)
+    if not wrong:
+        wrong = _two_units(surveys, robot, found, judged)
+    if wrong:
+        yield from wrong
+        return
     while len(wrong) < ODD and (odd := _odd_one(surveys, robot, found, judged)) is not None:
         wrong.append(odd[1])
         found = found.only(found.sequence != odd[0])
@@ -74,7 +82,7 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
         name, fit = robot.joint_names[j], _fit(found.only(found.joint == j))
         wrong += _joint(name, fit)
         sag = float(np.sqrt(np.mean(found.columns[found.joint == j, 2] ** 2)))
-        if sag > LOAD and _sure(fit)[2] and not SOFTNESS[0] < fit.x[2] < SOFTNESS[1]:
+        if sag > LOAD and fit.x[2] > 0 and _sure(fit)[2] and not SOFTNESS[0] < fit.x[2] < SOFTNESS[1]:
             soft[name] = float(fit.x[2])
     if soft:
         softness = float(np.median(list(soft.values())))
@@ -152,6 +160,59 @@ def _joint(name: str, fit: Fit) -> Iterator[Finding]:
             f"taken off: a constant offset, {how}; gaponet identify finds it, or take it off at import"
         )
         yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
+
+
+def _relabelled(surveys: list[Survey], found: Rests, judged: list[int]) -> list[Finding]:
+    """Would the labels' masses in another order explain the rests better?"""
+    mass = np.array([s.entry.meta.payload_mass for s in surveys])[found.sequence]
+    labels = sorted(set(mass.tolist()))
+    if not 1 < len(labels) <= 3:
+        return []
+    best = (0.0, labels)
+    for order in [list(p) for p in permutations(labels)][1:]:
+        other = np.array(order)[np.searchsorted(labels, mass)]
+        columns = found.columns + np.outer((other - mass) * found.per_kg, np.eye(4)[2])
+        evidence = 0.0
+        for j in judged:
+            mine = found.joint == j
+            fits = [_solve(c[mine], found.error[mine])[2] for c in (found.columns, columns)]
+            evidence += float(mine.sum() * np.log(fits[0] / fits[1]))
+        best = max(best, (evidence, order))
+    if best[0] < max(EVIDENCE, 0.1 * len(found.error)):
+        return []
+    told = ", ".join(f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b)
+    text = f"what is labelled {told}: payload labels in each other's place? Import again with the right --payload-mass"
+    return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
+
+
+def _two_units(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: list[int]) -> list[Finding]:
+    """Do the recordings fall into two groups that rest apart, in two joints at least?"""
+    middle = np.full((len(surveys), len(judged)), np.nan)
+    for column, j in enumerate(judged):
+        mine = found.only(found.joint == j)
+        left = mine.error - mine.columns @ _solve(mine.columns, mine.error)[0]
+        for number in set(mine.sequence.tolist()):
+            if (mine.sequence == number).sum() > 2:
+                middle[number, column] = np.median(left[mine.sequence == number])
+    told = np.flatnonzero(np.isfinite(middle).all(axis=1))
+    best: tuple[int, float, list[str], Array] = (1, 0.0, [], told[:0])
+    for column in range(len(judged)):
+        order = told[np.argsort(middle[told, column])]
+        for cut in range(2, len(order) - 1):
+            a, b = middle[order[:cut]], middle[order[cut:]]
+            gap = np.abs(a.mean(axis=0) - b.mean(axis=0))
+            within = np.sqrt((a.var(axis=0) * len(a) + b.var(axis=0) * len(b)) / (len(order) - 2))
+            apart = (gap > UNITS) & (gap > CLEAR * np.maximum(within, 5e-4))
+            names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
+            best = max(best, (len(names), float(gap.max()), names, order[:cut]), key=lambda x: x[:2])
+    if best[0] < 2:
+        return []
+    motions = [[surveys[i].motion for i in told if (i in best[3]) == side] for side in (True, False)]
+    text = (
+        f"{some(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {some(motions[1])} do ({some(best[2])}): "
+        "two robots under one name, or zeros set in between? Import one part with another --unit-id"
+    )
+    return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
 
 
 def _odd_one(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: list[int]) -> tuple[int, Finding] | None:

@@ -12,8 +12,9 @@ from gaponet.data.checks.finding import Finding, some
 from gaponet.data.survey import Survey
 from gaponet.robot import RobotSpec
 
-SCALE = (0.5, 1.1)  # a loaded joint falls short of its commands; it does not overshoot them all
+SCALE = (0.5, 1.25)  # a loaded joint falls short of its commands, and beyond them where its load stands on it
 OWN, OTHER, SEVERAL = 0.8, 0.95, 3  # correlations with the own joint and another's, and the motions to tell it
+APART, ALIKE = 0.7, 0.7  # of the state's own spread from its command; correlation with what else a command may be
 MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
 
 
@@ -58,6 +59,27 @@ def _together(surveys: list[Survey], asked: Array) -> dict[tuple[int, int], list
         if j != i and min(cross[i, j], cross[j, i]) > OTHER and own[j] < OWN:
             found[int(i), j] = follows[follows[:, i, j] > OTHER, i, j].tolist()
     return found
+
+
+def command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Are the commands positions?"""
+    column = lambda field: np.stack([getattr(s, field) for s in surveys])[:, robot.operated_index]  # noqa: E731
+    beside = column("beside")
+    judged = np.isfinite(beside) & (np.stack([s.ctrl_range for s in surveys])[:, robot.operated_index] > 0)
+    if not judged.any() or float(np.median(beside[judged])) < APART:
+        yield Finding("ok", "command", "commands are positions that the joints come near")
+        return
+    like = {
+        what: float(np.median(column(f)[judged]))
+        for what, f in (("velocities", "as_velocity"), ("torques", "as_torque"))
+    }
+    best = max(like, key=lambda what: np.nan_to_num(like[what]))
+    what = f"they are most like {best} (correlation {like[best]:.2f})" if like[best] > ALIKE else "are they torques?"
+    text = (
+        f"states are {np.median(beside[judged]):.2f} times as far from their commands as from their own mean: these "
+        f"are no position targets; {what}. Log the targets of the position controller"
+    )
+    yield Finding("error", "command", text, (), like)
 
 
 def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.log import UNITS, Log
+from gaponet.data.log import UNITS, Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
 
 # Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
 MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}
+FASTER = 50.0  # rad/s beyond ten times as fast as the positions ever move
+MOSTLY = 0.2  # of a joint's rows: more nonsense than this, and nothing of the channel is believed
 UNASKED = 1.0  # rad that no joint moves of itself while all are told to stand still
 
 
@@ -39,32 +42,69 @@ def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: li
     return out
 
 
-def refuse_absurd(log: Log, robot: RobotSpec) -> Log:
-    """Return the log, or refuse positions that can only be degrees (or another joint's), and what no motor does.
+def refuse_absurd(log: Log, robot: RobotSpec, strict: bool = False) -> Log:
+    """Return the log without what no joint does, or refuse it.
 
+    Positions that can only be degrees (or another joint's) refuse it. Where velocity, torque or temperature is
+    nonsense, a counter for a speed, that channel is made up for in those rows and the log notes it (notes, "nonsense"):
+    velocity from positions, others from the rows around them; a channel that is mostly nonsense is left out. `strict`
+    refuses it.
     A sensor may read more torque than the motor has, not 20 times as much.
     """
-    columns = robot.index(log.joint_names)
     still, moved = (np.ptp(log.channels[name].values, axis=0).max() for name in ("ctrl", "qpos"))
     if still == 0 and moved > UNASKED:
         raise LogError(
             f"{log.source}: every commanded position stands still while the joints move by up to {moved:.3g} rad: a "
             "robot driven by torques, by velocities or by hand; such commands are no position targets to learn from"
         )
+    channels, told = dict(log.channels), {}
     for name in (n for n in UNITS if n in log.channels):
         values = log.channels[name].values
         if name in ("ctrl", "qpos"):
             refuse_degrees(values, log.joint_names, robot, partial(_place, log, name))
             continue
-        most = np.maximum(20 * robot.effort_limit[columns], 100.0) if name == "tau" else MOST[name]
-        beyond = np.argwhere(np.abs(values) > most)
-        if len(beyond):
-            row, column = beyond[0]
+        wrong = _nonsense(name, log, robot)
+        if strict and wrong.any():
+            row, column = np.argwhere(wrong)[0]
             raise LogError(
                 f"{log.row(name, int(row))}: {name} of {log.joint_names[column]} is {values[row, column]:.4g} "
                 f"{UNITS[name]}: no joint does that; repair or cut the row, or leave the column out"
             )
-    return log
+        if wrong.any():
+            kept = wrong.mean(axis=0).max() <= MOSTLY
+            told[name] = {
+                "rows": int(wrong.any(axis=1).sum()), "of": len(values), "worst": float(values[wrong][0]),
+                "joints": [j for j, bad in zip(log.joint_names, np.ravel(wrong.any(axis=0)), strict=True) if bad],
+                "done": "left out" if not kept else "from positions" if name == "qvel" else "from the rows around them",
+            }  # fmt: skip
+            channels.pop(name)
+            channels |= {name: Channel(log.channels[name].time, _made_up(name, log, wrong))} if kept else {}
+    if not told:
+        return log
+    return replace(log, channels=channels, meta=log.meta | {"notes": log.meta.get("notes", {}) | {"nonsense": told}})
+
+
+def _nonsense(name: str, log: Log, robot: RobotSpec) -> Array:
+    """Where a channel holds what no joint does, (k, n)."""
+    values = np.abs(log.channels[name].values)
+    if name == "tau":
+        return np.asarray(values > np.maximum(20 * robot.effort_limit[robot.index(log.joint_names)], 100.0))
+    if name != "qvel":
+        return values > MOST[name]
+    time, qpos = log.channels["qpos"]
+    fastest = np.abs(np.diff(qpos, axis=0) / np.diff(time)[:, None]).max(axis=0)
+    return np.asarray(values > np.minimum(FASTER + 10 * fastest, MOST[name]))
+
+
+def _made_up(name: str, log: Log, wrong: Array) -> Array:
+    """A channel whose wrong values, (k, n), come from positions or from the rows around them."""
+    (at, qpos), (time, values) = log.channels["qpos"], log.channels[name]
+    out = np.array(values, float)
+    for j in np.flatnonzero(wrong.any(axis=0)):
+        bad = wrong[:, j]
+        known = (at, np.gradient(qpos[:, j], at)) if name == "qvel" else (time[~bad], values[~bad, j])
+        out[bad, j] = np.interp(time[bad], *known)
+    return out
 
 
 def _place(log: Log, name: str, row: int) -> str:

@@ -2,7 +2,8 @@
 
 format = "table"                          # where it cannot be seen
 motion = "{motion}_{payload:g}kg_{rep}"   # what the name of a recording says; with a slash: of its path
-manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, rep, kp, kp.<joint>, …
+manifest = "sheet.csv"                    # or a table: file, motion, unit, payload, rep, kp, kp.<joint>, …; estimated
+                                          # says which of these are no more than that, leave_out is yes or no
 unit = "lab-1"                            # of all recordings; payload = 0.0, side = "both" likewise
 time = "t"                                # column of the clock; or rate = 50.0 (Hz) where the log has none
 time_unit = "ms"                          # s, ms, us, ns
@@ -21,6 +22,7 @@ kp = 20.0                                 # while recording, N·m/rad; kd likewi
 [joint_units]                             # where one joint's position is in another unit
 [signs]                                   # elbow = -1: the log counts the other way round
 [offsets]                                 # rad to add to positions, after unit and sign
+[posture]                                 # elbow = 0.9: where a joint stood, rad, that the log does not hold
 [clock]                                   # a channel's own clock: ctrl = "t_cmd"
 """
 
@@ -52,7 +54,8 @@ FIELDS = {
     "motion": ("motion", r".+"), "unit": ("unit_id", r".+"), "side": ("payload_side", r"[^_/]+"),
     "payload": ("payload_mass", r"\d+(?:[.p]\d+)?"), "rep": ("repetition", r"\d+"),
     "level": ("level", r"[a-z_]+"), "virtual": ("virtual", r"yes|no"),
-    "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "": ("", r".+?"),
+    "kp": ("kp", r"\d+(?:[.p]\d+)?"), "kd": ("kd", r"\d+(?:[.p]\d+)?"), "estimated": ("estimated", r".+"),
+    "leave_out": ("leave_out", r"yes|no"), "": ("", r".+?"),
 }  # fmt: skip
 MOST_LOOSE = 3  # of a pattern's words that match anything: each more makes a name that does not fit slower to refuse
 NUMBERS = ("payload_mass", "repetition", "kp", "kd")
@@ -88,6 +91,7 @@ class LogsFile(TypedDict, total=False):
     joint_units: dict[str, str]
     signs: dict[str, Sign]
     offsets: dict[str, Offset]
+    posture: dict[str, Offset]
     clock: dict[str, str]
 
 
@@ -182,8 +186,8 @@ def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
             except ValueError:
                 raise LogError(f"{where}: {word} is '{text}', not a number ≥ 0; mend it") from None
             value = int(value) if field == "repetition" else value
-        if field == "virtual":
-            value = _yes(text, where)
+        if field in ("virtual", "leave_out"):
+            value = _yes(field, text, where)
         if joint:
             gains = found.get(field, {})
             value = (gains if isinstance(gains, dict) else {"": gains}) | {joint: value}
@@ -191,9 +195,9 @@ def _fields(said: dict[str, str], where: str) -> dict[str, Any]:
     return found
 
 
-def _yes(text: str, where: str) -> bool:
+def _yes(word: str, text: str, where: str) -> bool:
     if text.strip() not in ("yes", "no"):
-        raise LogError(f"{where}: virtual is '{text}'; write yes or no")
+        raise LogError(f"{where}: {word} is '{text}'; write yes or no")
     return text.strip() == "yes"
 
 

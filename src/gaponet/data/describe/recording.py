@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -134,13 +135,31 @@ def reading(file: Path, what: str) -> Iterator[None]:
     """Whatever a damaged file makes a library do becomes one error: they raise a dozen kinds, and name none."""
     try:
         yield
-    except LogError:
+    except (LogError, MemoryError, ImportError):
         raise
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise LogError(
-            f"{file}: not a readable {what} ({reason}); it may be cut short: copy or record it again"
-        ) from None
+        hint = "it is cut short: copy or record it again" if _cut_short(file, error) else "is it the right file?"
+        raise LogError(f"{file}: not a readable {what} ({reason}); {hint}") from None
+
+
+ENDS = {b"\x89MCAP0\r\n": b"\x89MCAP0\r\n", b"PAR1": b"PAR1"}  # how files begin → how those that are whole end
+
+
+def _cut_short(file: Path, error: Exception) -> bool:
+    """Whether a file begins as it should, or not at all, and its end is missing."""
+    if isinstance(error, EOFError) or re.search(r"truncated|unexpected(ly)? end|end.of.file", str(error).lower()):
+        return True
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        start = stream.read(8)
+        stream.seek(max(0, file.stat().st_size - 8))
+        stop = stream.read(8)
+    if start.startswith(b"PK\x03\x04"):
+        return not zipfile.is_zipfile(file)
+    return any(start == begin[: len(start)] or (start.startswith(begin) and not stop.endswith(end))
+               for begin, end in ENDS.items())  # fmt: skip
 
 
 Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)

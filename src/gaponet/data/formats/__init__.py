@@ -35,19 +35,27 @@ from gaponet.data.describe.logs_file import LogsFile, Naming, find_file, read_lo
 from gaponet.data.describe.recording import COMMAND, Recording, to_log
 from gaponet.data.log import Channel, Log, skipped
 from gaponet.errors import LogError, UsageError
+from gaponet.parts import offered
 from gaponet.robot import RobotSpec
 
-FORMATS = ("sage", "lerobot", "bam", "table", "rosbag", "hdf5", "npz", "mat", "pace", "asap")
+CORE = {name: f"gaponet.data.formats.{name}" for name in ("sage", "table", "npz")}  # parts bring others
 LOOK = 20  # recordings that are looked at before they are described
-ALWAYS = ("names", "ignore", "signs", "offsets", "motion", "manifest", "unit", "payload", "side", "kp", "kd", "format")
+ALWAYS = ("names", "ignore", "signs", "offsets", "posture", "motion", "manifest", "unit", "payload", "side", "kp", "kd",
+          "format")  # fmt: skip
 DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
+
+
+def formats() -> dict[str, str]:
+    """Every format that this installation reads → its reader's module."""
+    return CORE | offered("FORMATS")
 
 
 def module(fmt: str) -> ModuleType:
     """The reader of a format."""
-    if fmt not in FORMATS:
-        raise LogError(f"unknown format '{fmt}'; use one of {', '.join(FORMATS)}")
-    return import_module(f"gaponet.data.formats.{fmt}")
+    known = formats()
+    if fmt not in known:
+        raise LogError(f"unknown format '{fmt}'; use one of {', '.join(known)}")
+    return import_module(known[fmt])
 
 
 def about(fmt: str) -> str:
@@ -67,12 +75,12 @@ def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    found = [fmt for fmt in FORMATS if module(fmt).detects(path)]
+    found = [fmt for fmt in formats() if module(fmt).detects(path)]
     if len(found) > 1:
         ways = " or ".join(f"--format {fmt}" for fmt in found)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")
     if not found:
-        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in FORMATS)
+        known = "; ".join(f"{fmt}: {about(fmt)}" for fmt in formats())
         raise LogError(f"{path}: not a log this version reads. Known formats: {known}")
     return found[0]
 
@@ -91,6 +99,8 @@ def read_logs(
     position_unit: str | None = None,
     time_unit: str | None = None,
     allow_pickle: bool = False,
+    rate: float | None = None,
+    strict: bool = False,
 ) -> Iterator[tuple[str, Log]]:
     """Yield (motion name, Log) for every recording under a path.
 
@@ -98,10 +108,13 @@ def read_logs(
     cannot be read are left out, and both are listed there.
 
     Args:
-        fmt: One of FORMATS; default by looking.
+        fmt: One of formats(); default by looking.
         joint_map: The log's name of a joint → the robot's; wins over logs.toml.
         logs: A logs.toml (data.describe.logs_file); default the one in the folder of the logs.
-        position_unit, time_unit: Win over logs.toml; refused where the format itself fixes them.
+        position_unit, time_unit, rate: Win over logs.toml; refused where the format itself fixes them. rate, Hz, is
+            of logs without a clock.
+        strict: Refuse a recording whose velocity, torque or temperature is nonsense somewhere, instead of making up for
+            that channel there (data.describe.limits).
         allow_pickle: Open pickled files, with an unpickler that makes arrays, numbers and text and nothing else.
 
     Raises:
@@ -109,19 +122,19 @@ def read_logs(
     """
     told, file = _described(path, logs)
     reader = _reader(path, fmt or told.get("format"))
-    told = told | {k: v for k, v in (("position_unit", position_unit), ("time_unit", time_unit)) if v is not None}  # type: ignore[assignment]
+    by_hand = {"position_unit": position_unit, "time_unit": time_unit, "rate": rate}
+    told = told | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
     kind = _require_allowed(reader, path, allow_pickle)
     for name in told:
         if name not in ALWAYS and name not in reader.OPTIONS:
-            by_hand = {"position_unit": position_unit, "time_unit": time_unit}.get(name) is not None
-            said = f"--{name.replace('_', '-')}" if by_hand else f"{file}: {name}"
+            said = f"--{name.replace('_', '-')}" if by_hand.get(name) is not None else f"{file}: {name}"
             raise UsageError(f"{said} means nothing to the {kind} format, which fixes it itself; leave it out")
     names = told.get("names", {}) | (joint_map or {})
     naming, root = Naming(told, file), path if path.is_dir() else path.parent
     bad = skipped()
     for name, load in _loaders(reader, path, robot, told, names):
         try:
-            log = _corrected(refuse_absurd(load(), robot), robot, told, names)
+            log = _corrected(refuse_absurd(load(), robot, strict), robot, told, names)
         except LogError as error:
             if bad is None:
                 raise
@@ -130,6 +143,8 @@ def read_logs(
         inside, _, part = log.source.partition("#")
         place = Path(inside).relative_to(root).as_posix()
         words = naming.of(name, place + ("#" + part if part else ""))
+        if words.pop("leave_out", False):
+            continue
         yield str(words.pop("motion", name)), _named(log, words, robot, names)
     naming.require_all_used()
 
@@ -211,7 +226,10 @@ def _beside_clock(told: LogsFile) -> dict[str, str]:
 
 
 def _corrected(log: Log, robot: RobotSpec, told: LogsFile, names: dict[str, str]) -> Log:
-    """Signs and offsets, where logs.toml says some; both are noted."""
+    """Signs and offsets, where logs.toml says some, noted; and where joints stood that the log does not hold."""
+    stood = {robot.resolve(j, "[posture] of logs.toml", names): v for j, v in told.get("posture", {}).items()}
+    if stood:
+        log = replace(log, meta=log.meta | {"posture": stood})
     signs, offsets = ({robot.resolve(j, f"[{t}] of logs.toml", names): v for j, v in told.get(t, {}).items()}  # type: ignore[attr-defined]
                       for t in ("signs", "offsets"))  # fmt: skip
     if not signs and not offsets:
@@ -236,6 +254,8 @@ def _named(log: Log, said: dict[str, Any], robot: RobotSpec, names: dict[str, st
     for name in ("kp", "kd"):
         if name in said:
             meta[name] = _gains(name, said.pop(name), log, robot, names)
+    if "estimated" in said:
+        meta["notes"] = meta.get("notes", {}) | {"estimated": said.pop("estimated")}
     for name, value in said.items():
         if stated.get(name) not in (None, value):
             raise UsageError(f"{log.source}: {name} is {stated[name]} in the file and {value} in logs.toml; mend one")

@@ -2,8 +2,10 @@
 
 What gaponet data export wrote says everything itself. GAPONet's files hold many motions in one: real_dof_positions_cmd,
 real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero rows, or one array
-per motion; joint_sequence; payloads. They have no clock: logs.toml says rate = 50.0. In plain files logs.toml says
-which array is what; text in joint_names names the columns. Arrays of objects are opened as data.formats.pickles says.
+per motion; joint_sequence; payloads; or windows in which one joint moves, (windows, rows), with that joint's name in
+joint_sequence, (windows,). They have no clock: logs.toml says rate = 50.0, or --rate 50 does. In plain files logs.toml
+says which array is what; text in joint_names names the columns. Arrays of objects are opened as data.formats.pickles
+says.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from gaponet.data.describe.recording import Recording, from_arrays, reading, res
 from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 from gaponet.errors import LogError
+from gaponet.process.sandbox import inside
 from gaponet.structure import LARGEST_ARRAYS, parse_json
 
 OPTIONS = DESCRIBED
@@ -28,11 +31,10 @@ EXTRA = ""
 DEFAULT: LogsFile = {"time": "time"}
 GAPONET: LogsFile = {
     "ctrl": "real_dof_positions_cmd", "qpos": "real_dof_positions", "qvel": "real_dof_velocities",
-    "tau": "real_dof_torques", "position_unit": "rad",
+    "tau": "real_dof_torques", "position_unit": "rad", "time_unit": "s",
 }  # fmt: skip
 NAMES = ("joint_names", "joint_sequence", "dof_names")
 OURS = "gaponet"  # array with JSON in a file of ours
-CYCLES = ".cycles.npz"  # every period of a controller; deploy/recording.py writes it beside the table of its motion
 
 
 def detects(path: Path) -> bool:
@@ -41,8 +43,8 @@ def detects(path: Path) -> bool:
 
 
 def find(path: Path) -> list[Path]:
-    """The files, but for what a controller did beside its log."""
-    return [file for file in files_under(path, (".npz",)) if not file.name.endswith(CYCLES)]
+    """The files."""
+    return files_under(path, (".npz",))
 
 
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
@@ -72,9 +74,11 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
     """GAPONet's: the first axis counts motions."""
     keys = [k for k in GAPONET.values() if k in arrays]
     count = min(len(arrays[k]) for k in keys)
+    single = len(names) == count and all(arrays[k].dtype != object and arrays[k].ndim == 2 for k in keys)
     payloads = np.asarray(arrays["payloads"]).ravel() if "payloads" in arrays else ()
     for i in range(count):
         one = {k: np.asarray(arrays[k][i], float) for k in keys}
+        one = {k: a[:, None] for k, a in one.items()} if single else one
         if any(a.ndim != 2 for a in one.values()):
             raise LogError(f"{file}: motion {i} of {', '.join(keys)} is not rows of joints; write it again")
         rows = min(len(a) for a in one.values())
@@ -83,11 +87,13 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
         )
         end = int(used[-1]) + 1 if len(used) else 0  # behind it zeros pad the array
         stated = {"payload_mass": float(payloads[i])} if len(payloads) == count else {}
-        default = {k: v for k, v in GAPONET.items() if v in one or k == "position_unit"}
+        default = {k: v for k, v in GAPONET.items() if v in one or k.endswith("_unit")}
         one = {k: a[:end] for k, a in one.items()}
-        yield from_arrays(file, one, names, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default)
+        joints = names[i : i + 1] if single else names
+        yield from_arrays(file, one, joints, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default)
 
 
+@inside(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects through pickles.load."""
     with reading(file, "npz file"), zipfile.ZipFile(file) as packed:

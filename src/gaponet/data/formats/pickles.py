@@ -1,14 +1,17 @@
-"""Strangers' pickles, opened without running anything: numbers, text, lists, dictionaries and NumPy arrays come out.
+"""Strangers' pickles, opened without running anything: numbers, text, lists, dictionaries, arrays and tensors come out.
 
 A pickle names functions to call. Here each name that is not on a short list is refused, and those on it are not NumPy's
-own functions but stand-ins that note what was meant; arrays are made of that afterwards, with type and size checked.
+or torch's own functions but stand-ins that note what was meant; arrays are made of that afterwards, with type and size
+checked.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import zlib
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +20,8 @@ from gaponet.errors import LogError
 from gaponet.structure import LARGEST_ARRAYS
 
 KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
+STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",
+            "Byte": "u1", "Bool": "b1"}  # torch's name → dtype  # fmt: skip
 MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
 
 
@@ -96,6 +101,22 @@ class _Scalar:
         return np.frombuffer(self.data, self.kind.real())[0]
 
 
+class _Tensor:
+    """A tensor that was meant: a view of a storage, which the persistent id before it named."""
+
+    def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> None:
+        if not isinstance(storage, np.ndarray) or not isinstance(size, tuple) or not isinstance(stride, tuple):
+            raise RefusedError("a tensor without storage, size or stride")
+        if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)):
+            raise RefusedError("a tensor whose size is not numbers")
+        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+        if math.prod(size) and last >= len(storage):
+            raise RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
+        steps, self.array = [n * storage.itemsize for n in stride], None
+        if math.prod(size) <= len(storage):  # one may claim to be large by repeating one number: it is left alone
+            self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
+
+
 def _new(*_: Any) -> _Array:
     return _Array()
 
@@ -114,15 +135,17 @@ MEANT = {
     **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
     ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped, ("_codecs", "encode"): _codec,
     ("collections", "OrderedDict"): dict, ("builtins", "bytearray"): bytearray,
+    ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
+    **{("torch", f"{name}Storage"): kind for name, kind in STORAGES.items()},
 }  # fmt: skip
 
 
 class _Unpickler(pickle._Unpickler):
     """Python's own, slow one: what it keeps is bounded by what it has read, and BUILD can be seen."""
 
-    def __init__(self, stream: io.BytesIO) -> None:
+    def __init__(self, stream: io.BytesIO, storage: Callable[[str], bytes] | None) -> None:
         super().__init__(stream)
-        self.stream = stream
+        self.stream, self.storage = stream, storage
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in MEANT:
@@ -130,7 +153,10 @@ class _Unpickler(pickle._Unpickler):
         return MEANT[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
-        raise RefusedError("a persistent id")
+        known = isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[1], str) and pid[1] in STORAGES.values()
+        if self.storage is None or not known:
+            raise RefusedError("a persistent id that is no storage of tensors")
+        return np.frombuffer(self.storage(str(pid[2])), np.dtype("<" + pid[1]))
 
     def load_build(self) -> None:
         stack = self.stack  # type: ignore[attr-defined]
@@ -145,8 +171,11 @@ class _Unpickler(pickle._Unpickler):
     dispatch: ClassVar[Any] = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}
 
 
-def load(data: bytes, where: str) -> Any:
+def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None) -> Any:
     """What a pickle (or an uncompressed or zlib joblib file) holds.
+
+    Args:
+        storage: Of a file of torch's: key → the bytes of a storage of tensors, little-endian.
 
     Raises:
         LogError: It names anything else, is damaged, or too large.
@@ -160,7 +189,7 @@ def load(data: bytes, where: str) -> Any:
             raise RefusedError("too many values")
         if isinstance(x, (_Array, _Scalar)):
             return x.real(made)
-        if isinstance(x, _Wrapped):
+        if isinstance(x, (_Wrapped, _Tensor)):
             return x.array
         if isinstance(x, dict):
             return {k: made(v) for k, v in x.items()}
@@ -174,7 +203,7 @@ def load(data: bytes, where: str) -> Any:
         if data[:1] == b"\x78":
             packed = zlib.decompressobj()
             data = packed.decompress(data, LARGEST_ARRAYS)
-        return made(_Unpickler(io.BytesIO(data)).load())
+        return made(_Unpickler(io.BytesIO(data), storage).load())
     except Exception as error:  # a damaged stream makes the machine of a pickle fail in any way
         reason = " ".join(str(error).split())[:150] or type(error).__name__
         raise LogError(f"{where}: not a pickle of arrays, numbers and text ({reason}); nothing of it was run") from None

@@ -22,6 +22,7 @@ from gaponet.data.describe.limits import to_radians
 from gaponet.data.log import Channel, Log
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec
+from gaponet.structure import LARGEST_ARRAYS, content
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
 FILES = ("control.csv", "state_motor.csv")
@@ -83,9 +84,8 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
 
 def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
     """Time (k,) in seconds and {column: (k, n)}."""
-    if not file.is_file():
-        raise LogError(f"{file}: missing; a SAGE motion needs control.csv and state_motor.csv")
-    first, _, body = file.read_bytes().partition(b"\n")
+    needed = "a SAGE motion needs control.csv and state_motor.csv, each of one recording"
+    first, _, body = content(file, LogError, needed, LARGEST_ARRAYS).partition(b"\n")
     header = first.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
     columns = [c.strip().lower() for c in header.split(",")]
     lists = columns[2:]
@@ -163,7 +163,7 @@ def _seconds(file: Path, time: Array) -> float:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
+        return content(file, LogError).decode()
     except UnicodeDecodeError as error:
         raise LogError(
             f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"

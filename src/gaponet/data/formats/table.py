@@ -18,12 +18,14 @@ import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import DESCRIBED, files_under, parquet
 from gaponet.data.log import CHANNELS, skipped
 from gaponet.errors import LogError
+from gaponet.structure import LARGEST_ARRAYS, content
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders
+NOT_OBEYED = "gaponet.not_obeyed"  # metadata of a table that is no data, and why (deploy/recording.py)
 OPTIONS = DESCRIBED
 EXTRA = ""
 DEFAULT: LogsFile = {"time": "time"} | {c: c + ".{joint}" for c in CHANNELS}  # type: ignore[assignment]
@@ -116,7 +118,7 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    body = file.read_bytes()
+    body = content(file, LogError, "cut the log into shorter ones", LARGEST_ARRAYS)
     line, _, rest = body.partition(b"\n")
     delimiter = _delimiter(line.decode("utf-8", "replace"))
     body = (rest if first else body.removeprefix(b"\xef\xbb\xbf")).rstrip()
@@ -176,24 +178,19 @@ def _number(row: list[str], place: int, names: list[str], name: str) -> float:
 
 
 def _parquet_header(file: Path) -> list[str]:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        return pq.read_schema(file).names
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise LogError(_unreadable(file, error)) from None
+    names, said = parquet.header(file)
+    if reason := said.get(NOT_OBEYED):
+        raise LogError(
+            f"{file}: no data, the robot did not do what it was told ({reason[:300]}); leave it out, or --skip-bad does"
+        )
+    return names
 
 
 def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
     """{column: (k,)}; an empty cell is refused with its row, counted from 1."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    try:
-        table = pq.ParquetFile(file).read(columns=wanted)
-    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise LogError(_unreadable(file, error)) from None
+    table = parquet.read(file, wanted)
     data: dict[str, Signal] = {}
     for name in wanted:
         column = table.column(name)
@@ -204,8 +201,3 @@ def _read_parquet(file: Path, wanted: list[str]) -> dict[str, Signal]:
             raise LogError(f"{file}:{row}: column '{name}' is empty; repair or cut the row")
         data[name] = Signal(column.to_numpy().astype(float))
     return data
-
-
-def _unreadable(file: Path, error: Exception) -> str:
-    reason = str(error).split("\n")[0].rstrip(".")
-    return f"{file}: not a readable Parquet file ({reason}); it may be half-written: export it again"

@@ -1,8 +1,8 @@
 """Datasets out again, one file per format that others read. A writer loses nothing that its format can hold.
 
 A writer is a module with `write(dataset, robot, folder, tell)`, which writes below an empty folder and calls tell with
-the motion of each recording. Formats that cannot hold unit, payload, gains and the like get a logs.toml and a sheet
-beside them that do (SHEET), by which gaponet import reads them back without a word.
+the motion of each recording. A format that cannot hold unit, payload, gains and the like says SHEET = True: it gets a
+logs.toml and a sheet beside it that do, by which gaponet import reads it back without a word.
 """
 
 from __future__ import annotations
@@ -20,17 +20,11 @@ from typing import Any
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.files import MARK, sync, write_text, writing
+from gaponet.parts import offered
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 
-WRITERS = {
-    "lerobot": "LeRobotDataset v3.0, one set for each rate and choice of channels",
-    "sage": "SAGE folder: control.csv, state_motor.csv",
-    "npz": "NumPy, one file per recording",
-    "asap": "ASAP's motion pickle with action, one file per recording",
-    "mcap": "ROS 2 bags (MCAP): /joint_states and /joint_commands",
-}
-SHEET = ("sage", "mcap")
+CORE = {name: f"gaponet.data.writers.{name}" for name in ("sage", "npz")}  # parts bring others
 
 
 @dataclass(frozen=True)
@@ -43,20 +37,27 @@ class Written:
     fps: float
 
 
+def writers() -> dict[str, str]:
+    """Every format that this installation writes → its writer's module."""
+    return CORE | offered("WRITERS")
+
+
 def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = silent) -> list[Written]:
     """Write a dataset in a format of others.
 
     Args:
         robot: Whose units and home the format may need.
         out: New or empty folder; appears when the export is complete.
-        to: One of WRITERS.
+        to: One of writers().
 
     Raises:
         DatasetError, UsageError: Nothing to write, a folder that holds something, or no such format.
     """
     out = Path(out)
-    if to not in WRITERS:
-        raise UsageError(f"no writer '{to}'; use one of {', '.join(WRITERS)}")
+    known = writers()
+    if to not in known:
+        raise UsageError(f"no writer '{to}'; use one of {', '.join(known)}")
+    writer = import_module(known[to])
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -72,8 +73,8 @@ def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progres
     with writing(temporary, "export"):
         _empty(temporary)  # of an export that was killed
         try:
-            written = import_module(f"gaponet.data.writers.{to}").write(dataset, robot, temporary, tell)
-            if to in SHEET:
+            written = writer.write(dataset, robot, temporary, tell)
+            if getattr(writer, "SHEET", False):
                 _describe(dataset, temporary)
             for path in temporary.rglob("*"):
                 sync(path)

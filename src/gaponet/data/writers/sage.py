@@ -17,6 +17,8 @@ from gaponet.data.writers import Tell, Written
 from gaponet.files import write_text
 from gaponet.robot import RobotSpec
 
+SHEET = True
+
 
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
     """One motion folder per recording."""

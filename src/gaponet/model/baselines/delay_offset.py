@@ -102,9 +102,11 @@ def fit(
     for i, delay in enumerate(delays):
         candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
         twins = replay(part, robot, candidate.corrector(robot), nthread, lock_idle=True)
-        e = np.concatenate([(s.qpos - t.qpos)[1:, op] for s, t in zip(part, twins, strict=True)])
-        offset[i] = np.median(e, axis=0)
-        error[i] = np.abs(e - offset[i]).mean(axis=0)
+        for k, (j, name) in enumerate(zip(op, names, strict=True)):
+            mine = [(s.qpos - t.qpos)[1:, j] for s, t in zip(part, twins, strict=True) if name not in s.meta.unrecorded]
+            e = np.concatenate(mine or [np.zeros(1)])
+            offset[i, k] = np.median(e)
+            error[i, k] = np.abs(e - offset[i, k]).mean()
         if progress:
             progress(i + 1, len(delays))
     best = error.argmin(axis=0)

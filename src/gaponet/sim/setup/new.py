@@ -81,6 +81,9 @@ def new_robot(path: Path, out: Path, wanted: Wanted) -> Made:
     notes += _spoken(spec, model, kept, pose, path)
     text = _text(spec, model, kept, pose, path, wanted.contacts)
     robot_toml = _toml(model, found, wanted, path, source)
+    for name in (*_joint_names(model), *(model.body(b).name for b in range(model.nbody))):
+        if "/" in name:  # a name may become a file's
+            text, robot_toml = (t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml))
     if (out / "robot.toml").exists():
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
     with writing(out, "robot"):

@@ -10,7 +10,8 @@ import numpy as np
 
 from gaponet.data.checks.finding import some
 from gaponet.errors import RobotError
-from gaponet.mjcf import read_mjcf, require_size
+from gaponet.mjcf import compiled, read_mjcf, require_moderate, require_size, said
+from gaponet.process.sandbox import inside
 
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 KEEP = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
@@ -34,12 +35,24 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
     if path.suffix == ".xacro":
         raise RobotError(f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf")
     require_size(path)
+    packages = {name: folder.absolute() for name, folder in packages.items()}
+    _try(path, packages)
+    return _read(path, packages)
+
+
+@inside(RobotError, "mujoco", 0.5)
+def _try(path: Path, packages: dict[str, Path]) -> None:
+    spec, _ = _read(path, packages)
+    require_moderate(compiled(spec, path), path)
+
+
+def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
     root = ET.parse(path).getroot()
     return _urdf(root, path, packages) if root.tag == "robot" else _mjcf(path)
 
 
 def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
-    spec = read_mjcf(path)
+    spec = read_mjcf(path, tried=True)
     place = path.parent / spec.meshdir
     missing = {m.name or Path(m.file).stem: m for m in spec.meshes if m.file and not (place / m.file).is_file()}
     for geom in [g for g in spec.geoms if g.meshname in missing]:
@@ -72,10 +85,8 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
     for compiler in own.findall("compiler"):
         own.remove(compiler)
     ET.SubElement(own, "compiler", KEEP)
-    try:
+    with said(path, "not valid URDF"):
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-    except (ValueError, mujoco.FatalError) as error:
-        raise RobotError(f"{path}: not valid URDF: {' '.join(str(error).split())}") from None
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
     notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
     return spec, notes + _unreadable(spec) + mended

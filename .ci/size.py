@@ -1,0 +1,106 @@
+"""How large each part is, and a ratchet: what .ci/size.toml allows may fall, and rises only with that file.
+
+    python .ci/size.py           a table; exit code 1 where a part is larger than allowed
+    python .ci/size.py --write   allow what is there now; say in the commit why something rose
+
+Lines: all of a part's .py files. Public names: functions, classes and constants of modules, and methods, without an
+underscore. Floors: modules on the longest way down the imports. Longest: lines of the longest function.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+LIMITS = ROOT / ".ci" / "size.toml"
+COLUMNS = ("lines", "files", "public names", "floors", "longest")
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def imports(tree: ast.AST, modules: set[str]) -> set[str]:
+    """Modules among these that a file imports anywhere."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{a.name}" for a in node.names} & modules or {node.module}
+    return found & modules
+
+
+def public(body: list[ast.stmt]) -> int:
+    """Names that a module or class defines for others."""
+    count = 0
+    for node in body:
+        names: list[str] = []
+        if isinstance(node, Function | ast.ClassDef):
+            names = [node.name]
+        elif isinstance(node, ast.Assign):
+            names = [t.id for t in node.targets if isinstance(t, ast.Name)]
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names = [node.target.id]
+        count += sum(not name.startswith("_") for name in names)
+    return count
+
+
+def measure(part: Path) -> dict[str, int]:
+    """The columns of a part."""
+    texts = {f: f.read_text(encoding="utf-8") for f in part.rglob("*.py")}
+    trees = {
+        ".".join(f.relative_to(part.parent).with_suffix("").parts).removesuffix(".__init__"): ast.parse(text)
+        for f, text in texts.items()
+    }
+    edges = {name: imports(tree, trees.keys() - {name, part.name}) for name, tree in trees.items()}
+
+    @functools.cache
+    def floor(name: str) -> int:
+        return 1 + max(map(floor, edges[name]), default=0)
+
+    functions = [n for tree in trees.values() for n in ast.walk(tree) if isinstance(n, Function)]
+    methods = [
+        n
+        for tree in trees.values()
+        for c in ast.walk(tree)
+        if isinstance(c, ast.ClassDef) and not c.name.startswith("_")
+        for n in c.body
+        if isinstance(n, Function) and not n.name.startswith("_")
+    ]
+    return {
+        "lines": sum(len(text.splitlines()) for text in texts.values()),
+        "files": len(texts),
+        "public names": sum(public(tree.body) for tree in trees.values()) + len(methods),
+        "floors": max(map(floor, edges)),
+        "longest": max((n.end_lineno or n.lineno) - n.lineno + 1 for n in functions),
+    }
+
+
+def main(write: bool) -> int:
+    parts = sorted(p for p in (ROOT / "src").iterdir() if (p / "__init__.py").is_file())
+    found = {p.name: measure(p) for p in parts}
+    allowed = tomllib.loads(LIMITS.read_text()) if LIMITS.is_file() else {}
+    print(f"{'part':<16}" + "".join(f"{c:>16}" for c in COLUMNS))
+    worse = []
+    for name, sizes in found.items():
+        print(f"{name:<16}" + "".join(f"{sizes[c]:>16,}" for c in COLUMNS))
+        limits = allowed.get(name, {})
+        worse += [
+            f"{name}: {c} {sizes[c]:,}, allowed {limits.get(c, 0):,}" for c in COLUMNS if sizes[c] > limits.get(c, 0)
+        ]
+    print(f"{'all':<16}{sum(s['lines'] for s in found.values()):>16,}{sum(s['files'] for s in found.values()):>16,}")
+    if write:
+        text = "# What .ci/size.py allows each part; a number that rises needs a sentence in its commit.\n"
+        for name, sizes in found.items():
+            text += f"\n[{name}]\n" + "".join(f'"{c}" = {sizes[c]}\n' for c in COLUMNS)
+        LIMITS.write_text(text)
+        return 0
+    for line in worse:
+        print(f"larger than allowed: {line}")
+    return bool(worse)
+
+
+if __name__ == "__main__":
+    sys.exit(main("--write" in sys.argv[1:]))

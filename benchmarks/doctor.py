@@ -1,0 +1,215 @@
+"""What gaponet doctor finds on robots that nobody tuned on: faults that combine, and alarms at logs that are good.
+
+    python benchmarks/doctor.py --robots 10 [--page docs/results/doctor.md]
+
+A fault counts as found where a warning or an error says its kind (KINDS) that the good logs of the same robot have not.
+All robots are virtual (strangers.py); faults of labels need a payload, so an arm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from strangers import Recording, Stranger, draw
+
+from gaponet.data.checks.finding import Finding
+from gaponet.data.doctor import diagnose
+from gaponet.data.log import Channel, Log
+from gaponet.data.sequence import SequenceMeta, to_sequence
+from gaponet.data.store import Dataset
+from gaponet.robot import RobotSpec
+from gaponet.sim.dynamics import gravity_of
+from gaponet.sim.setup.new import Wanted, new_robot
+
+MOTIONS, SECONDS = 8, 18.0
+Logs = list[Recording]
+
+
+def every(change: Callable[[Recording], Recording]) -> Callable[[Stranger, Logs], Logs]:
+    """The same fault in all logs."""
+    return lambda robot, logs: [change(log) for log in logs]
+
+
+def one(change: Callable[[Recording], Recording]) -> Callable[[Stranger, Logs], Logs]:
+    """A fault in the fourth log."""
+    return lambda robot, logs: [change(log) if i == 3 else log for i, log in enumerate(logs)]
+
+
+def shifted(seconds: float) -> Callable[[Recording], Recording]:
+    """Commands so much later than they were."""
+
+    def change(log: Recording) -> Recording:
+        rows = np.clip(np.searchsorted(log.time, log.time - seconds, side="right") - 1, 0, len(log.time) - 1)
+        return replace(log, ctrl=log.ctrl[rows])
+
+    return change
+
+
+def state(log: Recording, values: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """Other positions and velocities."""
+    return replace(log, qpos=values(log.qpos), qvel=None if log.qvel is None else values(log.qvel))
+
+
+def drifted(log: Recording) -> Recording:
+    """The state's clock runs 2,000 ppm fast."""
+    at = np.minimum(log.time * 1.002, log.time[-1])
+    return state(log, lambda x: np.stack([np.interp(at, log.time, c) for c in x.T], axis=1))
+
+
+def averaged(log: Recording) -> Recording:
+    """The mean of the last 150 ms is logged."""
+    total = lambda x: np.concatenate([np.zeros((1, x.shape[1])), x.cumsum(axis=0)])  # noqa: E731
+    first = np.searchsorted(log.time, log.time - 0.15, side="right")
+    end = np.arange(1, len(log.time) + 1)
+    return state(log, lambda x: (total(x)[end] - total(x)[first]) / (end - first)[:, None])
+
+
+def velocities(log: Recording) -> Recording:
+    """Velocity commands where positions should be."""
+    return replace(log, ctrl=np.clip(np.gradient(log.ctrl, log.time, axis=0), -3, 3))
+
+
+def played(robot: Stranger, logs: Logs, number: int, told: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """A log of another motion than the commands say."""
+    told_it = robot.commands(number, SECONDS)
+    log = robot.play(logs[number].motion, told(told_it), logs[number].payload, number)
+    return replace(log, ctrl=told_it[np.minimum(np.round(log.time * robot.rate).astype(int), len(told_it) - 1)])
+
+
+def e_stop(robot: Stranger, logs: Logs) -> Logs:
+    """The brakes are on for four seconds of one motion."""
+    a, b = (round(x * robot.rate) for x in (7, 11))
+    hold = lambda u: np.concatenate([u[:a], np.repeat(u[a : a + 1], b - a, axis=0), u[b:]])  # noqa: E731
+    return [played(robot, logs, i, hold) if i == 3 else log for i, log in enumerate(logs)]
+
+
+def two_units(robot: Stranger, logs: Logs) -> Logs:
+    """Half of the logs are of a second robot of the same type."""
+    rng, n = np.random.default_rng(robot.seed), len(robot.joints)
+    law = replace(robot.law, offset=rng.normal(0, 0.015, n), kp=robot.law.kp * rng.uniform(0.85, 1.15, n),
+                  friction=robot.law.friction * rng.uniform(0.6, 1.6, n))  # fmt: skip
+    other = replace(robot, law=law)
+    return [
+        other.play(x.motion, robot.commands(i, SECONDS), x.payload, i) if i >= len(logs) / 2 else x
+        for i, x in enumerate(logs)
+    ]
+
+
+def degrees(robot: Stranger, logs: Logs) -> Logs:
+    """One joint hardly moves, and is logged in degrees."""
+    j, found = len(robot.joints) // 2, []
+    for i, x in enumerate(logs):
+        ctrl = robot.commands(i, SECONDS)
+        ctrl[:, j] = np.clip(0.02 * ctrl[:, j], robot.low[j], robot.high[j])
+        log = robot.play(x.motion, ctrl, x.payload, i)
+        for values in (log.ctrl, log.qpos, log.qvel):
+            if values is not None:
+                values[:, j] = np.degrees(values[:, j])
+        found.append(log)
+    return found
+
+
+def torques(robot: Stranger, logs: Logs) -> Logs:
+    """Torques where positions should be."""
+    robot = replace(robot, dirt=replace(robot.dirt, torque=True, dropped=0.0))
+    again = [robot.play(x.motion, robot.commands(i, SECONDS), x.payload, i) for i, x in enumerate(logs)]
+    return [replace(x, ctrl=x.tau, tau=None) for x in again if x.tau is not None]
+
+
+def swapped(robot: Stranger, logs: Logs) -> Logs:
+    """Each log has the other one's payload on its label."""
+    return [replace(x, payload=0.0 if x.payload else robot.payload) for x in logs] if robot.payload else []
+
+
+FAULTS: dict[str, tuple[Callable[[Stranger, Logs], Logs], tuple[str, ...]]] = {
+    "velocity commands as positions": (every(velocities), ("command",)),
+    "torque commands as positions": (torques, ("command",)),
+    "payload labels swapped": (swapped, ("payload",)),
+    "two units under one name": (two_units, ("unit_id",)),
+    "a joint in degrees that hardly moves": (degrees, ("unit", "gravity", "range")),
+    "states' clock 2,000 ppm fast": (every(drifted), ("clock",)),
+    "commands 30 ms late, one log": (one(shifted(0.03)), ("lag", "copied")),
+    "commands 30 ms late, all logs": (every(shifted(0.03)), ("lag", "copied")),
+    "commands 80 ms early, one log": (one(shifted(-0.08)), ("lag", "copied")),
+    "commands 80 ms early, all logs": (every(shifted(-0.08)), ("lag", "copied")),
+    "e-stop in the middle": (e_stop, ("blocked", "stuck", "stop")),
+    "states averaged over 150 ms": (every(averaged), ("averaged", "lag")),
+}
+
+
+def examine(robot: Stranger, spec: RobotSpec, logs: Logs, folder: Path) -> list[Finding]:
+    """Warnings and errors of the doctor."""
+    data = Dataset.create(folder, spec)
+    for log in logs:
+        names = {c: v for c in ("ctrl", "qpos", "qvel", "tau") if (v := getattr(log, c)) is not None}
+        raw = Log(spec.name, robot.joints, {c: Channel(log.time, v) for c, v in names.items()}, log.motion)
+        data.append(to_sequence(raw, spec, SequenceMeta(spec.name, "a", log.motion, log.payload)))
+    found = diagnose(data, spec, model=gravity_of(spec)).findings
+    return [f for f in found if f.level in ("warning", "error")]
+
+
+def drawn(first: int, count: int) -> Iterator[Stranger]:
+    """Robots of up to 250 Hz; every second one carries something, where it has a hand."""
+    for seed in range(first, first + count):
+        robot = draw(seed)
+        robot = replace(robot, rate=min(robot.rate, 250.0))
+        if robot.body == "arm" or "ur5e" in robot.body or "xarm" in robot.body:
+            robot = replace(
+                robot, payload=robot.payload or round(0.15 * float(robot.spec.compile().body_mass.sum()), 3)
+            )
+        yield robot
+
+
+def main() -> None:
+    """Play faults, count."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--robots", type=int, default=10)
+    parser.add_argument("--first", type=int, default=300)
+    parser.add_argument("--faults", nargs="*", default=list(FAULTS))
+    parser.add_argument("--page", type=Path)
+    args = parser.parse_args()
+    hits: dict[str, list[bool]] = {name: [] for name in args.faults}
+    alarms: Counter[str] = Counter()
+    clean = 0
+    for robot in drawn(args.first, args.robots):
+        with tempfile.TemporaryDirectory() as place:
+            folder = Path(place)
+            (folder / "vendor.xml").write_text(robot.file())
+            mounts = (f"hand={robot.bodies[-1]}:0,0,0",) if robot.payload else ()
+            wanted = Wanted(rate=robot.rate, mounts=mounts, name="stranger", joints=robot.joints)
+            spec = new_robot(folder / "vendor.xml", folder / "robot", wanted).robot
+            robot = replace(robot, joints=spec.joint_names) if "/" not in robot.joints[0] else robot
+            logs = list(robot.recordings(MOTIONS, MOTIONS * SECONDS))
+            good = examine(robot, spec, logs, folder / "good")
+            known = Counter((f.check, f.joints) for f in good)
+            alarms.update({f.check for f in good})
+            clean += not good
+            print(f"== {robot.seed} {robot.body} {len(robot.joints)} joints {robot.rate:g} Hz {robot.laws}", flush=True)
+            for f in good:
+                print(f"   good: {f.level} {f.check}: {f.message[:200]}", flush=True)
+            for number, name in enumerate(args.faults):
+                damage, kinds = FAULTS[name]
+                bad = damage(robot, logs)
+                if not bad:
+                    continue
+                new = [f for f in examine(robot, spec, bad, folder / str(number)) if (f.check, f.joints) not in known]
+                hits[name].append(any(f.check in kinds for f in new))
+                print(f"   {'found ' if hits[name][-1] else 'MISSED'} {name}: "
+                      + "; ".join(f"{f.level} {f.check}: {f.message[:110]}" for f in new[:4]), flush=True)  # fmt: skip
+    lines = ["| fault | found |", "|---|---:|"]
+    lines += [f"| {name} | {sum(found)} of {len(found)} |" for name, found in hits.items() if found]
+    told = ", ".join(f"{check} {count}" for check, count in alarms.most_common()) or "none"
+    lines += ["", f"Good logs of the same {args.robots} robots: {clean} without a warning; warnings by kind: {told}."]
+    print("\n".join(lines))
+    if args.page:
+        args.page.write_text("\n".join(["# What the doctor finds\n", *lines]) + "\n")
+
+
+if __name__ == "__main__":
+    main()

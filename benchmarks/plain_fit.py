@@ -1,0 +1,114 @@
+"""The plain rival of gaponet identify: scipy's least squares over free runs of the whole robot in MuJoCo.
+
+    python benchmarks/plain_fit.py DATASET [--robot ROBOT] [--out FOLDER]
+
+What an engineer writes in an afternoon: kp, total damping, dry friction, armature, delay and zero offset of each joint,
+finite differences over windows of the training motions, started at the robot's file; then whole validation motions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from scipy.optimize import least_squares
+
+from gaponet.data.sequence import Sequence
+from gaponet.data.split import split_entries
+from gaponet.data.store import open_dataset
+from gaponet.robot import RobotSpec
+from gaponet.robot_folder import save_robot
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import replay
+
+WINDOW, COUNT, SETTLE = 5.0, 8, 0.1  # s of a window, windows, s that do not count
+LOW, HIGH, STEP = (0.1, 0.0, 0.0, 0.0, 0.0, -10.0), (10.0, 10.0, 50.0, 50.0, 5.0, 10.0), 0.02
+
+
+def plain_fit(sequences: list[Sequence], robot: RobotSpec, nthread: int = 0, evaluations: int = 25) -> RobotSpec:
+    """The robot that follows the windows best; recordings at one period, gains and payload of robot.toml's kind."""
+    length = round(WINDOW / sequences[0].dt)
+    cuts = [s.rows(slice(a, a + length)) for s in sequences for a in range(0, len(s), length)]
+    cuts = [c for c in cuts if c.duration > 0.9 * WINDOW] or list(sequences)
+    cuts = [cuts[i * len(cuts) // min(COUNT, len(cuts))] for i in range(min(COUNT, len(cuts)))]
+    rows, op = min(map(len, cuts)), robot.operated_index
+    n, kd = len(op), robot.kd[robot.operated_index]
+    models = [build_model(robot, c.meta.payload_mass, c.meta.payload_side, c.dt, bare=True) for c in cuts]
+    own, h, count = models[0], models[0].opt.timestep, robot.steps_per(cuts[0].dt)
+    damping = own.dof_damping[op] + kd
+    armature = np.maximum(own.dof_armature[op], 2.5e-5 * robot.kp[op])  # with less, stiff joints chatter at this step
+    late, zero = np.full(n, 0.02), np.zeros(n)
+    scale = np.stack(
+        [robot.kp[op], np.maximum(damping, 0.05 * robot.kp[op]), 1e-3 * robot.kp[op], armature, late, late / 2]
+    )
+    low, high = (np.repeat(b, n) for b in (LOW, HIGH))
+    start = np.stack([robot.kp[op], damping, own.dof_frictionloss[op], armature, late, zero]) / scale
+    start = np.clip(start.ravel(), low + 0.2, high - 0.2)  # trust regions creep at bounds
+    state = np.concatenate([[[0.0, *c.qpos[0], *c.qvel[0]]] for c in cuts]).astype(float)
+    real = np.stack([c.qpos[1:rows, op] for c in cuts])
+    time_of = np.arange((rows - 1) * count) * h
+    engines = [mujoco.MjData(models[0]) for _ in range(nthread or 2)]
+    pool = Rollout(nthread=len(engines))
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        kp, total, friction, armature, delay, offset = np.reshape(x, (6, n)) * scale
+        late, controls = [], []
+        for c, model in zip(cuts, models, strict=True):
+            one = mujoco.MjModel.__copy__(model)
+            one.actuator_gainprm[op, 0], one.actuator_biasprm[op, 0] = kp, kp * offset
+            one.actuator_biasprm[op, 1], one.actuator_biasprm[op, 2] = -kp, -np.minimum(kd, total)
+            one.dof_damping[op], one.dof_frictionloss[op] = np.maximum(total - kd, 0), friction
+            one.dof_armature[op] = armature
+            ctrl = c.ctrl[np.arange(len(time_of)) // count].astype(float)
+            for i, j in enumerate(op):  # held commands; linear between them, so that a delay has a slope
+                ctrl[:, j] = np.interp(time_of - delay[i], time_of, ctrl[:, j])
+            late.append(one)
+            controls.append(ctrl)
+        found, _ = pool.rollout(late, engines, state, np.stack(controls))
+        qpos = found[:, count - 1 :: count, 1 + op]
+        return np.where(np.isfinite(qpos), np.clip(qpos - real, -1, 1), 1.0)[:, round(SETTLE / cuts[0].dt) :].ravel()
+
+    def slopes(x: np.ndarray) -> np.ndarray:
+        here, by = errors(x), np.where(x + STEP > high, -STEP, STEP)
+        return np.stack([(errors(x + row) - here) / by[i] for i, row in enumerate(np.diag(by))], axis=1)
+
+    fit = least_squares(
+        errors, start, slopes, (low, high), x_scale="jac", loss="soft_l1", f_scale=0.01, max_nfev=evaluations
+    )
+    kp, total, friction, armature, delay, offset = np.reshape(fit.x, (6, n)) * scale
+    servo = {"kp": kp, "damping": np.maximum(total - kd, 0), "frictionloss": friction, "armature": armature,
+             "delay": delay, "offset": offset}  # fmt: skip
+    found = robot.with_servos({j: {f: float(v[i]) for f, v in servo.items()} for i, j in enumerate(robot.operated)})
+    less = np.array(robot.kd)
+    less[op] = np.minimum(kd, total)
+    return replace(found, kd=less)
+
+
+def main() -> None:
+    """Fit on training motions, judge on whole validation motions."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset")
+    parser.add_argument("--robot")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    data, robot = open_dataset(args.dataset, args.robot, None)
+    parts = {k: data.sequences(v) for k, v in split_entries(data).items()}
+    began = time.monotonic()
+    found = plain_fit(parts["train"], robot)
+    seconds, op = time.monotonic() - began, robot.operated_index
+    for name, spec in (("as it is", robot), ("plain fit", found)):
+        twins = replay(parts["val"], spec)
+        error = np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(parts["val"], twins, strict=True)])
+        print(f"{name}: {1e3 * error:.3f} mrad over {len(twins)} validation motions")
+    print(f"{seconds:.0f} s")
+    if args.out:
+        save_robot(found, args.out)
+
+
+if __name__ == "__main__":
+    main()

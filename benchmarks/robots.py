@@ -1,0 +1,230 @@
+"""The standing tournament: robots that nobody tuned on (strangers.py), as a user would have them, by commands alone.
+
+    python benchmarks/robots.py WORK --robots 60 --first 0        # goes on where it was cut short
+    python benchmarks/robots.py WORK --robots 0 --page docs/results/robots.md
+
+Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify, gap
+on motions that nothing was fitted to; and benchmarks/plain_fit.py on the same dataset. One JSON line a robot.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from strangers import Stranger, draw
+
+HERE = Path(__file__).parent
+GAPONET = str(Path(sys.executable).with_name("gaponet"))
+FIELDS = ("kp", "damping", "frictionloss", "armature", "delay", "offset")
+WORSE, WORSE_THAN_PLAIN = 1.01, 1.10
+Row = dict[str, Any]
+
+
+class RefusedError(Exception):
+    """A command ended with an error."""
+
+
+def call(*words: object) -> tuple[str, float, float]:
+    """What a command prints; its seconds, and those of the processor."""
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
+    seconds, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        told = (done.stdout + done.stderr).strip().splitlines()
+        raise RefusedError(f"{Path(str(words[0])).name} {words[1]} ended with {done.returncode}: {' '.join(told[-3:])}")
+    return done.stdout, seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def write(robot: Stranger, folder: Path, motions: int, seconds: float | None) -> float:
+    """The vendor's file and the logs, a folder for each payload; seconds recorded."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder.mkdir(parents=True)
+    (folder / "vendor.xml").write_text(robot.file())
+    recorded = 0.0
+    for log in robot.recordings(motions, seconds):
+        place = folder / f"logs_{log.payload:g}"
+        place.mkdir(exist_ok=True)
+        pq.write_table(pa.table(log.columns(robot.joints)), place / f"{log.motion}.parquet")
+        recorded += float(log.time[-1])
+    return recorded
+
+
+def play(seed: int, folder: Path, motions: int = 12, seconds: float | None = None, rival: bool = True) -> Row:
+    """One robot of the tournament."""
+    robot = draw(seed)
+    row: Row = {"seed": seed, "body": robot.body, "joints": len(robot.joints), "rate": robot.rate,
+                "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
+    row["seconds_recorded"] = write(robot, folder, motions, seconds)
+    data, mine, found = folder / "data", folder / "robot", folder / "identified"
+    mounts = ["--mounts", f"hand={robot.bodies[-1]}:0,0,0"] if robot.payload else []
+    call(GAPONET, "robot", "new", folder / "vendor.xml", "--out", mine, "--rate", robot.rate, "--name", "stranger",
+         "--joints", *robot.joints, *mounts)  # fmt: skip
+    for place in sorted(folder.glob("logs_*")):
+        call(GAPONET, "import", place, "--robot", mine, "--out", data, "--unit-id", "a", "--payload-mass",
+             place.name.removeprefix("logs_"), "--position-unit", "rad", "--time-unit", "s")  # fmt: skip
+    told = json.loads(call(GAPONET, "doctor", data, "--json")[0])
+    row["doctor"] = [f"{f['level']} {f['check']}" for f in told["findings"] if f["level"] in ("warning", "error")]
+    row["nominal"] = held_out(data, mine)
+    try:
+        out, row["seconds"], row["cpu"] = call(GAPONET, "identify", data, "--out", found, "--json")
+        fit = json.loads(out)
+        row["warnings"] = fit["warnings"]
+        row |= inside(robot, found, fit["std"])
+    except RefusedError as refused:
+        row["refused"] = str(refused)
+    row["identified"] = held_out(data, found) if (found / "robot.toml").exists() else row["nominal"]
+    if rival:
+        try:
+            plain = (sys.executable, HERE / "plain_fit.py", data, "--out", folder / "plain")
+            row["plain_seconds"], row["plain_cpu"] = call(*plain)[1:]
+            row["plain"] = held_out(data, folder / "plain")
+        except RefusedError as refused:
+            row["plain_refused"] = str(refused)
+    return row
+
+
+def held_out(data: Path, robot: Path) -> float:
+    """Mean |error| on the test motions, rad."""
+    from gaponet.data.split import split_entries
+    from gaponet.data.store import Dataset
+
+    test = sorted({e.meta.motion for e in split_entries(Dataset(data))["test"]})
+    gap = json.loads(call(GAPONET, "gap", data, "--robot", robot, "--motions", *test, "--json")[0])
+    methods = gap["methods"]  # an identified folder is measured beside the robot that it was identified from
+    return float(methods.get("identified", methods["nominal"])["mpjae"])
+
+
+def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]]) -> Row:
+    """Distance of each parameter from the truth in its standard errors, and in its own size: field → numbers."""
+    from gaponet.robot import load_robot
+
+    spec, law = load_robot(folder), robot.law
+    truth = {"kp": law.kp, "damping": law.kd + law.damping, "frictionloss": law.friction, "armature": law.armature,
+             "delay": law.delay, "offset": law.offset}  # fmt: skip
+    row: Row = {"sigmas": {}, "relative": {}}
+    for field in FIELDS:
+        for j, joint in enumerate(robot.joints):
+            i = spec.joint_names.index(joint.replace("/", "_"))
+            value = getattr(spec, field)[i] + (spec.kd[i] if field == "damping" else 0.0)
+            far, error = abs(float(value - truth[field][j])), std.get(joint.replace("/", "_"), {}).get(field)
+            if error and np.isfinite(far):
+                row["sigmas"].setdefault(field, []).append(round(far / error, 2))
+                if field not in ("offset", "delay"):
+                    row["relative"].setdefault(field, []).append(round(far / truth[field][j], 3))
+    return row
+
+
+def ratios(rows: Iterable[Row], over: str = "nominal") -> np.ndarray:
+    """Error of the identified robot over another's."""
+    return np.array([r["identified"] / r[over] for r in rows if over in r])
+
+
+def tables(rows: list[Row]) -> list[str]:
+    """What is claimed, in Markdown."""
+    kinds: dict[str, Callable[[Row], bool]] = {
+        "all": lambda r: True,
+        "servo of the form that is fitted": lambda r: not r["laws"],
+        "of another form": lambda r: bool(r["laws"]),
+        "public model": lambda r: "/" in r["body"],
+    }
+    said = ["| robots | how many | never worse | median of nominal | worst | not worse than plain | by > 10 % | "
+            "plain, median | s, median | s, worst | plain, s |", "|---|" + "---:|" * 10]  # fmt: skip
+    for name, kind in kinds.items():
+        some = [r for r in rows if kind(r)]
+        if not some:
+            continue
+        x, y = ratios(some), ratios(some, "plain")
+        plain = np.array([r["plain"] / r["nominal"] for r in some if "plain" in r])
+        took = np.array([r["cpu"] for r in some if "cpu" in r] or [np.nan])
+        theirs = np.array([r["plain_cpu"] for r in some if "plain" in r] or [np.nan])
+        said.append(
+            f"| {name} | {len(some)} | {np.mean(x <= WORSE):.0%} | {np.median(x):.3f} | {x.max():.2f} | "
+            + (f"{np.mean(y <= 1.001):.0%} | {np.sum(y > WORSE_THAN_PLAIN)} of {len(y)} | {np.median(plain):.3f} | "
+               if len(y) else "– | – | – | ")
+            + f"{np.median(took):.0f} | {took.max():.0f} | {np.median(theirs):.0f} |"
+        )  # fmt: skip
+    said += ["", "Seconds are of the processor, commands as a whole.", "",
+             "| parameter, servos of the form | within 2 standard errors | median distance from the truth |",
+             "|---|---:|---:|"]  # fmt: skip
+    for field in FIELDS:
+        parts = [r for r in rows if not r["laws"] and field in r.get("sigmas", {})]
+        sigmas = np.concatenate([[], *(r["sigmas"][field] for r in parts)])
+        if len(sigmas):
+            far = np.concatenate([[], *(r["relative"].get(field, []) for r in parts)])
+            size = f"{np.median(far):.1%}" if len(far) else "–"
+            said.append(f"| {field} | {np.mean(sigmas <= 2):.0%} of {len(sigmas)} | {size} |")
+    return said
+
+
+def losers(rows: list[Row]) -> list[str]:
+    """Robots that lose to their own file or to the plain script, and those that were refused."""
+    said = ["| seed | body | joints | Hz | law | nominal, mrad | identified | plain | what |", "|---" * 9 + "|"]
+    for r in rows:
+        worse = r["identified"] > WORSE * r["nominal"] or r["identified"] > WORSE_THAN_PLAIN * r.get("plain", np.inf)
+        if worse or "refused" in r or "plain_refused" in r:
+            mrad = [f"{1e3 * r[k]:.2f}" if k in r else "–" for k in ("nominal", "identified", "plain")]
+            why = r.get("refused", r.get("plain_refused", ""))[:160].replace("|", "/")
+            laws = ", ".join(r["laws"]) or "of the form"
+            said.append(
+                f"| {r['seed']} | {r['body']} | {r['joints']} | {r['rate']:g} | {laws} | {' | '.join(mrad)} | {why} |"
+            )
+    return said
+
+
+def main() -> None:
+    """Play what is missing, one robot at a time; print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--robots", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--motions", type=int, default=12)
+    parser.add_argument("--seconds", type=float, help="recorded of each robot; default two to five minutes")
+    parser.add_argument("--keep", action="store_true", help="keep each robot's folder")
+    parser.add_argument("--page", type=Path, help="write the tables here")
+    args = parser.parse_args()
+    args.work.mkdir(parents=True, exist_ok=True)
+    journal = args.work / "robots.jsonl"
+    rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
+    for seed in range(args.first, args.first + args.robots):
+        if any(r["seed"] == seed for r in rows):
+            continue
+        folder = args.work / str(seed)
+        shutil.rmtree(folder, ignore_errors=True)
+        rows.append(play(seed, folder, args.motions, args.seconds))
+        with journal.open("a") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+        r = rows[-1]
+        print(
+            f"{seed} {r['body']} {r['joints']} joints {r['rate']:g} Hz {','.join(r['laws']) or 'in form'}: "
+            f"{1e3 * r['nominal']:.2f} → {1e3 * r['identified']:.2f} (plain {1e3 * r.get('plain', np.nan):.2f}) mrad, "
+            f"{r.get('cpu', np.nan):.0f} s (plain {r.get('plain_cpu', np.nan):.0f} s) {r.get('refused', '')}",
+            flush=True,
+        )
+        if not args.keep:
+            shutil.rmtree(folder)
+    text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
+    print(text)
+    if args.page:
+        head = (
+            "# Robots that nobody tuned on\n\n"
+            "`python benchmarks/robots.py WORK --robots N`; every robot is **virtual**, "
+            "its logs are of plain MuJoCo\nwith a servo that gaponet's simulator does not know "
+            "(`benchmarks/strangers.py`).\n\n"
+        )
+        args.page.write_text(head + text)
+
+
+if __name__ == "__main__":
+    main()

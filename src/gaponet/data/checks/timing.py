@@ -1,0 +1,99 @@
+"""Do command and state belong to the same time: in every recording, to its end, and unsmoothed?"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gaponet.data.checks.finding import Finding
+from gaponet.data.signals import averaged, following
+from gaponet.data.survey import Survey
+from gaponet.robot import RobotSpec
+
+FEW = 4  # recordings that say nothing of one among them
+LATE, FAR = 0.015, 6.0  # s, and times the usual scatter, by which a recording follows later than the others
+FIRST = -0.015  # s: joints that begin so long before their command
+LONG, APART = 0.1, 0.05  # s: dead time worth a warning; of one joint beyond the others'
+DEAD_TIMES = (
+    (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
+    (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
+)  # fmt: skip
+DRIFT, SURE = 3e-4, 5.0  # s a second, and standard errors
+NOTCH = 1.5  # depth, natural logarithm of power
+GAP = 2.5  # periods without a sample
+
+
+def timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+    """Are commands and states of one time, and is their clock one clock?"""
+    step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
+    same = [s for s in surveys if s.response.step == step]
+    # Across a hole states are interpolated: they begin to move before anything was measured.
+    same = [s for s in same if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or same
+    op, fields = robot.operated_index, ("own", "cross", "power")
+    own = [replace(s.response, **{f: getattr(s.response, f)[:, op] for f in fields}) for s in same]
+    told = following(own)
+    found = [*_late(same, told.whole)]
+    if found:
+        odd = {f.values["motion"] for f in found}
+        told = following(own, [s.motion not in odd for s in same])
+    onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
+    if onset < FIRST - step:
+        text = (
+            f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
+            "their clocks apart? Shift one of them at import"
+        )
+        found.append(Finding("error", "copied", text, (), {"onset_s": onset}))
+    elif np.isfinite(onset):
+        words = next(word for most, word in DEAD_TIMES if onset <= most)
+        text = f"joints begin to move {max(onset, 0) * 1e3:.0f} ms after their commands: {words}"
+        yield Finding("warning" if onset > LONG else "ok", "lag", text, (), {"onset_s": onset})
+    for name, late in zip(robot.operated, told.onset - onset, strict=True):
+        if late > APART and np.isfinite(told.onset).sum() > 2:
+            text = (
+                f"{name} begins to move {late * 1e3:.0f} ms later than the other joints: its channel is read late, "
+                "filtered or from another bus, or it moves stiffly; shift it at import if the time of reading is known"
+            )
+            found.append(Finding("warning", "lag", text, (name,), {"extra_s": float(late)}))
+    found += _drift(same, told.shifts)
+    asked, moved = np.mean([s.spectra for s in same], axis=0)
+    width, depth = averaged(moved)
+    if depth > NOTCH and averaged(asked, np.array([width]))[1] < depth / 3:  # steps at a regular pace have notches too
+        text = (
+            f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
+            "encoder itself; what is averaged is late, and fast motions are lost"
+        )
+        found.append(Finding("warning", "averaged", text, (), {"width_s": width}))
+    yield from found or [Finding("ok", "timing", "commands and states keep one time")]
+
+
+def _late(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
+    known = np.isfinite(shifts)
+    if known.sum() < FEW:
+        return
+    away = shifts - np.median(shifts[known])
+    usual = max(1.48 * float(np.median(np.abs(away[known]))), 1e-3)
+    for s, late in zip(surveys, away.tolist(), strict=True):
+        if abs(late) > max(LATE, FAR * usual):
+            text = (
+                f"{s.motion} follows its commands {abs(late) * 1e3:.0f} ms {'later' if late > 0 else 'sooner'} than "
+                "the other recordings: clocks of command and state that are apart, or another servo; leave it out"
+            )
+            yield Finding("warning", "lag", text, (), {"motion": s.motion, "late_s": late})
+
+
+def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
+    between = np.array([s.response.duration for s in surveys]) * (1 - 1 / shifts.shape[1])
+    slope = (shifts[:, -1] - shifts[:, 0]) / between
+    slope = slope[np.isfinite(slope)]
+    if len(slope) < FEW:
+        return
+    drift, error = float(np.median(slope)), float(max(slope.std(), 2e-3 / between.max()) / np.sqrt(len(slope)))
+    if abs(drift) > max(DRIFT, SURE * error):
+        text = (
+            f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
+            f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
+        )
+        yield Finding("error", "clock", text, (), {"drift": drift})

@@ -1,0 +1,63 @@
+"""Parquet files of strangers: read in the sandbox, and what they say that they hold is counted first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gaponet.errors import LogError
+from gaponet.process.sandbox import inside
+from gaponet.structure import LARGEST_ARRAYS
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@inside(LogError, "pyarrow.parquet")
+def header(file: Path) -> tuple[list[str], dict[str, str]]:
+    """Names of the columns, in their order, and what the file says of itself beside."""
+    import pyarrow.parquet as pq
+
+    with _readable(file):
+        schema = pq.read_schema(file)
+        said = (schema.metadata or {}).items()
+        return list(schema.names), {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in said}
+
+
+@inside(LogError, "pyarrow.parquet")
+def read(file: Path, wanted: list[str]) -> pa.Table:
+    """These columns.
+
+    Raises:
+        LogError: No Parquet file, a column is missing, or there is more than LARGEST_ARRAYS in them.
+    """
+    import pyarrow.parquet as pq
+
+    with _readable(file):
+        source = pq.ParquetFile(file)
+        parts = [source.metadata.row_group(i) for i in range(source.metadata.num_row_groups)]
+        chunks = (part.column(k) for part in parts for k in range(part.num_columns))
+        values = sum(c.num_values for c in chunks if c.path_in_schema.split(".")[0] in wanted)
+        if 8 * values > LARGEST_ARRAYS:
+            raise LogError(
+                f"{file}: {source.metadata.num_rows:,} rows of {len(wanted)} columns are {values:,} values, more than "
+                f"{LARGEST_ARRAYS >> 20} MiB; cut the log into shorter ones"
+            )
+        return source.read(columns=wanted, use_threads=False).select(wanted)
+
+
+@contextmanager
+def _readable(file: Path) -> Iterator[None]:
+    import pyarrow as pa
+
+    try:
+        yield
+    except MemoryError:
+        raise
+    except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
+        reason = str(error).split("\n")[0].rstrip(".")
+        raise LogError(
+            f"{file}: not a readable Parquet file ({reason}); it may be half-written: download or export it again"
+        ) from None

@@ -1,0 +1,1 @@
+"""Processes that gaponet starts, and what they may."""

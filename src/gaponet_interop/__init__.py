@@ -1,0 +1,15 @@
+"""The part at the edge: other people's log and dataset formats, engines, and places to share through.
+
+What it offers to gaponet (gaponet.parts); nothing is imported here.
+"""
+
+COMMANDS = {
+    "export": "gaponet_interop.cli.export:export",
+    "push": "gaponet_interop.cli.share:push",
+    "pull": "gaponet_interop.cli.share:pull",
+}
+FORMATS = {
+    name: f"gaponet_interop.formats.{name}" for name in ("lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")
+}
+WRITERS = {name: f"gaponet_interop.writers.{name}" for name in ("lerobot", "asap", "mcap")}
+PROVIDES = {"dataset behind an address": "gaponet_interop.share.stream:Streamed"}

@@ -1,0 +1,121 @@
+"""gaponet export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from gaponet.cli.options import Folder, Json
+from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+from gaponet.robot import load_robot
+from gaponet.robot_folder import KEPT, keeps_robot
+
+if TYPE_CHECKING:
+    from gaponet.data.sequence import Sequence
+    from gaponet.robot import RobotSpec
+
+Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.")]
+
+
+def export(
+    robot: Holder,
+    to: Literal["onnx", "torch", "mjcf", "mjlab", "isaaclab", "newton", "json"] = "onnx",
+    out: Path | None = None,
+    data: str | None = None,
+    into: Path | None = None,
+    prefix: str = "",
+    payload_mass: float = 0.0,
+    json: Json = False,
+) -> None:
+    """Write an identified robot for another engine, or a run's network for another program.
+
+    Args:
+        to: Of a robot or of a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
+            no gaponet; isaaclab; json (the numbers). Of a run: onnx (model.onnx, weights.npz and card.json) and torch
+            (delta.pt2 with simulator and action term for mjlab and Isaac Lab).
+        out: Folder; default one with that name in the robot or run, for onnx the run's model folder.
+        data: Dataset on which a servo law's nearest plain servos are fitted, and every form is judged; default the one
+            that the robot was identified from, and without any what the robot itself answers.
+        into: For mjcf: an MJCF of your own; a copy of it is edited in place of names (default the robot's).
+        prefix: What that MJCF has before each joint's name.
+        payload_mass: kg in each hand.
+    """
+    screen = Out(json)
+    if to in ("onnx", "torch"):
+        if data or into or prefix:
+            raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
+        _network(screen, robot, to, out, payload_mass)
+        return
+    from gaponet.eval.tables import mrad
+    from gaponet.progress import bar
+    from gaponet_interop.engine.folder import export_robot
+
+    spec, folder = load_robot(_simulator(robot)), out or robot / to
+    recordings = _recordings(_simulator(robot), data, spec)
+    with bar("fitting without the law") as update:
+        made = export_robot(spec, to, folder, recordings, into, prefix, payload_mass, update)
+    of = "of the robot's own answers, VIRTUAL" if made.virtual else "validation motions"
+    rows = [[what, mrad(error)] for what, error in made.left.items()]
+    screen.table(f"What is left of {made.motions} {of}", ["form", "mrad"], rows)
+    for line in made.notes:
+        screen.say(f"  {line}", "warning", "yellow")
+    check = folder / "check.py"
+    told = f"; next, in {'MuJoCo' if to == 'mjcf' else to}: python {check}" if check.is_file() else ""
+    screen.say(f"{made.file or folder}: {spec.name} for {to}{told}")
+    screen.result({"path": str(folder), "to": to, "robot": spec.name, "left": made.left, "notes": made.notes})
+
+
+def _simulator(holder: Path) -> Path:
+    """The robot folder of a run or an artifact, or the folder itself."""
+    return holder / KEPT if keeps_robot(holder) else holder
+
+
+def _recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
+    """Training and validation motions of a dataset, by default those that the robot was identified from."""
+    from gaponet.data.split import split_entries
+    from gaponet.data.store import opened
+    from gaponet.eval.candidate import read_origin
+
+    origin = read_origin(folder)
+    if data is None and origin is not None:
+        there = origin["dataset"]
+        data = there if "://" in there else str(folder / there)
+        data = data if "://" in there or Path(data).is_dir() else None  # it may have moved away
+    if data is None:
+        return None
+    dataset = opened(data)
+    dataset.require_robot(robot)
+    parts = split_entries(dataset, ())
+    if origin is not None:
+        known = {part: set(origin["parts"][part].values()) for part in ("train", "val")}
+        mine = {part: [e for e in dataset.entries if e.hash in hashes] for part, hashes in known.items()}
+        parts |= mine if all(mine.values()) else {}
+    return dataset.sequences(parts["train"]), dataset.sequences(parts["val"])
+
+
+def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: float) -> None:
+    from gaponet.model.artifact import CARD, GapModel, read_card
+
+    if (run / "robot.toml").is_file():
+        raise UsageError(f"{run}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton or json")
+    if to == "torch":
+        from gaponet_interop.engine.folder import export_model
+
+        path = out or run / to
+        difference = export_model(GapModel.load(run), run, path, payload_mass)
+    else:
+        from gaponet.model.export import drawn_states, trained_network
+        from gaponet.model.export import export as write
+        from gaponet.robot_folder import kept_robot, save_robot
+
+        path = out or run / "model"
+        card, config = read_card(run / "model" / CARD)
+        net = trained_network(run, config, len(card["joint_names"]))
+        difference = write(net, path, card, drawn_states(net))
+        if path != run / "model" and keeps_robot(run):
+            save_robot(kept_robot(run, card["robot"]), path / KEPT)  # so that commands can be transferred
+    screen.say(f"{path}: differs by {difference:.1e} rad from what was trained")
+    screen.result({"path": str(path), "to": to, "parity_rad": difference})

@@ -1,0 +1,32 @@
+"""gaponet push, pull."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import tyro
+
+from gaponet.cli.options import Flag, Folder, Json, like
+from gaponet.cli.out import Out
+from gaponet_interop.share import move
+
+
+@like(move.push)
+def push(
+    path: Folder, address: tyro.conf.Positional[str], private: Flag = False, replace: Flag = False, json: Json = False
+) -> None:
+    """Put a dataset or a run onto the Hugging Face Hub or into a bucket, with its card; sends what is not there."""
+    screen = Out(json)
+    moved = move.push(path, address, private, replace)
+    screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {address}", moved.kind)
+    screen.say(f"Back: gaponet pull {address} {path.name}")
+    screen.result({"kind": moved.kind, "address": address, "files": moved.files, "bytes": moved.size})
+
+
+@like(move.pull)
+def pull(address: tyro.conf.Positional[str], out: tyro.conf.Positional[Path], json: Json = False) -> None:
+    """Fetch a dataset or a run that was pushed; every file and every sequence is checked by its hash."""
+    screen = Out(json)
+    moved = move.pull(address, out)
+    screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB; all hashes are right: {out}", moved.kind)
+    screen.result({"kind": moved.kind, "path": str(out), "files": moved.files, "bytes": moved.size})

@@ -1,0 +1,130 @@
+"""Places that datasets and runs are pushed to, and what all of them can do."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Protocol
+
+from annotated_types import Interval, Len
+
+from gaponet.errors import RemoteError
+from gaponet.structure import Name, Sha256
+
+Kind = Literal["dataset", "run"]
+Anew = Literal["", "damaged", "all"]
+INDEX = "gaponet.json"  # names every file with its size and hash; a place without one holds nothing of ours
+LARGEST_INDEX = 16 << 20  # bytes
+BLOCK = 1 << 20  # bytes read at once
+DEEPEST = 8  # folders below each other
+
+
+@dataclass(frozen=True)
+class Part:
+    """A file: its size in bytes and the SHA-256 of its content."""
+
+    size: Annotated[int, Interval(ge=0, le=1 << 40)]
+    sha256: Sha256
+
+
+@dataclass(frozen=True)
+class Index:
+    """gaponet.json: what was pushed.
+
+    Attributes:
+        contents: Hashes of what it is about: of each sequence of a dataset; of a run's network.
+        files: By their path below the place, with slashes.
+    """
+
+    format: int
+    kind: Kind
+    name: Name
+    contents: Annotated[tuple[Name, ...], Len(1, 200_000)]
+    files: Annotated[dict[str, Part], Len(1, 20_000)]
+
+    def __post_init__(self) -> None:
+        for path in self.files:
+            parts = path.split("/")
+            strange = any(p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable() for p in parts)
+            if strange or ":" in path or len(parts) > DEEPEST or len(path) > 400 or path == INDEX:
+                raise RemoteError(f"files: '{path}' is not the name of a file inside a folder")
+        if len({path.casefold() for path in self.files}) < len(self.files):
+            raise RemoteError("files: two names differ in capitals alone")
+        if {parent for path in self.files for parent in _parents(path)} & self.files.keys():
+            raise RemoteError("files: a file stands where a folder does")
+
+    @property
+    def size(self) -> int:
+        """Bytes in all."""
+        return sum(part.size for part in self.files.values())
+
+
+def _parents(path: str) -> Iterator[str]:
+    while "/" in path:
+        path = path.rpartition("/")[0]
+        yield path
+
+
+class ChangedError(RemoteError):
+    """Somebody else pushed to the place since its index was read."""
+
+
+class Target(Protocol):
+    """A place for one dataset or run. What is stored is whole and replaces what was there at once, or not at all.
+
+    Errors of the network and of the place become RemoteError.
+    """
+
+    address: str
+
+    def index(self, kind: Kind | None = None) -> bytes | None:
+        """Content of gaponet.json, at most LARGEST_INDEX bytes; None where nothing is there yet.
+
+        Args:
+            kind: Where datasets and runs live apart: look for this kind alone.
+
+        Raises:
+            RemoteError: The place cannot be reached, or holds something else.
+        """
+
+    def store(
+        self, kind: Kind, files: Mapping[str, Path], index: bytes, private: bool, there: bytes | None, anew: Anew
+    ) -> None:
+        """Make the place hold these files, by their paths there, and the index; sends what is not there by its hash.
+
+        Args:
+            private: Where the place is made anew and knows of it: readable by its owner alone.
+            there: The index that was read, which this one takes the place of.
+            anew: What is sent though a file of its hash and size is there: nothing, what has other content, or all.
+
+        Raises:
+            ChangedError: Another index is there now; it stays.
+        """
+
+    def fetch(self, path: str, part: Part, folder: Path) -> None:
+        """Copy one file of the index into a folder, under its path; its hash is the caller's to look at."""
+
+
+def part_of(file: Path) -> Part:
+    """Size and hash of a file."""
+    digest = hashlib.sha256()
+    with file.open("rb") as content:
+        while block := content.read(BLOCK):
+            digest.update(block)
+    return Part(file.stat().st_size, digest.hexdigest())
+
+
+@contextmanager
+def reaching(address: str, *errors: type[Exception], but: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Errors of these types, and of the operating system's network, become a RemoteError with the address."""
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, (RemoteError, *but)) or not isinstance(error, (*errors, OSError)):
+            raise
+        cause = error.__cause__ or error
+        text = " ".join(str(cause).split()) or type(cause).__name__
+        raise RemoteError(f"{address}: {text[:300]}") from None

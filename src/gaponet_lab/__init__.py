@@ -1,0 +1,17 @@
+"""The part that shows and proves: reports, figures, views, studies over many trainings, speed.
+
+What it offers to gaponet (gaponet.parts); nothing is imported here.
+"""
+
+COMMANDS = {
+    name: f"gaponet_lab.cli.{name}:{name}" for name in ("view", "report", "experiment", "runs", "demo", "bench")
+}
+PROVIDES = {
+    "figure of a gap": "gaponet_lab.report.gap_figure:write_gap",
+    "figures of a dataset": "gaponet_lab.report.draw_dataset:draw_all",
+    "figures of findings": "gaponet_lab.report.draw_findings:draw_findings",
+    "picture of models": "gaponet_lab.view.still:still",
+    "labels of logs": "gaponet_lab.real.labels:estimate",
+    "labels to logs.toml": "gaponet_lab.real.labels:write",
+    "OpenGL": "gaponet_lab.view.portrait:prepare",
+}

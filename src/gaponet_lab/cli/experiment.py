@@ -1,0 +1,136 @@
+"""gaponet experiment: one question each, from trainings to tables, figures and a report."""
+
+from __future__ import annotations
+
+import inspect
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Union
+
+import tyro
+
+from gaponet.cli.out import Out, writes
+from gaponet.data.store import open_dataset
+from gaponet.errors import ModelError, UsageError
+from gaponet.progress import bar, bars
+from gaponet.training.config import TrainConfig
+from gaponet_lab.cli.show import show_result
+from gaponet_lab.study.ablation import Ablation
+from gaponet_lab.study.compare import Compare, identified
+from gaponet_lab.study.data import Data
+from gaponet_lab.study.found import Question, answer, train_all
+from gaponet_lab.study.options import MODELS, Options
+from gaponet_lab.study.payload import Payload
+from gaponet_lab.study.played.delivery import Delivery
+from gaponet_lab.study.played.session import Playing, Session, study_to_play
+from gaponet_lab.study.played.tracking import Tracking
+from gaponet_lab.study.simulators import Simulators
+from gaponet_lab.study.study import Study, expected_s
+from gaponet_lab.study.unit import Unit
+from gaponet_lab.study.variant import parse_variant
+
+if TYPE_CHECKING:
+    from gaponet.data.store import Dataset
+    from gaponet.robot import RobotSpec
+    from gaponet_lab.study.pool import Cell
+
+FLAT = tyro.conf.arg(name="")
+Shared = Annotated[Options, FLAT]
+PLAYED = (Tracking, Delivery)
+DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
+
+
+def _carry_out(question: Question, study: Study, json: bool) -> None:
+    """Say how long it will take, train, and show what came out."""
+    screen, cells = Out(json), question.cells(study)
+    with _trainings(cells, study, screen) as show:
+        result = answer(question, study, show)
+    show_result(result, study.out, screen)
+    if failed := sum(not c.done for c in cells):
+        raise ModelError(f"{failed} trainings failed; the tables are of the others. Run it again to retry")
+
+
+def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
+    todo = sum(not c.done for c in cells)
+    minutes = expected_s(cells, study) / 60
+    rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
+    screen.say(
+        f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
+        + (f"; the others take {rest}, {study.at_once} at a time" if todo else "")
+    )
+    return bars("trainings", todo)
+
+
+def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
+    data, robot = open_dataset(dataset, options.robot)
+    if kind in PLAYED:
+        _play(question, data, robot, out, options)
+        return
+    study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
+    if isinstance(question, Payload):
+        study = question.prepared(study)
+    if kind in (Compare, Simulators):
+        study = _prepared(question, study)
+    _carry_out(question, study, options.json)
+
+
+def _prepared(question: Compare | Simulators, study: Study) -> Study:
+    """The study with what is asked to be identified first; models that cannot be are refused before that."""
+    if not question.identify:
+        return study
+    if study.robot.nominal is not None:
+        raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
+    for word in question.models if isinstance(question, Compare) else ():
+        parse_variant(word, study.config)
+    with bar("identifying") as update:
+        return identified(study, update)
+
+
+def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+    """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
+    data.require_robot(robot)
+    question.require(data)
+    screen, runs, part = Out(options.json), question.runs, data
+    if not runs:
+        study = study_to_play(question, data, robot, out, options)
+        cells = study.cells(MODELS)
+        with _trainings(cells, study, screen) as show:
+            failed = train_all(cells, study, show)
+        if failed:
+            raise UsageError(f"{failed[0]}; run it again to retry")
+        runs, part, out = tuple(c.folder for c in cells), study.data, study.out
+    session = Session.of(question, part, data, robot.nominal or robot, runs, out, options.quick)
+    with bar("playing") as update:
+        result = question.play(session, lambda what, share: update(share, 1.0, what))
+    show_result(result, out, screen)
+
+
+def _command(kind: type[Any]) -> Any:
+    """A question's command: its fields are options."""
+    usual = DEFAULTS.get(kind, Options())
+
+    def ask(dataset: Any, out: Any, question: Any, options: Any = usual) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # options are understood (__main__.py)
+        _ask(kind, dataset, out, question, options)
+
+    place = tyro.conf.Positional[str]
+    ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
+    trained_on = " that the models were trained on" if kind in PLAYED else ""
+    ask.__doc__ = "\n    ".join((
+        f"{inspect.getdoc(kind)}\n\nArgs:",
+        f"dataset: Dataset folder{trained_on}, or the address (s3://, gs://) of one that was pushed.",
+        "out: Folder of the results; its report.html shows all experiments in it.", "question: What is asked.",
+        "options: Shared.",
+    ))  # fmt: skip
+    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=writes("experiments")(ask))]
+
+
+def experiment(action: None) -> None:
+    """Experiments with a question each: tables, figures and sentences in OUT, one report.html over all."""
+
+
+# Each is run while the command line is parsed; what is left to call is nothing.
+ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Ablation, Payload, Unit, Data, Simulators, *PLAYED))]  # noqa: UP007
+experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

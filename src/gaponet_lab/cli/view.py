@@ -1,0 +1,123 @@
+"""gaponet view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gaponet.cli.options import Data, Flag, Json, Robot
+from gaponet.cli.out import Out
+from gaponet.data.store import open_dataset
+from gaponet.eval.tables import mrad
+from gaponet.progress import bar
+
+if TYPE_CHECKING:
+    from gaponet_lab.view.film import Clip
+    from gaponet_lab.view.scene import Scene
+
+
+def view(
+    dataset: Data,
+    model: tuple[Path, ...] = (),
+    motion: str = "",
+    unit: str = "",
+    payload_mass: float | None = None,
+    show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
+    render: Path | None = None,
+    web: Flag = False,
+    port: int = 8080,
+    start: float | None = None,
+    duration: float = 8.0,
+    speed: float = 1.0,
+    magnify: float = 1.0,
+    ghost: bool = True,
+    closeup: bool = False,
+    fps: float = 20.0,
+    width: int = 960,
+    course: bool = True,
+    azimuth: float = 145.0,
+    elevation: float = -14.0,
+    robot: Robot = None,
+    json: Json = False,
+) -> None:
+    """Watch one recording: target, nominal, identified and corrected simulator, robot. --render, --web need no display.
+
+    Args:
+        model: Robot folders of gaponet identify and run folders of gaponet train; each gives a copy of the robot.
+        motion: Which motion; default: one that the model was not trained on, where there is one.
+        unit: Which unit's recording, where there are several.
+        payload_mass: Which payload's recording, kg.
+        show: Copies from left to right; aligned stands for the identified robot and every --model.
+        render: Write a .gif, .mp4 or .png instead (the .png shows the moment of the largest nominal error).
+        web: Serve the scene to a browser instead; needs gaponet[view].
+        port: Port of --web.
+        start: s into the recording; default: where most happens.
+        duration: s of the recording.
+        speed: Below 1 is slow motion.
+        magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
+        ghost: Draw the recording, translucent, into each other copy.
+        closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
+        fps: Pictures a second of a film.
+        width: Width of a picture, pixels; the height follows from the robots.
+        course: Draw the error against time below a picture.
+        azimuth: Camera, degrees; 180 looks at the robot's front.
+        elevation: Camera, degrees; negative looks down.
+    """
+    from gaponet.errors import UsageError
+    from gaponet_lab.view.gl import choose_gl, has_display
+
+    if render is None and not web and not has_display():
+        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
+    if render is not None:
+        choose_gl()
+    from gaponet_lab.view.film import Clip, require_kind
+    from gaponet_lab.view.scene import Scene, View
+    from gaponet_lab.view.side_by_side import pick, side_by_side
+
+    if render is not None:
+        require_kind(render)
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    fitted = model if spec.nominal is None else (*model, spec.folder)
+    entry = pick(data, fitted, motion, unit, payload_mass)
+    with bar("replaying") as update:
+        shown = side_by_side(data, entry, spec, model, update)
+    shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
+    clip = Clip.of(shown, start, duration, speed, fps)
+    meta = entry.meta
+    out.say(
+        f", {'VIRTUAL ' if meta.virtual else ''}unit {meta.unit_id}, {meta.payload_mass:g} kg; "
+        + ", ".join(f"{m.name} {mrad(m.mpjae)} mrad" for m in shown.motions if m.method != "recorded"),
+        meta.motion,
+    )
+    if shown.seen:
+        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
+    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
+    rows = slice(first, last + 1)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
+    if render is not None:
+        pictures = _film(scene, clip, render, width, magnify, course)
+        size = render.stat().st_size
+        out.say(f"{render}: {pictures} picture{'s' * (pictures > 1)}, {size / 1e6:.2f} MB")
+    elif web:
+        from gaponet_lab.view.web import serve
+
+        serve(scene, clip, port, magnify, out.say)
+    else:
+        from gaponet_lab.view.watch import watch
+
+        watch(scene, clip, magnify)
+    out.result({
+        "sequence": entry.id, "virtual": meta.virtual, "seen": shown.seen, "start": clip.start,
+        "duration": clip.duration, "mpjae": {m.method: m.mpjae for m in shown.motions if m.method != "recorded"},
+        "render": None if render is None else str(render),
+    })  # fmt: skip
+
+
+def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool) -> int:
+    from gaponet_lab.view.film import write
+    from gaponet_lab.view.picture import Camera
+
+    span = (clip.start, clip.stop)
+    with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:
+        return write(camera, clip, path, lambda done, total: update(done, total, "pictures"))

@@ -1,0 +1,1 @@
+"""The ground floor of every figure: style, charts, legends, files."""

@@ -1,0 +1,134 @@
+"""What is asked of a data set: recordings to learn from, and others to be right about, of the same robot."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.pair import hash_order
+from gaponet.data.repeatability import SAME_COMMAND
+from gaponet.data.sequence import Sequence
+from gaponet.data.split import in_turn, one_motion, split_entries
+from gaponet.data.store import Dataset, Entry, dataset_hash
+from gaponet.errors import UsageError
+from gaponet.robot import RobotSpec
+
+FOLDS = 3
+FEW = 6  # recordings of a unit, of each joint, to calibrate with
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question: name; recordings for training, validation and testing; `few` of the test's own, to calibrate with.
+
+    `motion` says of each test recording which independent motion it is of; `split` is the hash of both sides; `before`
+    is the robot as it was identified elsewhere.
+    """
+
+    name: str
+    robot: RobotSpec
+    train: list[Sequence]
+    val: list[Sequence]
+    test: list[Sequence]
+    motion: list[str]
+    split: str
+    few: list[Sequence] = field(default_factory=list)
+    before: RobotSpec | None = None
+
+
+def questions(name: str, dataset: Dataset, robot: RobotSpec, before: RobotSpec | None) -> Iterator[Question]:
+    """The parts of a question: one, or a fold for each command or unit that is left out in turn."""
+    lead = one_motion(dataset)
+    entries = dataset.entries
+
+    def ask(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
+        digest = hashlib.sha256(f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()).hexdigest()[:8]
+        read = lambda part: dataset.sequences(part)  # noqa: E731
+        motion = [lead[e.meta.motion] for e in test]
+        return Question(name, robot, read(train), read(val), read(test), motion, digest, read(few), before)
+
+    if name in ("new motions", "another session"):
+        parts = split_entries(dataset)
+        few = _half_a_minute(parts["train"]) if name == "another session" else []
+        yield ask(parts["train"], parts["val"], parts["test"], few)
+    elif name == "later repetitions":
+        parts = in_turn(dataset, "repetition")
+        yield ask(parts["train"], parts["val"], parts["test"])
+    elif name == "new commands":
+        order = {
+            j: hash_order({e.meta.motion for e in entries if _joint(e) == j}) for j in {_joint(e) for e in entries}
+        }
+        for fold in range(FOLDS):
+            out = {names[fold] for names in order.values() if fold < len(names) > 1}
+            yield ask(
+                [e for e in entries if e.meta.motion not in out], [], [e for e in entries if e.meta.motion in out]
+            )
+    elif name.endswith(" kg left out"):
+        mass = float(name.split()[0])
+        away = [e for e in entries if e.meta.payload_mass == mass]
+        yield ask([e for e in entries if e not in away], [], away)
+    elif name == "a unit left out":
+        for unit in sorted({e.meta.unit_id for e in entries}):
+            away = [e for e in entries if e.meta.unit_id == unit]
+            first = {
+                j: hash_order({e.meta.motion for e in away if _joint(e) == j})[0] for j in {_joint(e) for e in away}
+            }
+            known = [e for e in away if e.meta.motion in first.values()]
+            few = [e for j in first for e in [e for e in known if _joint(e) == j][:FEW]]
+            yield ask([e for e in entries if e not in away], [], [e for e in away if e not in known], few)
+    else:
+        raise UsageError(f"question '{name}' is not known; docs/benchmark.md lists them")
+
+
+def _joint(entry: Entry) -> str:
+    """What a recording of one joint is about; "" of others."""
+    unknown = entry.meta.unrecorded
+    return entry.meta.motion.split("-to")[0] if unknown else ""
+
+
+def _half_a_minute(entries: list[Entry], seconds: float = 30.0) -> list[Entry]:
+    """The first recording by the hash of its name; what is used of it is cut later."""
+    name = hash_order({e.meta.motion for e in entries})[0]
+    return [e for e in entries if e.meta.motion == name]
+
+
+def permuted(question: Question, seed: int) -> Question:
+    """The same with payload and unit of the training recordings dealt out anew among those of a joint: an adversary."""
+    rng = np.random.default_rng(seed)
+    train = list(question.train)
+    for joints in {s.meta.unrecorded for s in train}:
+        mine = [i for i, s in enumerate(train) if s.meta.unrecorded == joints]
+        for i, j in zip(mine, rng.permutation(mine), strict=True):
+            other = question.train[j].meta
+            meta = replace(train[i].meta, payload_mass=other.payload_mass, unit_id=other.unit_id)
+            train[i] = replace(train[i], meta=meta)
+    return replace(question, train=train)
+
+
+def floor(question: Question) -> float:
+    """Mean |difference| of two recordings of one command, unit and payload, rad; nan where there are none."""
+    groups: dict[tuple[object, ...], list[Sequence]] = {}
+    for s, motion in zip(question.test, question.motion, strict=True):
+        groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded), []).append(s)
+    apart = [d for group in groups.values() for d in _differences(group, question.robot)]
+    return float(np.mean(apart)) if apart else float("nan")
+
+
+def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[float]:
+    for a, first in enumerate(group):
+        for second in group[a + 1 :]:
+            rows = min(len(first), len(second))
+            if np.abs(first.ctrl[:rows] - second.ctrl[:rows]).max() < 5 * SAME_COMMAND:
+                error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows])[:, recorded(first, robot)]
+                yield float(error.mean())
+
+
+def recorded(sequence: Sequence, robot: RobotSpec) -> list[int]:
+    """Columns of the operated joints that a recording holds."""
+    return [
+        int(i) for i, j in zip(robot.operated_index, robot.operated, strict=True) if j not in sequence.meta.unrecorded
+    ]

@@ -1,0 +1,1 @@
+"""Pages and figures about datasets, gaps and runs."""

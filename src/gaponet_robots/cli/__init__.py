@@ -1,0 +1,1 @@
+"""Commands that play motions on robots, real or virtual."""

@@ -1,0 +1,97 @@
+"""`gaponet virtual serve`: a virtual robot on a real bus."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+from gaponet.files import write_text
+from gaponet_robots.control.stop import SIGNALS
+from gaponet_robots.drivers.unitree_virtual import FaultKind, VirtualH12
+
+
+def virtual(
+    action: tyro.conf.Positional[Literal["serve"]],
+    robot: str = "h1_2",
+    unit: str = "4",
+    payload_mass: float = 0.0,
+    payload_side: str = "both",
+    fleet: str = "hard",
+    domain: int = 0,
+    interface: str = "lo",
+    rate: float = 500.0,
+    seconds: float | None = None,
+    fault: FaultKind = "none",
+    fault_at: float = 2.0,
+    heard: Path | None = None,
+    link: Path | None = None,
+    calibration: Path | None = None,
+    frame: float | None = None,
+) -> None:
+    """Be a VIRTUAL robot behind the real bus until interrupted, for gaponet run and record in another terminal.
+
+    Args:
+        action: serve.
+        robot: h1_2 (DDS) or so101 (a serial bus on a pseudo-terminal).
+        unit: Unit of the fleet: its number or its name.
+        payload_mass: kg in each hand named by payload_side.
+        payload_side: both, or one hand.
+        fleet: Virtual units: hard, easy, shifted, or a .toml file.
+        domain: DDS domain.
+        interface: Network interface; lo reaches this machine only.
+        rate: States per second (DDS).
+        seconds: End by itself after this time.
+        fault: Go wrong on purpose, to rehearse what a controller does then.
+        fault_at: s after the first command.
+        heard: Write every command that arrived, and where the joints were, to this .npz at the end.
+        link: Serial: also give the pseudo-terminal this name, e.g. /tmp/so101.
+        calibration: Serial: write what the servos hold of a calibration to this file, as lerobot-calibrate does.
+        frame: Serial: instead of real time, this much time passes with every goal, s, for programs that keep none.
+    """
+    from gaponet.robot import load_robot
+    from gaponet_robots.drivers.so101_virtual import VirtualSO101
+    from gaponet_robots.virtual.fleet import load_fleet
+
+    out, spec = Out(), load_robot(robot)
+    if heard and not heard.parent.is_dir():  # said now, not when all has been heard
+        raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
+    name = f"virtual-{unit}" if unit.isdigit() else unit
+    physics = load_fleet(fleet, spec).unit(name)
+    for number in set(SIGNALS) - {signal.SIGINT}:
+        signal.signal(number, signal.default_int_handler)
+    label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
+    served: VirtualH12 | VirtualSO101
+    if spec.name != "so101":
+        payload = (payload_mass, payload_side)
+        served = VirtualH12(spec, physics, payload, domain, interface, rate, fault, fault_at)
+        where = f"rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}"
+    else:
+        side = payload_side if payload_side != "both" else "hand"
+        served = VirtualSO101(spec, physics, (payload_mass, side), link, frame)
+        where = f"servo bus on {served.port}"
+        if calibration:
+            rows = {joint: asdict(row) for joint, row in served.calibration.rows.items()}
+            write_text(calibration, json.dumps(rows, indent=4) + "\n")
+    out.say(f"{label}: {where}; Ctrl-C ends it")
+    sys.stdout.flush()  # whoever started us through a pipe waits for this line
+    try:
+        served.run(float("inf") if seconds is None else seconds)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if isinstance(served, VirtualSO101):
+            served.close()
+        elif heard:
+            served.heard.save(heard)
+    if isinstance(served, VirtualH12):
+        out.say(
+            f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods"
+        )

@@ -1,0 +1,1 @@
+"""The loop between a target and a robot: controller, limits, watchdog, recording."""

@@ -1,0 +1,60 @@
+"""Payload and unit of recordings that say neither, from held torque at equal commands."""
+
+import numpy as np
+import pytest
+
+from gaponet.data.log import Channel, Log
+from gaponet.errors import LogError
+from gaponet_lab.real.labels import estimate
+
+MASSES, UNITS = (0.0, 1.0, 2.0), 2
+
+
+def windows(lever: float, rng: np.random.Generator, apart: float = 0.7) -> list[tuple[str, Log]]:
+    """Two commands, two units and three payloads, each three times, in a random order of threes."""
+    made = []
+    for end in (0.5, 0.9):
+        for unit, own in enumerate((0.0, apart)):
+            for mass in MASSES:
+                made.append((end, unit, mass, -4.0 - own - lever * (1.0 + end) * mass))
+    order, logs = rng.permutation(len(made)), []
+    for i in order:
+        end, unit, mass, torque = made[i]
+        for take in range(3):
+            time = 0.02 * np.arange(50)
+            ctrl = np.linspace(-0.3, end, 50)[:, None]
+            tau = torque + 0.1 * rng.standard_normal(50)[:, None] + 0.05 * rng.standard_normal()
+            channels = {
+                "ctrl": Channel(time, ctrl),
+                "qpos": Channel(time, ctrl - 0.1 - 1e-3 * len(logs)),
+                "tau": Channel(time, tau),
+            }
+            suffix = "_0kg" if mass == 0.0 else ""
+            logs.append((f"{unit} {mass} {take}", Log("arm", ("elbow",), channels, f"motor{suffix}.npz#{len(logs)}")))
+    return logs
+
+
+def test_payload_and_unit_are_told_where_the_payload_loads_the_joint():
+    found = estimate(windows(1.5, np.random.default_rng(0)), MASSES, UNITS, {})
+    assert [c.told for c in found.cells] == [True, True]
+    assert [c.slope for c in found.cells] == [pytest.approx(-2.25, rel=0.1), pytest.approx(-2.85, rel=0.1)]
+    for r in found.recordings:
+        unit, mass, _ = r.name.split()
+        assert (r.payload, r.unit) == (float(mass), int(unit))  # the one that holds more is the later one
+    assert (found.agreement["within_half_a_kg"], found.agreement["taken_for_one_of_these"]) == (1.0, 0.0)
+
+
+def test_a_joint_that_the_payload_does_not_load_tells_nothing_and_says_so():
+    found = estimate(windows(0.02, np.random.default_rng(0), 0.3), MASSES, UNITS, {})
+    assert [c.told for c in found.cells] == [False, False]
+    assert not found.agreement
+
+
+def test_samples_that_are_there_twice_are_one_recording_and_two_moving_joints_are_refused():
+    logs = windows(1.5, np.random.default_rng(0))
+    again = estimate([*logs, ("again", logs[4][1])], MASSES, UNITS, {})
+    assert again.recordings[-1].copy == logs[4][0]
+    time, two = logs[0][1].channels["ctrl"].time, np.tile(logs[0][1].channels["ctrl"].values, 2)
+    both = Log("arm", ("elbow", "wrist"), {"ctrl": Channel(time, two), "qpos": Channel(time, two)}, "both")
+    with pytest.raises(LogError, match="2 joints are commanded to move"):
+        estimate([("both", both)], MASSES, UNITS, {})

@@ -1,0 +1,96 @@
+"""The benchmark of real robots: what it asks, what it counts, and how somebody adds a method."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from arm import recordings, write_arm
+from logs import arm_sequence, late, wave
+
+from gaponet.data.store import Dataset
+from gaponet.errors import UsageError
+from gaponet.robot import available, load_robot
+from gaponet.sim.dynamics import gravity_of
+from gaponet_lab.real.bench import _ask, load_method
+from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
+from gaponet_lab.real.questions import floor, permuted, questions
+from gaponet_lab.real.rivals import METHODS, hanging
+
+PAGE = Path(__file__).parents[2] / "docs" / "benchmark.md"
+
+
+@pytest.fixture
+def played(arm, tmp_path):
+    """Four motions by two units, each three times."""
+    data = Dataset.create(tmp_path / "data", arm)
+    for motion in range(4):
+        for unit in ("a", "b"):
+            for k in range(3):
+                ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
+                qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
+                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit)
+                data.append(replace(one, meta=replace(one.meta, repetition=k)))
+    return data
+
+
+def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
+    cards, page = read_cards(CARDS), PAGE.read_text(encoding="utf-8")
+    for card in cards.set:
+        robot = load_robot(ROBOTS / card.robot if card.robot not in available() else card.robot)
+        assert set(card.joints) <= set(robot.joint_names)
+        assert f"| {card.name} | {card.title} |" in page
+        assert card.elsewhere in {"", *(c.name for c in cards.set)}
+
+
+def test_a_unit_left_out_is_learned_from_by_calibration_alone_and_never_asked_what_it_saw(arm, played):
+    for question in questions("a unit left out", played, arm, None):
+        (unit,) = {s.meta.unit_id for s in question.test}
+        assert unit not in {s.meta.unit_id for s in question.train}
+        assert {s.meta.unit_id for s in question.few} == {unit}
+        assert not {s.meta.motion for s in question.few} & {s.meta.motion for s in question.test}
+    with pytest.raises(UsageError, match="question 'of life' is not known"):
+        list(questions("of life", played, arm, None))
+
+
+def test_repetitions_are_no_motions_and_set_the_floor(arm, played):
+    (question,) = questions("new motions", played, arm, None)
+    assert floor(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
+    card = next(c for c in read_cards().set if c.name == "so101")
+    rows = _ask(
+        card, "new motions", [question], {k: METHODS[k] for k in ("nominal", "delay_offset")}, lambda text: None
+    )
+    told = [row.as_dict() for row in rows]
+    assert [(r["motions"], r["recordings"]) for r in told] == [(1, 6), (1, 6)]
+    assert told[0]["standard_error"] is None
+    assert told[1]["of_nominal"] < 1.0
+    mixed = permuted(question, 0)
+    assert sorted(s.meta.unit_id for s in mixed.train) == sorted(s.meta.unit_id for s in question.train)
+    assert [s.meta.unit_id for s in mixed.train] != [s.meta.unit_id for s in question.train]
+
+
+def test_the_method_on_the_page_is_one(arm, played, tmp_path):
+    code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
+    (tmp_path / "mine.py").write_text(code)
+    name, method = load_method(f"{tmp_path / 'mine.py'}:half_gravity")
+    (question,) = questions("new motions", played, arm, None)
+    moved = method(question).positions(question.test)
+    assert name == "half_gravity"
+    assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
+    with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
+        load_method("nothing.py:f")
+
+
+def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    mount = robot.payload_mounts[0]
+    true = replace(robot, payload_mounts=(replace(mount, pos=(mount.pos[0] - 0.06, *mount.pos[1:])),))
+    windows = []
+    for mass in (0.0, 0.2, 0.4):
+        for s in recordings(robot, 2, rows=200):
+            tau = gravity_of(true)(s.qpos, mass + 0.1, "both")
+            one = replace(s, tau=tau, qvel=0 * s.qvel, meta=replace(s.meta, payload_mass=mass))
+            windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
+    moved, load = hanging(windows, robot)
+    assert moved.payload_mounts[0].pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)
+    assert load(windows[0]).meta.payload_mass == pytest.approx(0.1, abs=0.02)

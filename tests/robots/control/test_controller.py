@@ -1,0 +1,445 @@
+"""The controller on a virtual arm in simulated time: phases, faults, what is sent, what is recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import os
+import signal
+import time
+
+import numpy as np
+import pytest
+from arm import commands
+
+from gaponet.data.importer import import_logs
+from gaponet.data.sequence import SequenceMeta, to_sequence
+from gaponet.errors import LogError, UsageError
+from gaponet.robot import RobotSpec
+from gaponet_robots.control.clock import SimulatedClock
+from gaponet_robots.control.controller import Controller
+from gaponet_robots.control.driver import DriverError, Fault
+from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
+from gaponet_robots.control.publisher import sole_publisher
+from gaponet_robots.control.recording import Recording
+from gaponet_robots.control.safety import Limits, SafetyConfig
+from gaponet_robots.drivers.virtual import VirtualDriver
+from gaponet_robots.motion.motion import Motion
+from gaponet_robots.targets.policy import play
+from gaponet_robots.virtual.fleet import load_fleet
+
+QUICK = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
+MOTION = Motion("sway", "whole_body", 0.02, commands(40, seed=1))
+
+
+class Tampered(VirtualDriver):
+    """A virtual arm that lies, is late or goes silent from some time after its connection on; notes what it is sent."""
+
+    def __init__(self, robot: RobotSpec, clock: SimulatedClock, at: float = np.inf, kind: str = "") -> None:
+        super().__init__(robot, load_fleet("easy", robot).unit("virtual-1"), clock, period=0.01)
+        self.at, self.kind = at, kind
+        self.sent: list[tuple[float, np.ndarray | None]] = []
+
+    def read(self):
+        honest = super().read()
+        passed = self.clock.now() - self._begun
+        if passed < self.at:
+            self.last = honest
+            return honest
+        wrong = np.eye(2)[0]
+        return {
+            "stops": lambda: self.last,
+            "late": lambda: dataclasses.replace(honest, time=honest.time - 0.1),
+            "freezes": lambda: dataclasses.replace(self.last, time=honest.time),
+            "nan": lambda: dataclasses.replace(honest, qpos=honest.qpos + np.nan * wrong),
+            "jumps": lambda: dataclasses.replace(honest, qpos=honest.qpos + 0.8 * wrong),
+            "hot": lambda: dataclasses.replace(honest, temperature=honest.temperature + 70 * wrong),
+            "bus": self._fail,
+            "encoder": lambda: dataclasses.replace(honest, qpos=np.where(wrong, self.last.qpos, honest.qpos)),
+            "leans": lambda: dataclasses.replace(honest, tilt=0.8),
+            "told": lambda: dataclasses.replace(honest, fault=Fault("robot", "a motor reports an error")),
+        }[self.kind]()
+
+    def _fail(self):
+        raise DriverError("the cable is out")
+
+    def write(self, ctrl, weight=1.0):
+        self.sent.append((self.clock.now(), ctrl.copy()))
+        super().write(ctrl, weight)
+
+    def damp(self, weight=1.0, share=0.0):
+        self.sent.append((self.clock.now(), None))
+        super().damp(weight, share)
+
+
+def run(robot: RobotSpec, driver: VirtualDriver, motion: Motion = MOTION, **how: object) -> Recording:
+    controller = Controller(driver, robot, how.pop("config", QUICK), clock=driver.clock, **how)
+    return controller.run(play(motion, controller.dt))
+
+
+def phases(recording: Recording) -> list[str]:
+    return [event.phase for event in recording.events]
+
+
+def test_a_run_goes_through_all_phases_and_follows_the_motion(arm):
+    driver = Tampered(arm, SimulatedClock())
+    recording = run(arm, driver)
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "stopped"]
+    assert recording.fault is None
+    log = recording.log()
+    np.testing.assert_allclose(log.channels["ctrl"].values, MOTION.ctrl, atol=1e-12)
+    assert np.abs(log.channels["ctrl"].values - log.channels["qpos"].values).max() < 0.2
+    assert recording.virtual
+    assert recording.missed == 0
+
+
+def test_nothing_is_collected_while_it_runs_and_nothing_piles_up_for_it(arm):
+    passes: list[bool] = []
+
+    class Watching(Tampered):
+        def read(self):
+            passes.append(gc.isenabled())
+            return super().read()
+
+    run(arm, Watching(arm, SimulatedClock()))
+    assert passes
+    assert not any(passes)
+    assert gc.isenabled()
+    gc.collect()
+    gc.disable()  # else the first pass afterwards might come before we count
+    try:
+        recording = run(arm, Tampered(arm, SimulatedClock()))
+        assert gc.collect() < len(recording.rows) / 2, "cycles, which only a collection frees"
+    finally:
+        gc.enable()
+
+
+def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
+    recording = run(arm, Tampered(arm, SimulatedClock()), unit_id="virtual-1", payload_mass=0.0)
+    meta = SequenceMeta(arm.name, "virtual-1", "sway", 0.0, virtual=True)
+    sequence = to_sequence(recording.log(), arm, meta)
+    assert sequence.meta.notes["rows"] == "as recorded"
+    assert sequence.dt == 0.02
+    recording.save(tmp_path / "logs", "sway")
+    report = import_logs(tmp_path / "logs", arm, "virtual-1", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
+    stored = report.dataset.read(report.entries[0])
+    np.testing.assert_allclose(stored.ctrl, sequence.ctrl, atol=1e-6)
+    np.testing.assert_allclose(stored.qpos, sequence.qpos, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "reason", "periods"),
+    [
+        ("stops", "stale", 3), ("late", "stale", 1), ("freezes", "frozen", 2), ("nan", "nan", 1), ("jumps", "jump", 1),
+        ("hot", "temperature", 1), ("bus", "driver", 1),
+        ("encoder", "frozen", 25), ("leans", "tilt", 1), ("told", "robot", 1),
+    ],
+)  # fmt: skip
+def test_every_fault_ends_in_damp_with_its_reason(arm, kind, reason, periods):
+    driver = Tampered(arm, SimulatedClock(), at=0.801, kind=kind)
+    recording = run(arm, driver)
+    assert phases(recording) == ["idle", "blend_in", "run", "damp", "stopped"]
+    assert recording.fault is not None
+    assert recording.fault.kind == reason
+    damped = next(t for t, ctrl in driver.sent if ctrl is None)
+    assert 0 < damped - 0.801 <= periods * 0.02
+    assert all(ctrl is None for t, ctrl in driver.sent if t >= damped), "a position command after the fault"
+
+
+@pytest.mark.parametrize("kind", ["stops", "freezes", "nan", "jumps", "bus", "late", "hot"])
+@pytest.mark.parametrize("at", [0.31, 0.9])
+def test_no_command_sent_around_a_fault_is_outside_the_limits(arm, kind, at):
+    driver = Tampered(arm, SimulatedClock(), at=at, kind=kind)
+    wild = Motion("wild", "whole_body", 0.02, np.where(np.arange(40)[:, None] // 10 % 2, 3.0, -3.0) * np.ones((40, 2)))
+    recording = run(arm, driver, wild)
+    limits = Limits.of(arm, arm.joint_names, SafetyConfig())
+    rows = [r for r in recording.rows if r.ctrl is not None]
+    before = None
+    for row in rows:
+        assert (row.ctrl >= limits.low).all()
+        assert (row.ctrl <= limits.high).all()
+        assert (np.abs(limits.kp * (row.ctrl - row.state.qpos) - limits.kd * row.state.qvel) <= limits.effort).all()
+        if before is not None:
+            assert (np.abs(row.ctrl - before) <= limits.speed * 0.02 + 1e-12).all()
+        before = row.ctrl
+    assert len([c for _, c in driver.sent if c is not None]) == len(rows)
+
+
+def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
+    monkeypatch.setattr("gaponet_robots.control.controller.PATIENCE", 0.3)
+    driver = Tampered(arm, SimulatedClock(), at=0.0, kind="hot")
+    recording = run(arm, driver)
+    assert phases(recording) == ["idle", "stopped"]
+    assert "never ready" in recording.fault.text
+    assert driver.sent == []
+
+
+@pytest.mark.parametrize("how", ["call", "signal"])
+def test_a_stop_takes_effect_in_the_next_period(arm, how):
+    driver = Tampered(arm, SimulatedClock())
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    motion = play(MOTION, 0.02)
+
+    def policy(k, state):
+        if k == 20 and how == "call":
+            controller.stop("the operator")
+        if k == 20 and how == "signal":
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0)
+        return motion(k, state)
+
+    recording = controller.run(policy)
+    assert recording.fault.kind == "stop"
+    assert ("SIGTERM" if how == "signal" else "the operator") in recording.fault.text
+    assert sum(r.phase == "run" for r in recording.rows) == 21
+
+
+def test_a_stop_is_latched(arm):
+    driver = Tampered(arm, SimulatedClock())
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller.stop("first")
+    controller.stop("second")
+    assert phases(controller.run(play(MOTION, 0.02))) == ["idle", "stopped"]
+    assert driver.sent == [], "nothing was commanded, so nothing is sent"
+    assert "first" in controller.recording.events[1].text
+    with pytest.raises(UsageError, match="runs once"):
+        controller.run(play(MOTION, 0.02))
+
+
+def test_from_damp_the_only_way_is_to_stopped():
+    assert NEXT[Phase.DAMP] == (Phase.STOPPED,)
+    assert NEXT[Phase.STOPPED] == ()
+    assert all(Phase.DAMP in NEXT[p] for p in COMMANDING)
+
+
+def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
+    driver = Tampered(arm, SimulatedClock())
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    recording = controller.run(lambda k, state: np.full(2, np.nan if k == 10 else 0.0))
+    assert recording.fault.kind == "target"
+
+    driver = Tampered(arm, SimulatedClock())
+    with pytest.raises(ZeroDivisionError):
+        Controller(driver, arm, QUICK, clock=driver.clock).run(lambda k, state: np.zeros(2) / (1 if k < 9 else 1 // 0))
+    damping = [t for t, ctrl in driver.sent if ctrl is None]
+    assert damping[-1] - damping[0] >= QUICK.damp, "the whole damping, as after any other fault"
+    assert driver.sent[-1][1] is None
+
+
+def test_a_listener_that_fails_does_not_keep_the_robot_from_damping(arm):
+    def broken(event):
+        if event.phase in ("run", "damp"):
+            raise BrokenPipeError("no terminal")
+
+    driver = Tampered(arm, SimulatedClock())
+    with pytest.raises(BrokenPipeError):
+        Controller(driver, arm, QUICK, clock=driver.clock, on_event=broken).run(play(MOTION, 0.02))
+    assert driver.sent[-1][1] is None
+
+
+@pytest.mark.parametrize("where", ["read", "policy", "compensator"])
+def test_a_period_that_stood_still_sends_nothing(arm, where):
+    clock = SimulatedClock()
+
+    class Standing(Tampered):
+        def read(self):
+            state = super().read()
+            stand("read")
+            return state
+
+    def stand(here, at=0.9):
+        if here == where and clock.now() >= at and not stood:
+            stood.append(clock.now())
+            clock.wait_until(clock.now() + 0.7)
+
+    class Model:
+        def reset(self, target, payload_mass=None): ...
+
+        def step(self, target, qpos, qvel):
+            stand("compensator")
+            return target
+
+    stood: list[float] = []
+    driver, motion = Standing(arm, clock), play(MOTION, 0.02)
+
+    def policy(k, state):
+        stand("policy")
+        return motion(k, state)
+
+    recording = Controller(driver, arm, QUICK, compensator=Model(), clock=clock).run(policy)
+    assert stood
+    assert recording.fault.kind == "overrun"
+    assert all(ctrl is None for t, ctrl in driver.sent if t > stood[0])
+
+
+def test_handing_over_holds_the_arms_while_the_weight_goes_to_zero(arm):
+    class Shared(Tampered):
+        at_end = "hand_over"
+        closed: list[bool]
+
+        def write(self, ctrl, weight=1.0):
+            weights.append((self.clock.now(), weight))
+            super().write(ctrl, weight)
+
+        def close(self, hold=False):
+            self.closed = [hold]
+
+    weights: list[tuple[float, float]] = []
+    driver = Shared(arm, SimulatedClock())
+    recording = run(arm, driver)
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "release", "stopped"]
+    released = [w for t, w in weights if t >= recording.events[-2].time]
+    assert released[0] == 1.0
+    assert released[-1] == 0.0
+    assert np.diff(released).max() <= 0
+    assert all(ctrl is not None for _, ctrl in driver.sent), "no damping: the arms would sink"
+    assert driver.closed == [True], "leaving sends nothing more"
+
+
+def test_a_fault_while_little_is_handed_over_damps_with_that_little(arm):
+    weights: list[float] = []
+
+    class Shared(Tampered):
+        def damp(self, weight=1.0, share=0.0):
+            weights.append(weight)
+            super().damp(weight, share)
+
+    driver = Shared(arm, SimulatedClock(), at=0.2, kind="hot")
+    recording = run(arm, driver)
+    assert recording.fault.kind == "temperature"
+    assert 0 < max(weights) < 0.7, "the robot keeps what it held"
+
+
+def test_a_slow_policy_is_an_overrun(arm):
+    driver = Tampered(arm, SimulatedClock())
+
+    def policy(k, state):
+        if k == 5:
+            driver.clock.wait_until(driver.clock.now() + 0.09)
+        return np.zeros(2) if k < 20 else None
+
+    recording = Controller(driver, arm, QUICK, clock=driver.clock).run(policy)
+    assert recording.fault.kind == "overrun"
+    assert recording.missed == 3
+
+
+def test_the_wall_clock_may_be_set_while_it_runs(arm, monkeypatch):
+    steps = iter(range(10**6))
+    monkeypatch.setattr(time, "time", lambda: 1e9 * (-1) ** next(steps))
+    monkeypatch.setattr(time, "time_ns", lambda: 10**18 * (-1) ** next(steps))
+    assert run(arm, Tampered(arm, SimulatedClock())).fault is None
+
+
+def test_two_controllers_cannot_command_one_robot(arm):
+    driver = Tampered(arm, SimulatedClock())
+    with sole_publisher(driver.address), pytest.raises(UsageError, match="another process commands this robot"):
+        run(arm, driver)
+    assert driver.sent == []
+
+
+def test_a_compensator_acts_within_its_bounds(arm):
+    class Greedy:
+        def reset(self, target, payload_mass=None):
+            assert payload_mass == 0.7
+            self.resets = getattr(self, "resets", 0) + 1
+
+        def step(self, target, qpos, qvel):
+            return target + np.array([5.0, -0.01])
+
+    greedy = Greedy()
+    recording = run(arm, Tampered(arm, SimulatedClock()), compensator=greedy, payload_mass=0.7)
+    rows = [r for r in recording.rows if r.phase == "run"]
+    delta = np.array([r.ctrl - r.target for r in rows])
+    assert greedy.resets == 1
+    assert delta[:, 0].max() <= 0.5 + 1e-12
+    np.testing.assert_allclose(delta[:, 1], -0.01, atol=1e-12)
+
+
+def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
+    class Guard:
+        beats = 0
+
+        def alive(self):
+            return True
+
+        def fired(self):
+            return False
+
+        def beat(self, weight):
+            assert guard.beats or not driver.sent, "from the first beat on it would damp the robot"
+            self.beats += 1
+            return True
+
+    class Slow:
+        def reset(self, target, payload_mass=None):
+            assert guard.beats == 0  # from the first beat on, the guard damps a robot that it hears nothing of
+            clock.wait_until(clock.now() + 0.4)
+
+        def step(self, target, qpos, qvel):
+            return target
+
+    clock, guard = SimulatedClock(), Guard()
+    driver = Tampered(arm, clock)
+    controller = Controller(driver, arm, QUICK, compensator=Slow(), clock=clock)
+    controller._guard = guard
+    recording = controller.run(play(MOTION, controller.dt))
+    assert recording.fault is None
+    assert guard.beats > 40
+
+
+def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
+    monkeypatch.setattr("gaponet_robots.control.controller.PATIENCE", 0.3)
+    recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))
+    with pytest.raises(LogError, match="0 periods of phase 'run'"):
+        recording.log()
+
+
+def test_damping_takes_the_stiffness_away_and_brakes(arm):
+    driver = Tampered(arm, SimulatedClock())
+    driver.connect()
+    held = driver.read().qpos
+    driver.clock.wait_until(0.5)
+    assert np.abs(driver.read().qpos - held).max() < 0.02
+    driver.damp()
+    driver.clock.wait_until(0.9)
+    sinking = driver.read()
+    assert np.abs(sinking.qpos - held).max() > 0.05
+    assert (np.abs(sinking.qvel) < 5).all()
+
+
+def test_the_guard_tries_again_until_it_has_damped(capsys):
+    from gaponet_robots.control import guard
+
+    class Loose:
+        address = "/dev/loose"
+        tries, damped, closed = 0, [], False
+
+        def connect(self):
+            self.tries += 1
+            if self.tries < 3:
+                raise DriverError("the cable is out")
+
+        def damp(self, weight, share):
+            self.damped.append(weight)
+            if len(self.damped) in (2, 3):
+                raise OSError("a glitch")
+
+        def confirm(self):
+            self.asked = getattr(self, "asked", 0) + 1
+            if self.asked < 3:
+                raise DriverError("one servo does not answer")
+            return "let go"
+
+        def close(self, hold=False):
+            self.closed = True
+
+    robot = Loose()
+    guard._damp(robot, 0.1, 0.5, connected=False)
+    assert robot.tries == 3
+    assert len(robot.damped) > 3
+    assert 0.5 >= robot.damped[0] > robot.damped[-1]
+    assert robot.closed
+    said = capsys.readouterr().err
+    assert "could NOT be damped: switch the supply off (the cable is out); trying again" in said
+    assert "(one servo does not answer)" in said
+    assert said.endswith("guard: /dev/loose let go\n")
