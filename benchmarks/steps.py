@@ -32,15 +32,14 @@ from gaponet.spread import Spread, Table
 from gaponet.training.kept import PROGRESS
 from gaponet.training.run import VALIDATION_RUNS
 from gaponet_lab.plot.charts import lines
-from gaponet_lab.study.ablation import PAPER_SIZE
 from gaponet_lab.study.found import baselines, train_all
 from gaponet_lab.study.pool import RESULT, Cell
 from gaponet_lab.study.result import Result, facts
 from gaponet_lab.study.study import Study
 
-LAYERS = PAPER_SIZE.removeprefix("coupling=full:")
+LAYERS = "branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"  # the paper's
 ARMS = {"usual": ("today's network", "", 0.0), "layers": ("the paper's layers", LAYERS, -0.4),
-        "full": ("the paper's layers, full coupling", PAPER_SIZE, 0.5)}  # fmt: skip
+        "full": ("the paper's layers, full coupling", f"coupling=full:{LAYERS}", 0.5)}  # fmt: skip
 ROUNDS, TIMES = 6, (1, 10)
 
 

@@ -21,13 +21,17 @@ from scipy.optimize import nnls
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import LAW, RobotSpec
+from gaponet.sim import servo
 from gaponet.sim.model import build_model
-from gaponet.sim.servo import SLOWEST, friction_limit, present, servo_torque
+from gaponet.sim.servo import friction_limit, present, servo_torque
 
 try:
-    njit: Any = import_module("numba").njit
-except ImportError:  # an extra: what it compiles is eight times as fast as numpy
-    njit = None
+    import_module("numba")  # an extra: what it compiles is eight times as fast as numpy
+    jitable = import_module("numba.extending").register_jitable
+    jitable(servo.passing_friction), jitable(servo.resting_friction)
+    advance: Any = import_module("numba").njit(cache=True, nogil=True)(servo.advance)  # anew when servo.py changes
+except ImportError:
+    advance = None
 
 Array = np.ndarray
 
@@ -252,66 +256,6 @@ class Along:
         mujoco.mj_fwdPosition(self.model, self.data)
         mujoco.mj_fwdVelocity(self.model, self.data)
         return self.data.qfrc_bias.copy()
-
-
-def _advance(
-    first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
-    lengths: Any, stiffer: Any, kd: Any, stops: Any, dt: float, count: int, thin: int, out: Any,
-) -> None:  # fmt: skip
-    """Fill rows `first` to `last` of out (k·n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them."""
-    n, windows = qpos.shape[:2]
-    h = dt / count
-    for item in range(first, last):
-        c, j, p = item // (n * windows), item // windows % n, item % windows
-        kp, own, dry, mass = values[c, j, 0] * stiffer[p, j], values[c, j, 1], values[c, j, 2], values[c, j, 3]
-        offset, delay, limit = values[c, j, 4], values[c, j, 5] / dt, values[c, j, 6]
-        rest, speed, by_motor, by_load = (
-            values[c, j, 7],
-            max(values[c, j, 8], SLOWEST),
-            values[c, j, 9],
-            values[c, j, 10],
-        )
-        least, step = values[c, j, 11], values[c, j, 12]
-        brake = max(kd[p, j] + min(own, 0.0), 0.0)
-        own = max(own, 0.0)
-        q, w = float(qpos[j, p, 0]), float(qvel[j, p, 0])
-        rows = lengths[p]
-        for t in range(rows - 1):
-            inertia, weight, pull = tables[0, j, p, t] + mass, tables[1, j, p, t], tables[2, j, p, t]
-            slope = tables[3, j, p, t]
-            turn = h / (inertia + h * (own + brake))
-            for part in range(count):
-                at = t + part / count - delay  # the command in force; a part of each where it changes on the way
-                row = int(np.floor(at))
-                share = max((at - row - 1) * count + 1, 0.0)
-                aim = (1 - share) * ctrl[j, p, min(max(row, 0), rows - 1)]
-                aim += share * ctrl[j, p, min(max(row + 1, 0), rows - 1)]
-                load = slope * q + weight
-                if law:
-                    read = np.round(q / step) * step if step > 0 else q
-                    torque = kp * (aim + offset - read)
-                    if least > 0:
-                        torque = np.copysign(max(abs(torque), least), torque) if abs(torque) > 0.5 * step * kp else 0.0
-                    torque = min(max(torque - brake * w, -limit), limit)
-                    most = dry + abs(by_motor * torque + by_load * load)
-                    if rest > 0:
-                        most += rest * np.exp(-abs(w) / speed)
-                else:
-                    torque, most = min(max(kp * (aim + offset - q) - brake * w, -limit), limit), dry
-                net = torque - load - pull - own * w
-                w += turn * (net + min(max(-inertia / h * w - net, -most), most))
-                q += h * w
-                if q < stops[j, 0]:
-                    q, w = stops[j, 0], max(w, 0.0)
-                elif q > stops[j, 1]:
-                    q, w = stops[j, 1], min(w, 0.0)
-            if touch[p, t + 1]:  # goes on from the recording
-                q, w = float(qpos[j, p, t + 1]), float(qvel[j, p, t + 1])
-            if (t + 1) % thin == 0:
-                out[item, (t + 1) // thin] = q - qpos[j, p, t + 1]
-
-
-advance = njit(cache=True, nogil=True)(_advance) if njit else None
 
 
 def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:

@@ -3,7 +3,8 @@
 The encoder counts in steps; a motor that is told to turn at all turns with a least torque (minimum PWM); friction is
 larger at rest (Stribeck) and grows with what the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024).
 MuJoCo integrates: these laws only move the actuator's bias and the limit of friction, so friction sticks as MuJoCo's
-does. A compiled model carries the numbers in actuator_user; without any, nothing here runs.
+does. The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_runs.py) compute with
+them. A compiled model carries the numbers in actuator_user; without any, nothing here runs.
 """
 
 from __future__ import annotations
@@ -27,14 +28,25 @@ def present(law: Law) -> Law:
     return {name: x for name, x in law.items() if x.any()}
 
 
+def passing_friction(by_motor: Any, by_load: Any, torque: Any, load: Any) -> Any:
+    """What friction takes more, N·m, the more passes the gear: the motor's torque and gravity's."""
+    return abs(by_motor * torque + by_load * load)
+
+
+def resting_friction(exp: Any, stribeck: Any, speed: Any, qvel: Any) -> Any:
+    """What friction takes more, N·m, the slower a joint turns, rad/s; exp of the arrays' library."""
+    return stribeck * exp(-abs(qvel) / speed)
+
+
 def friction_limit(law: Law, frictionloss: Any, qvel: Any, torque: Any, load: Any) -> Any:
     """The most that friction takes, N·m, at a speed, under the motor's torque and gravity's; law as of `present`."""
     limit = frictionloss
     if "friction_motor" in law or "friction_external" in law:
-        limit = limit + abs(law.get("friction_motor", 0.0) * torque + law.get("friction_external", 0.0) * load)
+        by_motor, by_load = law.get("friction_motor", 0.0), law.get("friction_external", 0.0)
+        limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in law:
         speed = law["stribeck_speed"].clip(min=SLOWEST) if "stribeck_speed" in law else SLOWEST
-        limit = limit + law["stribeck"] * library(qvel).exp(-abs(qvel) / speed)
+        limit = limit + resting_friction(library(qvel).exp, law["stribeck"], speed, qvel)
     return limit
 
 
@@ -49,6 +61,62 @@ def servo_torque(law: Law, kp: Any, aim: Any, qpos: Any) -> Any:
     if "min_torque" not in law:
         return torque
     return xp.where(abs(torque) > deadband, xp.copysign(xp.maximum(abs(torque), law["min_torque"]), torque), 0.0)
+
+
+def advance(
+    first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
+    lengths: Any, stiffer: Any, kd: Any, stops: Any, dt: float, count: int, thin: int, out: Any,
+) -> None:  # fmt: skip
+    """Fill rows `first` to `last` of out (k·n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them.
+
+    numba compiles this; it stands here since a compiled function is made anew when its own file changes, and no other.
+    """
+    n, windows = qpos.shape[:2]
+    h = dt / count
+    for item in range(first, last):
+        c, j, p = item // (n * windows), item // windows % n, item % windows
+        kp, own, dry, mass = values[c, j, 0] * stiffer[p, j], values[c, j, 1], values[c, j, 2], values[c, j, 3]
+        offset, delay, limit = values[c, j, 4], values[c, j, 5] / dt, values[c, j, 6]
+        rest, speed = values[c, j, 7], max(values[c, j, 8], SLOWEST)
+        by_motor, by_load = values[c, j, 9], values[c, j, 10]
+        least, step = values[c, j, 11], values[c, j, 12]
+        brake = max(kd[p, j] + min(own, 0.0), 0.0)
+        own = max(own, 0.0)
+        q, w = float(qpos[j, p, 0]), float(qvel[j, p, 0])
+        rows = lengths[p]
+        for t in range(rows - 1):
+            inertia, weight, pull = tables[0, j, p, t] + mass, tables[1, j, p, t], tables[2, j, p, t]
+            slope = tables[3, j, p, t]
+            turn = h / (inertia + h * (own + brake))
+            for part in range(count):
+                at = t + part / count - delay  # the command in force; a part of each where it changes on the way
+                row = int(np.floor(at))
+                share = max((at - row - 1) * count + 1, 0.0)
+                aim = (1 - share) * ctrl[j, p, min(max(row, 0), rows - 1)]
+                aim += share * ctrl[j, p, min(max(row + 1, 0), rows - 1)]
+                load = slope * q + weight
+                if law:
+                    read = np.round(q / step) * step if step > 0 else q
+                    torque = kp * (aim + offset - read)
+                    if least > 0:
+                        torque = np.copysign(max(abs(torque), least), torque) if abs(torque) > 0.5 * step * kp else 0.0
+                    torque = min(max(torque - brake * w, -limit), limit)
+                    most = dry + passing_friction(by_motor, by_load, torque, load)
+                    if rest > 0:
+                        most += resting_friction(np.exp, rest, speed, w)
+                else:
+                    torque, most = min(max(kp * (aim + offset - q) - brake * w, -limit), limit), dry
+                net = torque - load - pull - own * w
+                w += turn * (net + min(max(-inertia / h * w - net, -most), most))
+                q += h * w
+                if q < stops[j, 0]:
+                    q, w = stops[j, 0], max(w, 0.0)
+                elif q > stops[j, 1]:
+                    q, w = stops[j, 1], min(w, 0.0)
+            if touch[p, t + 1]:  # goes on from the recording
+                q, w = float(qpos[j, p, t + 1]), float(qvel[j, p, t + 1])
+            if (t + 1) % thin == 0:
+                out[item, (t + 1) // thin] = q - qpos[j, p, t + 1]
 
 
 class ServoLaw:

@@ -194,7 +194,8 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
 def _ship(folder: Path, to: str) -> None:
     """Files that need no gaponet: the law, the action term, the check."""
     here = Path(__file__).parent
-    law = [inspect.getsource(f) for f in (library, servo.present, servo.friction_limit, servo.servo_torque)]
+    told = (servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit, servo.servo_torque)
+    law = [inspect.getsource(f) for f in (library, *told)]
     limits = f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
     write_text(folder / "servo_law.py", "\n\n".join([LAW + limits, *law]))
     shipped = {"mujoco_servos.py": here / "mujoco_servos.py"}

@@ -16,16 +16,12 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar, bars
 from gaponet.training.config import TrainConfig
 from gaponet_lab.cli.show import show_result
-from gaponet_lab.study.ablation import Ablation
 from gaponet_lab.study.compare import Compare, identified
 from gaponet_lab.study.data import Data
 from gaponet_lab.study.found import Question, answer, train_all
 from gaponet_lab.study.options import MODELS, Options
-from gaponet_lab.study.payload import Payload
-from gaponet_lab.study.played.delivery import Delivery
-from gaponet_lab.study.played.session import Playing, Session, study_to_play
+from gaponet_lab.study.played.session import Session, study_to_play
 from gaponet_lab.study.played.tracking import Tracking
-from gaponet_lab.study.simulators import Simulators
 from gaponet_lab.study.study import Study, expected_s
 from gaponet_lab.study.unit import Unit
 from gaponet_lab.study.variant import parse_variant
@@ -37,7 +33,6 @@ if TYPE_CHECKING:
 
 FLAT = tyro.conf.arg(name="")
 Shared = Annotated[Options, FLAT]
-PLAYED = (Tracking, Delivery)
 DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
@@ -64,33 +59,30 @@ def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
 
 def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
     data, robot = open_dataset(dataset, options.robot)
-    if kind in PLAYED:
+    if kind is Tracking:
         _play(question, data, robot, out, options)
         return
     study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
-    if isinstance(question, Payload):
-        study = question.prepared(study)
-    if kind in (Compare, Simulators):
+    if kind is Compare:
         study = _prepared(question, study)
     _carry_out(question, study, options.json)
 
 
-def _prepared(question: Compare | Simulators, study: Study) -> Study:
+def _prepared(question: Compare, study: Study) -> Study:
     """The study with what is asked to be identified first; models that cannot be are refused before that."""
     if not question.identify:
         return study
     if study.robot.nominal is not None:
         raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
-    for word in question.models if isinstance(question, Compare) else ():
+    for word in question.models:
         parse_variant(word, study.config)
     with bar("identifying") as update:
         return identified(study, update)
 
 
-def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+def _play(question: Tracking, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
     """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
     data.require_robot(robot)
-    question.require(data)
     screen, runs, part = Out(options.json), question.runs, data
     if not runs:
         study = study_to_play(question, data, robot, out, options)
@@ -117,7 +109,7 @@ def _command(kind: type[Any]) -> Any:
 
     place = tyro.conf.Positional[str]
     ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
-    trained_on = " that the models were trained on" if kind in PLAYED else ""
+    trained_on = " that the models were trained on" if kind is Tracking else ""
     ask.__doc__ = "\n    ".join((
         f"{inspect.getdoc(kind)}\n\nArgs:",
         f"dataset: Dataset folder{trained_on}, or the address (s3://, gs://) of one that was pushed.",
@@ -132,5 +124,5 @@ def experiment(action: None) -> None:
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.
-ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Ablation, Payload, Unit, Data, Simulators, *PLAYED))]  # noqa: UP007
+ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Unit, Data, Tracking))]  # noqa: UP007
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 from gaponet.cli.options import Data, Flag, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.data.store import open_dataset
+from gaponet.errors import UsageError
 from gaponet.eval.tables import mrad
 from gaponet.progress import bar
 
 if TYPE_CHECKING:
+    from gaponet.data.sequence import SequenceMeta
     from gaponet_lab.view.film import Clip
     from gaponet_lab.view.scene import Scene
 
@@ -63,42 +65,24 @@ def view(
         azimuth: Camera, degrees; 180 looks at the robot's front.
         elevation: Camera, degrees; negative looks down.
     """
-    from gaponet.errors import UsageError
-    from gaponet_lab.view.gl import choose_gl, has_display
-
-    if render is None and not web and not has_display():
-        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
-    if render is not None:
-        choose_gl()
-    from gaponet_lab.view.film import Clip, require_kind
+    _require_screen(render, web)
+    from gaponet_lab.view.film import Clip
     from gaponet_lab.view.scene import Scene, View
     from gaponet_lab.view.side_by_side import pick, side_by_side
 
-    if render is not None:
-        require_kind(render)
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
-    fitted = model if spec.nominal is None else (*model, spec.folder)
-    entry = pick(data, fitted, motion, unit, payload_mass)
+    entry = pick(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
     with bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, update)
     shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
     clip = Clip.of(shown, start, duration, speed, fps)
-    meta = entry.meta
-    out.say(
-        f", {'VIRTUAL ' if meta.virtual else ''}unit {meta.unit_id}, {meta.payload_mass:g} kg; "
-        + ", ".join(f"{m.name} {mrad(m.mpjae)} mrad" for m in shown.motions if m.method != "recorded"),
-        meta.motion,
-    )
-    if shown.seen:
-        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
-    first, last = (round(t / shown.real.dt) for t in (clip.start, clip.stop))
-    rows = slice(first, last + 1)
+    errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
+    _introduce(out, entry.meta, {m.name: m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
+    rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
     scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
     if render is not None:
-        pictures = _film(scene, clip, render, width, magnify, course)
-        size = render.stat().st_size
-        out.say(f"{render}: {pictures} picture{'s' * (pictures > 1)}, {size / 1e6:.2f} MB")
+        _film(scene, clip, render, width, magnify, course, out)
     elif web:
         from gaponet_lab.view.web import serve
 
@@ -108,16 +92,37 @@ def view(
 
         watch(scene, clip, magnify)
     out.result({
-        "sequence": entry.id, "virtual": meta.virtual, "seen": shown.seen, "start": clip.start,
-        "duration": clip.duration, "mpjae": {m.method: m.mpjae for m in shown.motions if m.method != "recorded"},
-        "render": None if render is None else str(render),
+        "sequence": entry.id, "virtual": entry.meta.virtual, "seen": shown.seen, "start": clip.start,
+        "duration": clip.duration, "mpjae": errors, "render": None if render is None else str(render),
     })  # fmt: skip
 
 
-def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool) -> int:
+def _require_screen(render: Path | None, web: bool) -> None:
+    """Refuse, before anything is simulated, what could not be seen."""
+    from gaponet_lab.view.gl import choose_gl, has_display
+
+    if render is not None:
+        choose_gl()
+        from gaponet_lab.view.film import require_kind
+
+        require_kind(render)
+    elif not web and not has_display():
+        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
+
+
+def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: bool | None) -> None:
+    said = ", ".join(f"{name} {mrad(error)} mrad" for name, error in errors.items())
+    whose = "VIRTUAL " if meta.virtual else ""
+    out.say(f", {whose}unit {meta.unit_id}, {meta.payload_mass:g} kg; {said}", meta.motion)
+    if seen:
+        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
+
+
+def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool, out: Out) -> None:
     from gaponet_lab.view.film import write
     from gaponet_lab.view.picture import Camera
 
     span = (clip.start, clip.stop)
     with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:
-        return write(camera, clip, path, lambda done, total: update(done, total, "pictures"))
+        pictures = write(camera, clip, path, lambda done, total: update(done, total, "pictures"))
+    out.say(f"{path}: {pictures} picture{'s' * (pictures > 1)}, {path.stat().st_size / 1e6:.2f} MB")

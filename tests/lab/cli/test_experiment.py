@@ -51,7 +51,5 @@ def test_what_cannot_be_asked_of_a_dataset_is_one_line(place, capsys):
     where = [str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm")]
     assert main(["experiment", "unit", *where]) == 2
     assert "leaving one out needs recordings of two or more" in capsys.readouterr().err
-    assert main(["experiment", "payload", *where]) == 2
-    assert "needs 3" in capsys.readouterr().err
-    assert main(["experiment", "ablation", *where, "--seeds", "0"]) == 2
+    assert main(["experiment", "compare", *where, "--seeds", "0"]) == 2
     assert "--seeds is at least 1" in capsys.readouterr().err

@@ -10,7 +10,6 @@ from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
-from gaponet_lab.study.payload import Payload
 
 
 @pytest.fixture
@@ -35,13 +34,3 @@ def test_it_has_another_hash_and_survives_its_folder(arm, tmp_path):
     assert not again.carries_payload
     assert model_hash(again) == model_hash(bare)
     assert build_model(again, 0.2).body_mass.sum() == build_model(arm).body_mass.sum()
-
-
-def test_the_payload_study_changes_the_simulator_alone(make_study):
-    study = make_study(seeds=1)
-    told, none = (Payload(simulator_payload=p).prepared(study) for p in ("told", "none"))
-    assert told is study
-    assert replace(none, robot=study.robot) == study
-    assert [c.setup(study.data)["config"] for c in Payload(simulator_payload="none").cells(none)] == [
-        c.setup(study.data)["config"] for c in Payload().cells(study)
-    ][:4]
