@@ -25,7 +25,7 @@ from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.data.store import Dataset
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import gravity_of
-from gaponet.sim.setup.new import Wanted, new_robot
+from gaponet_interop.setup.new import Wanted, new_robot
 
 MOTIONS, SECONDS = 8, 18.0
 Logs = list[Recording]

@@ -21,7 +21,7 @@ RANKS = {
         {"data"}, {"metrics"}, {"sim"}, {"model"}, {"training", "deploy"}, {"eval"}, {"api"}, {"cli"},
     ],
     "gaponet_robots": [{"motion"}, {"control", "drivers", "targets", "virtual"}, {"cli"}],
-    "gaponet_interop": [{"formats", "writers", "engine"}, {"share"}, {"cli"}],
+    "gaponet_interop": [{"formats", "writers", "engine", "setup"}, {"share"}, {"cli"}],
     "gaponet_lab": [{"plot"}, {"view", "report", "bench", "real"}, {"study"}, {"cli"}],
 }  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")

@@ -1,10 +1,11 @@
-"""The part at the edge: other people's log and dataset formats, engines, and places to share through.
+"""The part at the edge: other people's log and dataset formats, vendors' models, engines, and places to share through.
 
 What it offers to gaponet (gaponet.parts); nothing is imported here.
 """
 
 COMMANDS = {
     "export": "gaponet_interop.cli.export:export",
+    "robot": "gaponet_interop.cli.robot:robot",
     "push": "gaponet_interop.cli.share:push",
     "pull": "gaponet_interop.cli.share:pull",
 }

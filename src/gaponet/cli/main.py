@@ -31,7 +31,7 @@ TASKS = {
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 CORE = {
-    **{name: f"gaponet.cli.{name}:{name}" for name in ("data", "robot", "gap", "identify", "calibrate", "train")},
+    **{name: f"gaponet.cli.{name}:{name}" for name in ("data", "gap", "identify", "calibrate", "train")},
     **{name: f"gaponet.cli.logs:{name}" for name in ("formats", "doctor")},
     "import": "gaponet.cli.logs:import_logs",
     "eval": "gaponet.cli.train:evaluate",

@@ -19,8 +19,8 @@ from gaponet.files import write_text, writing
 from gaponet.mjcf import compiled
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import freeze
-from gaponet.sim.setup.drives import ON_JOINT, Drive, drives
-from gaponet.sim.setup.vendor import read_vendor
+from gaponet_interop.setup.drives import ON_JOINT, Drive, drives
+from gaponet_interop.setup.vendor import read_vendor
 
 HANDS = ("attachment", "tcp", "tool", "flange", "palm", "grip", "hand", "wrist")  # beginnings of words
 IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)

@@ -6,13 +6,13 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from setup_vendors import MJCF, URDF, write_mjcf, write_urdf
+from vendors import MJCF, URDF, write_mjcf, write_urdf
 
 from gaponet.errors import RobotError, UsageError
 from gaponet.mjcf import read_mjcf
 from gaponet.sim.model import build_model
-from gaponet.sim.setup.check import check_robot
-from gaponet.sim.setup.new import Made, Wanted, new_robot
+from gaponet_interop.setup.check import check_robot
+from gaponet_interop.setup.new import Made, Wanted, new_robot
 
 GAINS = {"kp": ("20",), "kd": ("1",)}
 ARM = ("shoulder", "elbow", "roll")

@@ -8,7 +8,7 @@ import pytest
 from arm import TOML, XML, write_arm
 
 from gaponet.data.checks.finding import Finding
-from gaponet.sim.setup.check import check_robot
+from gaponet_interop.setup.check import check_robot
 
 LIGHT = XML.replace('damping="0.5" armature="0.02" frictionloss="0.05"', "")
 STIFF = TOML.replace("kp = 20.0", "kp = 4000.0\nkd = 1.0").replace("effort_limit = 5.0", "effort_limit = 300.0")

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from arm import TOML, XML, write_arm
-from setup_vendors import write_mjcf
+from vendors import write_mjcf
 
 from gaponet.cli.main import main
 

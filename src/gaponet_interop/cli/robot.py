@@ -18,7 +18,7 @@ from gaponet.parts import named, offered, take
 from gaponet.robot import RobotSpec, as_option, available, load_robot
 
 if TYPE_CHECKING:
-    from gaponet.sim.setup.new import Made
+    from gaponet_interop.setup.new import Made
 
 POSTURES = 300  # of the logs
 
@@ -116,7 +116,7 @@ def new(
     prepare, still = (offered("PROVIDES").get(what) for what in ("OpenGL", "picture of models"))
     if prepare:
         named(prepare)()
-    from gaponet.sim.setup.new import Wanted, new_robot
+    from gaponet_interop.setup.new import Wanted, new_robot
 
     screen = Out(json)
     made = new_robot(model, out, Wanted(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
@@ -150,7 +150,7 @@ def _picture(made: Made, label: str, still: Callable[..., bytes]) -> Path:
 def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]) -> dict[str, Any]:
     """Step the robot; a broken one raises RobotError, a doubtful one gets warnings."""
     from gaponet.sim.model import model_hash
-    from gaponet.sim.setup import check
+    from gaponet_interop.setup import check
 
     postures = None
     if dataset is not None:
