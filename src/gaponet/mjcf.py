@@ -101,7 +101,7 @@ def require_moderate(model: mujoco.MjModel, path: Path) -> None:
 
 
 @dataclass
-class Look:
+class _Look:
     """What an MJCF is made of: files (path, size, time), how many elements in all, and whether all are PLAIN."""
 
     files: set[tuple[str, int, int]] = field(default_factory=set)
@@ -109,15 +109,15 @@ class Look:
     plain: bool = True
 
 
-def require_size(path: Path) -> Look:
+def require_size(path: Path) -> _Look:
     """Refuse a file that is no XML, or makes or names more than a robot has."""
-    look = Look()
+    look = _Look()
     _count(path, path.parent, {path.resolve()}, look, 1.0)
     look.plain = look.plain and look.count <= PLAIN_ELEMENTS
     return look
 
 
-def _count(path: Path, folder: Path, seen: set[Path], look: Look, times: float) -> None:
+def _count(path: Path, folder: Path, seen: set[Path], look: _Look, times: float) -> None:
     """Count what a file makes, its <include>s too; refuses too much."""
     if not path.is_file() or path.stat().st_size > BYTES:
         raise RobotError(f"{path}: is missing, not a file, or has more than {BYTES >> 20} MiB")
@@ -148,7 +148,7 @@ def _count(path: Path, folder: Path, seen: set[Path], look: Look, times: float) 
     _require_files(root, path, folder, look)
 
 
-def _require_files(root: ElementTree.Element, path: Path, folder: Path, look: Look) -> None:
+def _require_files(root: ElementTree.Element, path: Path, folder: Path, look: _Look) -> None:
     places = {folder} | {
         folder / tag.get(key, "") for tag in root.iter("compiler") for key in ("meshdir", "texturedir", "assetdir")
     }

@@ -15,7 +15,7 @@ Metres = Annotated[float, Interval(ge=-100, le=100)]
 
 
 @dataclass(frozen=True)
-class Joint:
+class _Joint:
     name: Name
     kp: Gain  # N·m/rad
     effort_limit: Gain  # N·m
@@ -56,7 +56,7 @@ class PayloadMount:
 
 
 @dataclass(frozen=True)
-class Servo:
+class _Servo:
     """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
 
     kp: Gain | None = None
@@ -101,14 +101,14 @@ class RobotTable:
     name: Name
     dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
     timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
-    joint: Annotated[tuple[Joint, ...], Len(1, 500)]
+    joint: Annotated[tuple[_Joint, ...], Len(1, 500)]
     servo: Annotated[tuple[ServoType, ...], Len(0, 50)] = ()
     payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
     tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
     table: Table | None = None
     contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
     carries_payload: bool = True  # false: the robot's payload is not in the simulator
-    identified: dict[str, Servo] = field(default_factory=dict)
+    identified: dict[str, _Servo] = field(default_factory=dict)
     identified_table: Table | None = None
     description: str = ""
     license: str = ""

@@ -111,7 +111,7 @@ def text(cell: Any, digits: int = 2) -> str:
 
 def compared(name: str, value: Spread, base: Spread, to: str, unit: str = "") -> str:
     """Whether a value differs from another by more than seeds do, in words."""
-    change, margin = value.mean - base.mean, noise(value, base)
+    change, margin = value.mean - base.mean, _noise(value, base)
     known = "" if margin == margin else " (one seed)"
     if abs(change) <= margin:
         return f"{name} {value.mean:.2f}{unit}, no different from {to} within the spread of seeds"
@@ -128,7 +128,7 @@ def compared_by_seed(name: str, ratio: Spread, to: str) -> str:
     return f"{name} {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} than {to} ({known})"
 
 
-def noise(a: Spread, b: Spread) -> float:
+def _noise(a: Spread, b: Spread) -> float:
     """Two standard errors of a difference of means; where one has a single value, with the other's std; else NaN."""
     std = [s for s in (a.std, b.std) if s == s]
     if not std:

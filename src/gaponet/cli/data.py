@@ -15,7 +15,7 @@ from gaponet.parts import take
 from gaponet.progress import bar
 
 
-def card(
+def _card(
     dataset: Data,
     licence: str | None = None,
     source: str | None = None,
@@ -36,7 +36,7 @@ def card(
         data.state(**stated)
     with bar("reading") as update:
         made = make_card(data, update)
-    show_card(out, made)
+    _show_card(out, made)
     if data.read_only:
         out.say("nothing may be written into that folder, so the card is only shown")
     else:
@@ -45,7 +45,7 @@ def card(
     out.result(made)
 
 
-def split(
+def _split(
     dataset: Data,
     by: Literal["motion", "unit", "payload", "repetition", "time"],
     holdout: tuple[str, ...] = (),
@@ -66,7 +66,7 @@ def split(
     with bar("comparing") as update:
         require_distinct_samples(data, parts, update)
     path = write_split(data, parts, by, holdout)
-    rows: dict[str, dict[str, Any]] = {part: count(entries) | members(entries) for part, entries in parts.items()}
+    rows: dict[str, dict[str, Any]] = {part: count(entries) | _members(entries) for part, entries in parts.items()}
     columns = ["part", "sequences", "hours", "frames", "motions", "units", "payloads, kg"]
     virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
     out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
@@ -78,7 +78,7 @@ def split(
     out.result({"split": str(path), "by": by, "parts": rows})
 
 
-def figures(
+def _figures(
     dataset: Source,
     out: Path,
     robot: Robot = None,
@@ -104,7 +104,7 @@ def figures(
     screen.result({"figures": [str(path) for path in written], "left_out": left_out})
 
 
-def export(
+def _export(
     dataset: Source,
     out: Path,
     to: str = "lerobot",
@@ -134,7 +134,7 @@ def export(
     screen.result({"sets": [{"path": str(s.path), "episodes": s.episodes, "frames": s.frames} for s in sets]})
 
 
-def remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
+def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json = False) -> None:
     """Take sequences out of a dataset, with their twins; the logs that they came from can be imported again.
 
     Args:
@@ -146,7 +146,7 @@ def remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Json
     out.result({"removed": [e.id for e in gone], "sequences": len(data)})
 
 
-def labels(
+def _labels(
     logs: Folder,
     robot: str,
     out: Path,
@@ -192,12 +192,12 @@ def labels(
 
 # Each is run while the command line is parsed; what is left to call is nothing.
 Action = (
-    Annotated[None, tyro.conf.subcommand("card", constructor=card)]
-    | Annotated[None, tyro.conf.subcommand("split", constructor=split)]
-    | Annotated[None, tyro.conf.subcommand("figures", constructor=figures)]
-    | Annotated[None, tyro.conf.subcommand("export", constructor=export)]
-    | Annotated[None, tyro.conf.subcommand("remove", constructor=remove)]
-    | Annotated[None, tyro.conf.subcommand("labels", constructor=labels)]
+    Annotated[None, tyro.conf.subcommand("card", constructor=_card)]
+    | Annotated[None, tyro.conf.subcommand("split", constructor=_split)]
+    | Annotated[None, tyro.conf.subcommand("figures", constructor=_figures)]
+    | Annotated[None, tyro.conf.subcommand("export", constructor=_export)]
+    | Annotated[None, tyro.conf.subcommand("remove", constructor=_remove)]
+    | Annotated[None, tyro.conf.subcommand("labels", constructor=_labels)]
 )
 
 
@@ -205,7 +205,7 @@ def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Acti
     """What a dataset holds: its card, splits, pictures and export; what of it is removed; labels that logs lack."""
 
 
-def show_card(out: Out, made: dict[str, Any]) -> None:
+def _show_card(out: Out, made: dict[str, Any]) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
     from gaponet.data.card import NOT_STATED
     from gaponet.data.card_text import TITLES, headline, number, shares
@@ -226,7 +226,7 @@ def show_card(out: Out, made: dict[str, Any]) -> None:
         out.say(f"{name}: {made[name]}{ask}")
 
 
-def members(entries: list[Any]) -> dict[str, list[str]]:
+def _members(entries: list[Any]) -> dict[str, list[str]]:
     """Which units and payloads."""
     return {
         "units": sorted({e.meta.unit_id for e in entries}),

@@ -87,11 +87,11 @@ def import_logs(
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
     report = api.import_logs(
         src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
+        joint_map=_joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
         kp=kp, kd=kd,
         skip_bad=skip_bad, allow_pickle=allow_pickle, strict=strict,
     )  # fmt: skip
-    show_import(Out(json), report, spec)
+    _show_import(Out(json), report, spec)
 
 
 def doctor(
@@ -112,7 +112,7 @@ def doctor(
     data, spec = open_dataset(dataset, robot)
     diagnosis = api.doctor(data, spec)
     out.say(f", {inventory(data)}", spec.name)
-    show_diagnosis(out, diagnosis)
+    _show_diagnosis(out, diagnosis)
     mended = proposal(diagnosis.findings) if fix else ""
     for line in mended.splitlines():
         out.say(line)
@@ -141,7 +141,7 @@ def formats(json: Json = False) -> None:
     out.result({fmt: {"about": what, "extra": extra} for fmt, (what, extra) in rows.items()})
 
 
-def cuts(entries: list[Entry]) -> dict[str, list[str]]:
+def _cuts(entries: list[Entry]) -> dict[str, list[str]]:
     """Why recordings were cut → which."""
     found: dict[str, list[str]] = {}
     for entry in entries:
@@ -150,7 +150,7 @@ def cuts(entries: list[Entry]) -> dict[str, list[str]]:
     return found
 
 
-def nonsense(entries: list[Entry]) -> list[str]:
+def _nonsense(entries: list[Entry]) -> list[str]:
     """What was nonsense in some rows, a line for each channel (data.describe.limits)."""
     told: dict[str, list[tuple[Entry, dict[str, Any]]]] = {}
     for entry in entries:
@@ -164,7 +164,7 @@ def nonsense(entries: list[Entry]) -> list[str]:
     ]
 
 
-def unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
+def _unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
     """A line about operated joints that the logs do not hold."""
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     if not lacking:
@@ -172,7 +172,7 @@ def unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
     return [f"{some(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says where"]
 
 
-def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
+def _joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     """("a=b",) → {"a": "b"}."""
     for pair in pairs:
         if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):
@@ -180,7 +180,7 @@ def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     return {a.strip(): b.strip() for a, b in (pair.split("=") for pair in pairs)} or None
 
 
-def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
+def _show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     """What came in, the lag and the offsets of each joint, and what to do next."""
     entries, data = report.entries or report.present, report.dataset
     minutes = sum(e.rows * e.dt for e in entries) / 60
@@ -194,17 +194,17 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         f"{len(entries)} sequences, {minutes:.1f} min at {', '.join(f'{r:g}' for r in rates)} Hz, {virtual}robot "
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
-    for cut, motions in cuts(entries).items():
+    for cut, motions in _cuts(entries).items():
         out.say(f"{', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
-    for line in (*nonsense(entries), *unrecorded(entries, robot)):
+    for line in (*_nonsense(entries), *_unrecorded(entries, robot)):
         out.say(line, "note", "cyan")
     for line in report.cut[:MAX_ROWS]:
         out.say(line, "cut", "yellow")
     if len(report.cut) > MAX_ROWS:
         out.say(f"… and {len(report.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
-    lags = {name: fast_lags(entries, name) for name in robot.operated}
+    lags = {name: _fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}
-    show_offsets(out, lags, offsets)
+    _show_offsets(out, lags, offsets)
     if offsets:
         out.say(f"Offsets are recorded in {data.path!s}/offsets.json; nothing was applied to the data.")
     out.say(f"Next: gaponet doctor {data.path!s}")
@@ -216,18 +216,18 @@ def show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
     })  # fmt: skip
 
 
-def show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
+def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, JointOffset]) -> None:
     """Lag and static errors by joint, and why a zero offset is not identified."""
     rows = []
     for name, found in lags.items():
         median = f"{np.median(found) * 1e3:.0f}" if found else "–"
         joint = offsets.get(name)
         at_rest = (
-            [signed_mrad(joint.static_error, joint.stiction_band), signed_mrad(joint.tracking_offset)]
+            [_signed_mrad(joint.static_error, joint.stiction_band), _signed_mrad(joint.tracking_offset)]
             if joint
             else ["–", "–"]
         )
-        zero = signed_mrad(joint.zero_offset, joint.zero_std) if joint else "–"
+        zero = _signed_mrad(joint.zero_offset, joint.zero_std) if joint else "–"
         rows.append([name, median, *at_rest, zero if joint and joint.identifiable else f"({zero})"])
     out.table("Lag in fast motions, ms; errors at rest, mrad", ["joint", "lag", "at rest", "offset", "zero"], rows)
     if not offsets:
@@ -242,28 +242,28 @@ def show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Join
         out.say(f"zero not identified for {joints}: {reason}")
 
 
-def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
+def _show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
     """Tables of sequences and joints, the findings, the verdict."""
     shown = diagnosis.sequences[:MAX_ROWS]
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]
     out.table("Sequences; jitter, longest gap and fast lag in ms", columns, [
         [r["motion"], f"{r['payload_mass']:g}", f"{r['seconds']:.1f}", f"{r['rate_hz']:.2f}",
-         f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}", span(list(r["fast_lag_s"].values()))]
+         f"{r['jitter_ms']:.2f}", f"{r['longest_gap_ms']:.1f}", _span(list(r["fast_lag_s"].values()))]
         for r in shown
     ])  # fmt: skip
     if len(shown) < len(diagnosis.sequences):
         out.say(f"… and {len(diagnosis.sequences) - len(shown)} more; --json lists all")
     columns = ["joint", "commanded, rad", "lag", "at rest", "rests"]
     out.table("Joints; fast lag in ms, error at rest ± stiction in mrad", columns, [
-        [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), lag(r["lag_s"]),
-         signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
+        [r["joint"], "{:.2f}…{:.2f}".format(*r["commanded_rad"]), _lag(r["lag_s"]),
+         _signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
         for r in diagnosis.joints
     ])  # fmt: skip
     show_findings(out, diagnosis.findings)
     out.say("", diagnosis.verdict)
 
 
-def fast_lags(entries: list[Entry], joint: str) -> list[float]:
+def _fast_lags(entries: list[Entry], joint: str) -> list[float]:
     """Lags of a joint in the sequences that command it fast, s."""
 
     def of(entry: Entry, name: str) -> float | None:
@@ -273,18 +273,18 @@ def fast_lags(entries: list[Entry], joint: str) -> list[float]:
     return [lag for lag in found if lag is not None]
 
 
-def lag(values: dict[str, float] | None) -> str:
+def _lag(values: dict[str, float] | None) -> str:
     """Median and range, "104 (81–120)"."""
-    return f"{values['median'] * 1e3:.0f} ({span([values['min'], values['max']])})" if values else "–"
+    return f"{values['median'] * 1e3:.0f} ({_span([values['min'], values['max']])})" if values else "–"
 
 
-def span(seconds: list[float]) -> str:
+def _span(seconds: list[float]) -> str:
     """[0.08, 0.12] → "80–120" ms."""
     low, high = (f"{f(seconds) * 1e3:.0f}" for f in (min, max)) if seconds else ("–", "–")
     return low if low == high else f"{low}–{high}"
 
 
-def signed_mrad(value: float | None, band: float | None = None) -> str:
+def _signed_mrad(value: float | None, band: float | None = None) -> str:
     """0.037, 0.031 → "+37 ± 31"."""
     if value is None:
         return "–"

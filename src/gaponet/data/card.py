@@ -39,9 +39,9 @@ def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     stride = max(1, sum(e.rows for e in dataset.entries) // QUANTILE_ROWS)
-    ranges = {name: Range(stride) for name in ARRAYS}
+    ranges = {name: _Range(stride) for name in ARRAYS}
     repeated, done = [], 0
-    for group in repetition_groups(dataset.entries):
+    for group in _repetition_groups(dataset.entries):
         repetitions = Repetitions()
         for entry in group:
             sequence = dataset.read(entry)
@@ -54,7 +54,7 @@ def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
             repeated.append(repetitions.result())
     return _identity(dataset) | {
         "total": count(dataset.entries),
-        "shares": {name: shares(dataset.entries, key) for name, key in SHARES.items()},
+        "shares": {name: _shares(dataset.entries, key) for name, key in SHARES.items()},
         "signals": {
             name: {"unit": UNITS[name], "sequences": r.sequences, "joints": r.by_joint(dataset.joint_names)}
             for name, r in ranges.items()
@@ -81,7 +81,7 @@ def count(entries: list[Entry]) -> dict[str, float]:
     }
 
 
-def shares(entries: list[Entry], key: Callable[[Entry], str]) -> dict[str, dict[str, float]]:
+def _shares(entries: list[Entry], key: Callable[[Entry], str]) -> dict[str, dict[str, float]]:
     """Counts by a property, numbers in the order of their size, names in the alphabet's."""
     groups: dict[str, list[Entry]] = defaultdict(list)
     for entry in entries:
@@ -89,7 +89,7 @@ def shares(entries: list[Entry], key: Callable[[Entry], str]) -> dict[str, dict[
     return {name: count(groups[name]) for name in sorted(groups, key=_number_or_name)}
 
 
-def repetition_groups(entries: list[Entry]) -> Iterable[list[Entry]]:
+def _repetition_groups(entries: list[Entry]) -> Iterable[list[Entry]]:
     """Entries of the same motion, unit, payload and period together."""
     groups: dict[tuple[object, ...], list[Entry]] = defaultdict(list)
     for e in entries:
@@ -97,7 +97,7 @@ def repetition_groups(entries: list[Entry]) -> Iterable[list[Entry]]:
     return groups.values()
 
 
-class Range:
+class _Range:
     """Least, greatest, mean, spread and outer percentiles of one channel, without keeping it; every `stride`-th row
     is kept for the percentiles."""
 

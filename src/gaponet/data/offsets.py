@@ -80,7 +80,7 @@ class UnitOffsets:
     stiffness: float | None
 
 
-class OffsetsFile(TypedDict):
+class _OffsetsFile(TypedDict):
     """offsets.json: unit → what UnitOffsets holds, and the hash of the simulator whose gravity was used."""
 
     applied: bool
@@ -151,7 +151,7 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     if not file.is_file():
         return {"applied": False, "unit": "rad", "units": {}}
     hint = "delete it, the next import writes it again"
-    return {**read_json(OffsetsFile, file, DatasetError, hint, more=True)}
+    return {**read_json(_OffsetsFile, file, DatasetError, hint, more=True)}
 
 
 def _nominal_sag(qpos: Array, setting: Load, robot: RobotSpec, gravity: Gravity) -> Array:

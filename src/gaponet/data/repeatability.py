@@ -18,7 +18,7 @@ REPEATED = ("qpos", "qvel", "tau", "temperature")
 
 
 @dataclass(frozen=True)
-class Repeated:
+class _Repeated:
     """What came of the repetitions of a motion; nothing as long as it."""
 
     count: int
@@ -62,10 +62,10 @@ class Repetitions:
             self._mean[name] = mean + step / self.count
             self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
 
-    def result(self) -> Repeated:
+    def result(self) -> _Repeated:
         """Of two repetitions or more."""
         variance = {c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()}
-        return Repeated(self.count, self.others, np.ptp(self._ctrl, axis=0) > MOVED, variance)
+        return _Repeated(self.count, self.others, np.ptp(self._ctrl, axis=0) > MOVED, variance)
 
 
 def periods(sequence: Sequence) -> list[Sequence]:
@@ -82,7 +82,7 @@ def periods(sequence: Sequence) -> list[Sequence]:
     return [sequence.rows(slice(a, a + period)) for a in starts]
 
 
-def summary(groups: list[Repeated], joint_names: tuple[str, ...]) -> dict[str, Any]:
+def summary(groups: list[_Repeated], joint_names: tuple[str, ...]) -> dict[str, Any]:
     """Root-mean-square standard deviation over repetitions, by channel and joint.
 
     Args:

@@ -175,7 +175,7 @@ def response(ctrl: Array, qpos: Array, dt: float) -> Response:
 
 
 @dataclass(frozen=True)
-class Following:
+class _Following:
     """What some recordings say together.
 
     Attributes:
@@ -190,7 +190,7 @@ class Following:
     whole: Array
 
 
-def following(found: list[Response], told: list[bool] | None = None) -> Following:
+def following(found: list[Response], told: list[bool] | None = None) -> _Following:
     """Of recordings at one step; those not `told` are shifted against the others, which alone say how joints follow."""
     from scipy.linalg import toeplitz
 
@@ -224,7 +224,7 @@ def following(found: list[Response], told: list[bool] | None = None) -> Followin
         square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
         square[:, 1:] *= 2
         fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
-    return Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
+    return _Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
 
 
 def sharp(found: list[Response]) -> Array:

@@ -53,7 +53,7 @@ class RunSplit(TypedDict):
     test: dict[str, str]
 
 
-class SplitFile(TypedDict):
+class _SplitFile(TypedDict):
     """A split file, and whatever else stands there."""
 
     parts: RunSplit
@@ -322,7 +322,7 @@ def read_split(path: str | Path, dataset: Dataset) -> Parts:
     Raises:
         DatasetError: Not a split file, a sequence of it is not in the dataset, or parts share one.
     """
-    hashes = read_json(SplitFile, Path(path), DatasetError, "make one with gaponet data split", more=True)["parts"]
+    hashes = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", more=True)["parts"]
     parts: Parts = {part: [] for part in PARTS}
     taken: dict[str, str] = {}
     for part in PARTS:

@@ -52,7 +52,7 @@ KIND, JOURNAL = "dataset", "sequences.jsonl"
 LARGEST_TABLE = 1 << 30  # bytes of what is read of one sequence at once
 
 
-class Header(TypedDict):
+class _Header(TypedDict):
     """dataset.json, and whatever else stands there."""
 
     format: int
@@ -98,7 +98,7 @@ class Dataset:
             raise DatasetError(
                 f"{self.path}: not a dataset (no dataset.json); make one with gaponet import, collect or pull"
             )
-        self.header: dict[str, Any] = {**read_format(Header, header, FORMAT, DatasetError, MEND)}
+        self.header: dict[str, Any] = {**read_format(_Header, header, FORMAT, DatasetError, MEND)}
         self.robot_name: str = self.header["robot"]
         self.joint_names: tuple[str, ...] = self.header["joint_names"]
         self._load()

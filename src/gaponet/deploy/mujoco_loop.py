@@ -115,19 +115,19 @@ class MujocoAligner:
         joints = tuple(prefix + name for name in reference.joint_names)
         inverse: ClosedForm | Probed
         if how == "closed":
-            inverse = of_scene(scene, joints, told.dt)
+            inverse = _of_scene(scene, joints, told.dt)
             as_is = periods_of(model, told.dt) == 1 if isinstance(model, GapModel) else not robot.has_law
             if as_is and alike(inverse, ClosedForm.of(reference), reference.range):
                 return
             self._stand = inverse.stand
         else:
-            copies = SceneCopies(scene, joints, told.dt)
+            copies = _SceneCopies(scene, joints, told.dt)
             inverse = Probed(copies, told.dt)
             self._stand = copies.stand
         self.transfer = Transfer(model, inverse, [told], locked, 1, extrapolate)
 
 
-class SceneCopies:
+class _SceneCopies:
     """Where targets would lead the robot of a scene, asked of copies of its MjData in which nothing touches."""
 
     def __init__(self, scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> None:
@@ -155,7 +155,7 @@ class SceneCopies:
         return qpos, qvel
 
 
-def of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> ClosedForm:
+def _of_scene(scene: mujoco.MjModel, joints: tuple[str, ...], dt: float) -> ClosedForm:
     """The inverse of a robot in a scene."""
     model, h = _untouched(scene), scene.opt.timestep
     return ClosedForm(Batch(model, nsim=1, nthread=1), model, joints, np.array([round(dt / h)]), np.array([h]))

@@ -70,7 +70,7 @@ class Transfer:
         self.inverse, self.num_envs = inverse, len(conditions)
         self.sim = sim = BatchSim(robot, conditions, nthread, locked)
         if not extrapolate:
-            require_measured(inverse, ClosedForm.of(sim), sim.joint_names)
+            _require_measured(inverse, ClosedForm.of(sim), sim.joint_names)
         self.joint_names = sim.joint_names
         self.op = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.every = 1 if model is None else max(periods_of(model, c.dt) for c in dict.fromkeys(conditions))
@@ -187,7 +187,7 @@ def of_simulator(
     return Probed(answer, conditions[0].dt, ahead)
 
 
-def require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
+def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
     """Refuse a target further from the reference than those that docs/results/simulators.md has."""
     periods = (inverse.ahead - reference.ahead) * reference.dt
     later = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay

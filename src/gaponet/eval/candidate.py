@@ -24,7 +24,7 @@ from gaponet.structure import read_json
 DATA = "data of the robot that the run was trained for"
 
 
-class Origin(TypedDict):
+class _Origin(TypedDict):
     """What a robot was identified from: dataset (address, or path from the folder), recordings and motions by part, and
     what that left on validation motions, rad."""
 
@@ -164,7 +164,7 @@ def split_of_run(run: Path) -> dict[str, dict[str, str]]:
     return dict(read_json(RunSplit, run / "split.json", ModelError, hint))  # type: ignore[arg-type]
 
 
-def read_origin(folder: Path) -> Origin | None:
+def read_origin(folder: Path) -> _Origin | None:
     """What a robot folder was identified from; None where nobody noted it.
 
     Raises:
@@ -174,5 +174,5 @@ def read_origin(folder: Path) -> Origin | None:
     if not file.is_file():
         return None
     return read_json(
-        Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", more=True
+        _Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", more=True
     )

@@ -19,21 +19,21 @@ Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in 
 GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
 
 
-class Error(TypedDict):
+class _Error(TypedDict):
     """The error of a payload, a horizon or a motion, rad."""
 
     mpjae: Number
 
 
-class JointError(Error):
+class _JointError(_Error):
     """The errors of a joint, rad."""
 
     static: Number
     dynamic: Number
 
 
-Joints = Annotated[dict[str, JointError], Len(1)]
-Groups = Annotated[dict[str, Error], Len(1)]
+Joints = Annotated[dict[str, _JointError], Len(1)]
+Groups = Annotated[dict[str, _Error], Len(1)]
 Scores = TypedDict(  # one method's metrics, and those of its parts
     "Scores",
     {
@@ -44,7 +44,7 @@ Scores = TypedDict(  # one method's metrics, and those of its parts
 )  # fmt: skip
 
 
-class Shown(TypedDict):
+class _Shown(TypedDict):
     """A sequence whose trajectories are kept."""
 
     motion: str
@@ -53,20 +53,20 @@ class Shown(TypedDict):
     dt: Annotated[float, Interval(ge=1e-4, le=1)]
 
 
-class Artifact(TypedDict):
+class _Artifact(TypedDict):
     """A model that was evaluated."""
 
     weights: str
     seed: Json
 
 
-class Delta(TypedDict):
+class _Delta(TypedDict):
     """Size of a model's corrections, rad."""
 
     max: Number
 
 
-class Metrics(TypedDict):
+class _Metrics(TypedDict):
     methods: dict[Method, Scores]
     ratio_to_nominal: dict[Method, Number]
     dataset: str
@@ -78,15 +78,15 @@ class Metrics(TypedDict):
     simulator_hash: str
     simulators: NotRequired[dict[Method, str]]
     """In which simulator each method ran."""
-    delta: dict[Method, Delta]
-    artifacts: dict[Method, Artifact]
-    shown: NotRequired[Annotated[list[Shown], Len(0, 100)]]
+    delta: dict[Method, _Delta]
+    artifacts: dict[Method, _Artifact]
+    shown: NotRequired[Annotated[list[_Shown], Len(0, 100)]]
     moves: NotRequired[dict[str, Count]]
     date: NotRequired[str]
     command: NotRequired[str]
 
 
-class PPO(TypedDict):
+class _PPO(TypedDict):
     """What a report says of PPO."""
 
     num_envs: int
@@ -94,15 +94,15 @@ class PPO(TypedDict):
     std: float
 
 
-class Model(TypedDict):
+class _Model(TypedDict):
     """What a list of runs says of the model."""
 
     kind: Method
 
 
-class Config(TypedDict):
-    model: Model
-    ppo: PPO
+class _Config(TypedDict):
+    model: _Model
+    ppo: _PPO
     seed: int
     robot: str
     dataset: str
@@ -110,7 +110,7 @@ class Config(TypedDict):
     command: NotRequired[str]
 
 
-class Validation(TypedDict):
+class _Validation(TypedDict):
     """One line of progress.jsonl."""
 
     stage: str
@@ -126,13 +126,13 @@ def read_config(run: Path) -> dict[str, Any]:
     Raises:
         ModelError: Missing or damaged, as of all functions here; with file and field.
     """
-    return dict(read_json(Config, run / "config.json", ModelError, MEND, more=True))
+    return dict(read_json(_Config, run / "config.json", ModelError, MEND, more=True))
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
     """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
-    metrics: dict[str, Any] = {**read_json(Metrics, file, ModelError, MEND, more=True)}
+    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, more=True)}
     methods = metrics["methods"]
     if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
         raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {MEND}")
@@ -170,27 +170,27 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
     return [
-        {**parse_json(Validation, line, f"{file}:{number}", ModelError, MEND, more=True)}
+        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, MEND, more=True)}
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]
 
 
-class Floor(TypedDict):
+class _Floor(TypedDict):
     """The error that encoder and repeatability hide together, rad."""
 
     both: Number
 
 
-class Panel(TypedDict):
+class _Panel(TypedDict):
     """What is left of the error after each step, and what no simulator can remove; rad."""
 
     left: dict[Method, Number]
-    floor: Floor
+    floor: _Floor
 
 
-class Gap(Panel):
-    by_joint: dict[str, Panel]
+class _Gap(_Panel):
+    by_joint: dict[str, _Panel]
     virtual: bool
     unseen: bool
     sequences: Count
@@ -202,7 +202,7 @@ def read_gap(run: Path) -> dict[str, Any] | None:
     file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
     if not file.is_file():
         return None
-    gap = read_json(Gap, file, ModelError, again, more=True)
+    gap = read_json(_Gap, file, ModelError, again, more=True)
     steps = list(gap["left"])
     if not steps or any(list(panel["left"]) != steps for panel in gap["by_joint"].values()):
         raise ModelError(f"{file}: by_joint: should have the steps of left; {again}")

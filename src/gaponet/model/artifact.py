@@ -95,14 +95,14 @@ def write_card(path: Path, card: dict[str, Any]) -> None:
     write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
-class SensorR2(TypedDict):
+class _SensorR2(TypedDict):
     """How well the sensor predictor explains what it was not fitted to."""
 
     mean: Number
     by_joint: dict[str, Number]
 
 
-class Stages(TypedDict):
+class _Stages(TypedDict):
     """What training got to: rounds of the warm start, done and planned; updates of PPO, and whether it began anew."""
 
     warm_start_rounds: tuple[int, int]
@@ -110,7 +110,7 @@ class Stages(TypedDict):
     ppo_anew: NotRequired[bool]
 
 
-class Card(TypedDict):
+class _Card(TypedDict):
     """The fields of a card.json that something is decided by; others stand beside them."""
 
     format: int
@@ -128,7 +128,7 @@ class Card(TypedDict):
     virtual: NotRequired[bool]
     simulator_only: NotRequired[bool]
     interrupted: NotRequired[bool]
-    stages: NotRequired[Stages]
+    stages: NotRequired[_Stages]
     dataset_hash: NotRequired[str]
     seed: NotRequired[int]
     hours: NotRequired[float]
@@ -138,7 +138,7 @@ class Card(TypedDict):
     parity_rad: NotRequired[float]
     motions: NotRequired[dict[str, tuple[str, ...]]]
     val_mpjae: NotRequired[dict[Literal["model", "nominal", "start"], Number]]
-    sensor_r2: NotRequired[SensorR2 | None]
+    sensor_r2: NotRequired[_SensorR2 | None]
     versions: NotRequired[dict[str, str]]
     sha256: NotRequired[dict[str, Sha256]]
 
@@ -150,7 +150,7 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
         ModelError: Damaged, or written by a newer version.
     """
     mend = "restore it or train again"
-    read_format(Card, file, FORMAT, ModelError, mend)
+    read_format(_Card, file, FORMAT, ModelError, mend)
     card = read_json(dict[str, Any], file, ModelError, mend)
     for field, value in RETIRED.items():
         if (had := card["model"].pop(field, value)) != value:
@@ -169,7 +169,7 @@ def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
     return card, config
 
 
-def require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
+def _require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
     """Refuse a network that does not answer (k, width) numbers with (k, *shape) finite ones up to `largest` (rad)."""
     try:
         bound = network.bind(1)
@@ -219,7 +219,7 @@ class GapModel:
         file = folder / (fused.FILE if numpy else WEIGHTS)
         network = NumpyNetwork(file) if numpy else OnnxNetwork(file, threads)
         width, n = config.input_dim(len(card["joint_names"])), len(card["joint_names"])
-        require_answer(network, width, (n,), config.delta_max, file)
+        _require_answer(network, width, (n,), config.delta_max, file)
         if card.get("sha256", {}).get(file.name, digest := sha256(file)) != digest:
             raise ModelError(f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again")
         return cls(folder, card, config, network)

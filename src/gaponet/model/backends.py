@@ -58,7 +58,7 @@ class FunctionNetwork:
         return Bound(x, delta, run)
 
 
-def require_tried(path: Path) -> None:
+def _require_tried(path: Path) -> None:
     """Refuse an ONNX file that does not answer in the sandbox; each content is tried once in a process.
 
     Raises:
@@ -95,7 +95,7 @@ class OnnxNetwork:
                 "onnxruntime is not installed; run: pip install 'gaponet[deploy]', or load with backend='numpy'"
             ) from None
         if not trusted:
-            require_tried(path)
+            _require_tried(path)
         options = ort.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.log_severity_level = 3

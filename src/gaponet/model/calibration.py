@@ -93,7 +93,7 @@ def calibrate(
         unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
         progress: Called with evaluations done, at most, RMS error in rad.
     """
-    unit = one_unit(sequences)
+    unit = _one_unit(sequences)
     found = fit(simulator, sequences, seconds, unknown_payload, model.corrector(simulator), progress)
     servos = {
         j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
@@ -106,7 +106,7 @@ def calibrate(
     )  # fmt: skip
 
 
-def one_unit(sequences: ListOf[Sequence]) -> str:
+def _one_unit(sequences: ListOf[Sequence]) -> str:
     """The unit whose recordings these are."""
     units = sorted({s.meta.unit_id for s in sequences})
     if len(units) != 1:

@@ -17,7 +17,7 @@ from gaponet.model.layers import DeltaNet, Standardise, dense, size
 from gaponet.model.observation import Layout
 
 
-class SensorPredictor(nn.Module):
+class _SensorPredictor(nn.Module):
     """f_φ(o_t) → mean and log-variance of the standardised sensor values, (B, 2nm) each."""
 
     def __init__(self, config: ModelConfig, n: int) -> None:
@@ -51,7 +51,7 @@ class OperatorNet(DeltaNet):
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
         if config.sensors == "predicted":
-            self.predictor = SensorPredictor(config, n)
+            self.predictor = _SensorPredictor(config, n)
         self.sees_observation = config.branch_history or config.sensors == "off"
         self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)

@@ -41,7 +41,7 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         frozen = copy.deepcopy(net).eval()
         weights = fuse(frozen)
         with whole(folder / WEIGHTS) as onnx:
-            write_onnx(frozen if weights is None else FusedNet(weights), onnx, samples[:2])
+            _write_onnx(frozen if weights is None else FusedNet(weights), onnx, samples[:2])
             TRUSTED.add(sha256(onnx))
             with torch.inference_mode():
                 expected = frozen(torch.from_numpy(samples)).numpy()
@@ -58,7 +58,7 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
         return difference
 
 
-def write_onnx(net: nn.Module, path: Path, x: Array) -> None:
+def _write_onnx(net: nn.Module, path: Path, x: Array) -> None:
     """Input x (batch, dim), output delta (batch, n), float32."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

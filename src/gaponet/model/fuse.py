@@ -37,7 +37,7 @@ def _plain(net: OperatorNet) -> bool:
 
 def _mlp(net: DeltaMLP) -> dict[str, Array]:
     weights = _features(net, np.arange(net.features.dim))
-    return weights | _name("trunk", _scaled(dense_layers(net.net), net)) | {
+    return weights | _name("trunk", _scaled(_dense_layers(net.net), net)) | {
         "kind": np.array("mlp"), "bias": np.zeros(net.n)
     }  # fmt: skip
 
@@ -45,13 +45,13 @@ def _mlp(net: DeltaMLP) -> dict[str, Array]:
 def _full(net: OperatorNet) -> dict[str, Array]:
     n, dim = net.n, net.features.dim
     weights = _features(net, np.arange(dim))
-    branch, trunk = dense_layers(_sequential(net.branch)), dense_layers(net.trunk)
+    branch, trunk = _dense_layers(_sequential(net.branch)), _dense_layers(net.trunk)
     w, b = branch[0]
     predictor: Layers = []
     sensed = net.config.sensor_dim(n) if net.predictor is not None else 0
     parts = []
     if net.predictor is not None:
-        *predictor, (last, last_bias) = dense_layers(net.predictor.net)
+        *predictor, (last, last_bias) = _dense_layers(net.predictor.net)
         predictor[0] = (_rows(predictor[0][0], np.arange(dim - n), dim), predictor[0][1])
         parts.append(last[:, :sensed] @ w[:sensed])
         b = b + last_bias[:sensed] @ w[:sensed]
@@ -75,13 +75,13 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
     ).astype(int)
     weights = _named(_features(net, columns), n)
     alone = isinstance(net, SharedMLP)  # one net is a branch whose trunk answers 1
-    branch = dense_layers(net.net if isinstance(net, SharedMLP) else _sequential(net.branch))
-    trunk = [(np.zeros((1 + payload + n, 1)), np.ones(1))] if alone else dense_layers(net.trunk)
+    branch = _dense_layers(net.net if isinstance(net, SharedMLP) else _sequential(net.branch))
+    trunk = [(np.zeros((1 + payload + n, 1)), np.ones(1))] if alone else _dense_layers(net.trunk)
     predictor: Layers = []
     (w, b), sensed = branch[0], 0
     parts = []
     if net.predictor is not None:
-        predictor = dense_layers(net.predictor.net)
+        predictor = _dense_layers(net.predictor.net)
         first = np.zeros((n * width, predictor[0][0].shape[1]))
         at = np.arange(n)[:, None] * width + np.arange(depth)
         first[at.ravel()] = predictor[0][0][columns.reshape(n, known)[:, :depth].ravel()]
@@ -148,7 +148,7 @@ def _sequential(net: nn.Module) -> nn.Sequential:
     return net
 
 
-def dense_layers(net: nn.Sequential) -> Layers:
+def _dense_layers(net: nn.Sequential) -> Layers:
     """Weights (in, out) and biases of Linear layers with ELU between, double precision."""
     linear = [m for m in net if isinstance(m, nn.Linear)]
     return [(m.weight.detach().double().numpy().T, m.bias.detach().double().numpy()) for m in linear]

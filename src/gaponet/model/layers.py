@@ -84,7 +84,7 @@ class Features(nn.Module):
         return z[:, : self.layout.past.stop].reshape(-1, 2 + 3 * self.history, self.n).transpose(1, 2)
 
 
-class Bounded(nn.Module):
+class _Bounded(nn.Module):
     """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
 
     The gain is 1 while training; training/gain.py lowers it where less of a correction does better.
@@ -116,7 +116,7 @@ class DeltaNet(nn.Module):
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
-        self.bounded = Bounded(config.delta_max)
+        self.bounded = _Bounded(config.delta_max)
         self.predictor, self.sample_sensors = None, False
 
     def fit_inputs(self, x: Tensor) -> None:

@@ -254,7 +254,7 @@ class FreeRuns:
 
     def normal(self, x: Array, errors: Array, jac: Array) -> tuple[Array, Array]:
         """Normal equations of weighted least squares with the prior: matrix (P, P), right-hand side (P,)."""
-        weight, count = weights(errors)[..., None], len(self.fields)
+        weight, count = _weights(errors)[..., None], len(self.fields)
         blocks = np.swapaxes(jac, -1, -2) @ (weight * jac)
         sides = (np.swapaxes(jac, -1, -2) @ (weight * errors[..., None]))[..., 0]
         matrix, side = np.zeros((self.size, self.size)), np.zeros(self.size)
@@ -265,7 +265,7 @@ class FreeRuns:
             matrix[at, -1] = matrix[-1, at] = blocks[:, :count, -1]
             matrix[-1, -1], side[-1] = blocks[:, -1, -1].sum(), sides[:, -1].sum()
         far, slope = self.priced(x)
-        heavy = weights(far)[:, None] * slope
+        heavy = _weights(far)[:, None] * slope
         return matrix + slope.T @ heavy, side + heavy.T @ far
 
     def cost(self, x: Array, errors: Array) -> float:
@@ -273,7 +273,7 @@ class FreeRuns:
         return float(sum((np.sqrt(1 + (e / SOFT) ** 2) - 1).sum() for e in (errors, self.priced(x)[0])))
 
 
-def weights(errors: Array) -> Array:
+def _weights(errors: Array) -> Array:
     """Weights of the errors that give the soft_l1 loss."""
     return np.asarray(1 / np.sqrt(1 + (errors / SOFT) ** 2))
 

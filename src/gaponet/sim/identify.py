@@ -191,7 +191,7 @@ def identify(
     bounds = Bounds(robot, sequences)
     parts = cut(sequences, windows)
     fit = Fit(JointRuns(parts, robot, below, nthread), robot, bounds)
-    judge = Judge(list(validation), robot, below, nthread) if validation else Judge(parts, robot, below, nthread)
+    judge = _Judge(list(validation), robot, below, nthread) if validation else _Judge(parts, robot, below, nthread)
 
     clock.share(PARTS["joints"], 0)
     balanced = fit.runs.regressed()
@@ -237,7 +237,7 @@ def identify(
     before, after = (judge.by_joint(v) for v in (bounds.first, values))
     doubts = (
         *fit.bounds_met(values),
-        *asked_stops(given, met),
+        *_asked_stops(given, met),
         *far_from_published(found),
         *fit.undetermined(values, std, over_kp),
     )
@@ -249,11 +249,11 @@ def identify(
     return Identified(found, began, ended, chosen, doubts, std, tuple(tried), touch, tuple(common), by_joint)
 
 
-class Judge:
+class _Judge:
     """Motions that were not fitted, whole, in the simulator of the whole robot."""
 
     def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
-        self.runs = FreeRuns(sequences, robot, nthread, CLASSIC, touch=touching_rows(sequences, robot, below))
+        self.runs = FreeRuns(sequences, robot, nthread, CLASSIC, touch=_touching_rows(sequences, robot, below))
         each = [self.runs.window == i for i in range(len(sequences))]
         self.motions = [rows for rows in each if rows.any()]
         self.known: dict[bytes, Array] = {}
@@ -291,7 +291,7 @@ class Judge:
         return name, candidates[name]
 
 
-def touching_rows(sequences: ListOf[Sequence], robot: RobotSpec, below: float) -> Array | None:
+def _touching_rows(sequences: ListOf[Sequence], robot: RobotSpec, below: float) -> Array | None:
     """Rows in which a tip is below a height, (sequences, rows)."""
     if not robot.tips:
         return None
@@ -498,7 +498,7 @@ def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
     return robot.with_servos(servos) if servos else robot
 
 
-def asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
+def _asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
     """Where joints stayed behind several commands: a question, since what was met may have been anything."""
     found = []
     for joint, i in zip(given.operated, given.operated_index, strict=True):

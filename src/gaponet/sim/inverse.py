@@ -97,11 +97,11 @@ class ClosedForm:
         self.batch, self.num = batch, batch.nsim
         self.at = np.array([model.joint(name).qposadr[0] for name in joints])
         self.dof = np.array([model.joint(name).dofadr[0] for name in joints])
-        act = np.array([position_actuator(model, name) for name in joints])
+        act = np.array([_position_actuator(model, name) for name in joints])
         bias = _own(batch, model, "actuator_biasprm")[:, act]
         self.kp, self.kd = _own(batch, model, "actuator_gainprm")[:, act, 0], -bias[..., 2]
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
-        self.low, self.high = most_torque(model, joints, act)
+        self.low, self.high = _most_torque(model, joints, act)
         self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
         user = model.actuator_user[act].T if model.nuser_actuator == len(LAW) else np.zeros((len(LAW), len(act)))
         self.law = present(dict(zip(LAW, user, strict=True)))
@@ -297,7 +297,7 @@ def within(count: int, rows: int) -> tuple[Array, Array]:
     return before, speeds
 
 
-def most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
+def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:
     """The least and the most that motors give, (2, n) N·m; ±inf where there is no limit."""
     at = np.array([model.joint(name).id for name in joints])
     limits = [(model.actuator_forcelimited[actuators], model.actuator_forcerange[actuators]),
@@ -306,7 +306,7 @@ def most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array
     return np.array([np.max(low, axis=0), np.min(high, axis=0)])
 
 
-def position_actuator(model: mujoco.MjModel, joint: str) -> int:
+def _position_actuator(model: mujoco.MjModel, joint: str) -> int:
     """The index of the one actuator of a joint, which must be a position actuator without gear or dynamics."""
     of_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
     mine = np.flatnonzero(of_joint & (model.actuator_trnid[:, 0] == model.joint(joint).id))

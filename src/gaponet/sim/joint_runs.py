@@ -62,11 +62,11 @@ class JointRuns:
         self.count = robot.steps_per(self.dt)
         self.thin = max(1, round(THIN / self.dt))
         rows = max(map(len, parts))
-        made: dict[tuple[float, str], Along] = {}
+        made: dict[tuple[float, str], _Along] = {}
         for p in parts:
             key = (p.meta.payload_mass, p.meta.payload_side)
             if key not in made:
-                made[key] = Along(robot, build_model(robot, *key, self.dt, bare=True))
+                made[key] = _Along(robot, build_model(robot, *key, self.dt, bare=True))
         along = [made[p.meta.payload_mass, p.meta.payload_side].follow(p, self.thin) for p in parts]
         low, high = robot.qpos_range[self.op].T
         # (n, windows, rows) each, so that a run reads what lies side by side.
@@ -212,7 +212,7 @@ class JointRuns:
         return np.asarray((1 - share) * first + share * then)
 
 
-class Along:
+class _Along:
     """Inertia, load and tip height along recordings with one payload."""
 
     def __init__(self, robot: RobotSpec, model: mujoco.MjModel) -> None:

@@ -67,7 +67,7 @@ def build_model(
             f"{robot.mjcf}: has {model.nq} degrees of freedom ({', '.join(sorted(known))}), but robot.toml names "
             f"{len(robot.joint_names)} hinge joints. Name each actuated joint once; weld or delete the others"
         )
-    if not np.array_equal(qpos_address(model, robot, locked), np.arange(model.nq)):
+    if not np.array_equal(_qpos_address(model, robot, locked), np.arange(model.nq)):
         raise RobotError(f"{robot.mjcf}: robot.toml must list the joints in the MJCF's order: {_mjcf_order(model)}")
     stiffen_friction(model)
     soften_table(model, robot)
@@ -115,7 +115,7 @@ def build_spec(
     return spec
 
 
-def qpos_address(model: mujoco.MjModel, robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:
+def _qpos_address(model: mujoco.MjModel, robot: RobotSpec, locked: tuple[str, ...] = ()) -> np.ndarray:
     """Index of each of the robot's free joints in qpos, (n − locked,)."""
     return np.array([model.joint(name).qposadr[0] for name in robot.joint_names if name not in locked])
 

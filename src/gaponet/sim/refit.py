@@ -24,7 +24,7 @@ SHORTEST = 0.8  # s
 
 
 @dataclass(frozen=True)
-class Fit:
+class _Fit:
     """Parameters (P,), errors (n, rows) and Jacobian (n, rows, fields) at the end, and how many evaluations it took."""
 
     x: Array
@@ -80,9 +80,9 @@ def refit(
     """
     parts = cut(sequences, windows)
     problem = FreeRuns(parts, robot, nthread, fields, corrector, prior, unknown_payload, believed)
-    fit = descend(problem, problem.start(), evaluations, 1e-3, progress)
+    fit = _descend(problem, problem.start(), evaluations, 1e-3, progress)
     before, after = rms(problem.errors(problem.own()[None])[0]), rms(fit.errors)
-    mass = {"payload_mass": float(fit.x[-1]), "payload_std": jackknife(problem, fit)} if unknown_payload else {}
+    mass = {"payload_mass": float(fit.x[-1]), "payload_std": _jackknife(problem, fit)} if unknown_payload else {}
     return Refitted(problem.robot_of(fit.x), before, after, **mass)
 
 
@@ -98,7 +98,7 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
     return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
 
 
-def jackknife(problem: FreeRuns, fit: Fit) -> float:
+def _jackknife(problem: FreeRuns, fit: _Fit) -> float:
     """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
 
     The model's own errors last as long as a motion, so that rows of a window say little about each other.
@@ -112,13 +112,13 @@ def jackknife(problem: FreeRuns, fit: Fit) -> float:
     return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")
 
 
-def descend(
+def _descend(
     problem: FreeRuns,
     x: Array,
     evaluations: int,
     tolerance: float,
     progress: Callable[[int, int, float], None],
-) -> Fit:
+) -> _Fit:
     """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
 
     Many parameters end at a bound (no delay, no friction), where scipy's trust regions creep: two to four times the
@@ -153,4 +153,4 @@ def descend(
         progress(count, evaluations, rms(errors))
         if 0 <= gained < tolerance or damping > 10:
             break
-    return Fit(x, errors, jac, count)
+    return _Fit(x, errors, jac, count)

@@ -54,17 +54,17 @@ def add_table(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
 def soften_table(model: mujoco.MjModel, robot: RobotSpec) -> None:
     """Give the contacts of a compiled model the table's stiffness, critically damped."""
     if robot.table is not None:
-        model.pair_solref[:] = solref(model, np.array(robot.table.stiffness))
+        model.pair_solref[:] = _solref(model, np.array(robot.table.stiffness))
 
 
 def write_table(batch: Batch, model: mujoco.MjModel, height: Array, friction: Array, stiffness: Array) -> None:
     """Give every simulation of a batch a table of its own, (nsim,) m, 1 and N/m; their model has one."""
     batch.expand("geom_pos")[:, model.geom(TABLE).id, 2] = height
     batch.expand("pair_friction")[:, :, :2] = friction[:, None, None]
-    batch.expand("pair_solref")[:] = solref(model, stiffness)
+    batch.expand("pair_solref")[:] = _solref(model, stiffness)
 
 
-def solref(model: mujoco.MjModel, stiffness: Array) -> Array:
+def _solref(model: mujoco.MjModel, stiffness: Array) -> Array:
     """The pairs' direct solref for stiffnesses (…) in N/m, (…, npair, 2).
 
     A contact at rest pushes with d²k/((1 − d)·w) N per metre, w the mobility of the bodies that touch.

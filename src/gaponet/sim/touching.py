@@ -91,7 +91,7 @@ def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: floa
     return sorted(found, key=lambda s: -len(s))
 
 
-def most_wrong(scene: Scene, away: Array) -> list[Sequence]:
+def _most_wrong(scene: _Scene, away: Array) -> list[Sequence]:
     """At most WINDOWS, PER_MOTION of a motion, whose free runs without a table (1, 3 + n) are worst."""
     order = np.argsort(-scene.mean(scene.errors(away))[0])
     taken: dict[str, list[int]] = {}
@@ -118,8 +118,8 @@ def fit_table(
     n, measured = len(robot.operated), robot.table
     with_table = replace(robot, table=measured or Table(lowest, FRICTION[3], float(np.exp(STIFFNESS[3]))))
     away = np.array([[lowest - 10.0, FRICTION[3], STIFFNESS[3], *np.zeros(n)]])
-    scene = Scene(parts, with_table, nthread)
-    scene = Scene(most_wrong(scene, away), with_table, nthread)
+    scene = _Scene(parts, with_table, nthread)
+    scene = _Scene(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
     before = scene.errors(away)
     guesses = np.repeat(away, HEIGHTS, axis=0)
@@ -158,7 +158,7 @@ def fit_table(
     return Touch(found, kept, without, within, motions)
 
 
-class Scene:
+class _Scene:
     """Windows beside tables and zeros of many kinds: rows of [height m, friction, log stiffness, zeros rad]."""
 
     def __init__(self, parts: list[Sequence], robot: RobotSpec, nthread: int) -> None:

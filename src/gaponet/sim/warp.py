@@ -27,7 +27,7 @@ LATE = {"history": "history", "time": "time"}
 LAW = {"servo_torque": "servo_torque", "servo_load": "servo_load"}
 
 
-class Worlds:
+class _Worlds:
     """Simulations of one rate: mujoco_warp steps all of its worlds or none, and all as often."""
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
@@ -133,7 +133,7 @@ class WarpSim:
         )  # fmt: skip
         # One rate's worlds are not stepped with another's, since they take more steps or fewer.
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
-        self._worlds = [Worlds(sim, rows, device) for rows in rates]
+        self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
         self._kept = STATE | (LATE if self._late else {}) | ({} if sim.law is None else LAW)
         names = [*self._kept, "ctrl", "actuator_force"]
@@ -177,7 +177,7 @@ class WarpSim:
                 mine = put[rows].nonzero()[:, 0]
                 worlds.law.reset(mine, target[rows[mine]])
 
-    def _in_turn(self) -> Iterator[tuple[Worlds, Tensor]]:
+    def _in_turn(self) -> Iterator[tuple[_Worlds, Tensor]]:
         """The worlds of each rate with their simulations' state, which is taken back."""
         for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
             if views is not self._all:

@@ -51,12 +51,12 @@ def with_own(state: Any, mine: Any) -> Any:
     return mine
 
 
-def rng_text(rng: np.random.Generator) -> str:
+def _rng_text(rng: np.random.Generator) -> str:
     """State of a generator; its integers have 128 bits."""
     return json.dumps(rng.bit_generator.state)
 
 
-def set_rng(rng: np.random.Generator, text: str) -> None:
+def _set_rng(rng: np.random.Generator, text: str) -> None:
     rng.bit_generator.state = json.loads(text)
 
 
@@ -66,7 +66,7 @@ def env_state(env: DeltaEnv) -> StateDict:
     return {
         "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
         "reward": (float(env.reward_sum), env.reward_count),
-        "rng": rng_text(env.rng),
+        "rng": _rng_text(env.rng),
     }
 
 
@@ -78,13 +78,13 @@ def restore_env(env: DeltaEnv, state: StateDict) -> None:
     env.loop.history.frames[:] = like(env.loop.history.frames, arrays["frames"])
     env.sim.set_state(arrays)
     env.reward_sum, env.reward_count = state["reward"]
-    set_rng(env.rng, state["rng"])
+    _set_rng(env.rng, state["rng"])
 
 
 def round_state(warm: WarmStart) -> StateDict:
     """What the next round's roll-outs follow from."""
     net = {name: x.clone() for name, x in warm.net.state_dict().items()}
-    return {"net": net, "rng": rng_text(warm.env.rng)}
+    return {"net": net, "rng": _rng_text(warm.env.rng)}
 
 
 def warm_state(warm: WarmStart, rounds: list[StateDict]) -> StateDict:
@@ -93,7 +93,7 @@ def warm_state(warm: WarmStart, rounds: list[StateDict]) -> StateDict:
         "rounds": rounds,
         "optimiser": warm.optimiser.state_dict(),
         "generator": warm.generator.get_state(),
-        "env_rng": rng_text(warm.env.rng),
+        "env_rng": _rng_text(warm.env.rng),
     }
 
 
@@ -102,10 +102,10 @@ def restore_warm(warm: WarmStart, state: StateDict) -> None:
     present = {name: x.clone() for name, x in warm.net.state_dict().items()}
     for i, before in enumerate(state["rounds"]):
         warm.net.load_state_dict(before["net"])
-        set_rng(warm.env.rng, before["rng"])
+        _set_rng(warm.env.rng, before["rng"])
         warm.collect(follow_labels=i == 0)
     warm.net.load_state_dict(present)
     warm.optimiser.load_state_dict(state["optimiser"])
     warm.generator.set_state(state["generator"])
-    set_rng(warm.env.rng, state["env_rng"])
+    _set_rng(warm.env.rng, state["env_rng"])
     warm.done = len(state["rounds"])

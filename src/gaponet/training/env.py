@@ -22,7 +22,7 @@ from gaponet.training.config import RewardConfig
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
 
-def placed(sim: BatchSim, device: str) -> Any:
+def _placed(sim: BatchSim, device: str) -> Any:
     """The same simulations on a --device: themselves on "cpu", mujoco_warp's elsewhere."""
     if device == "cpu":
         return sim
@@ -118,7 +118,7 @@ class DeltaEnv:
 
     def _place(self, sim: BatchSim, device: str) -> None:
         """Put the simulations, and all that a step looks up or writes, on the device; in numpy nothing is copied."""
-        self.sim: Any = placed(sim, device)
+        self.sim: Any = _placed(sim, device)
         place, num = self.sim.array, self.num_envs
         for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features"):
             setattr(self, name, place(getattr(self, name)))

@@ -27,7 +27,7 @@ from gaponet.sim.model import build_model
 FRICTION_SPEED = 0.02  # rad/s: below it, recorded motion is as good as rest
 
 
-class Motion(NamedTuple):
+class _Motion(NamedTuple):
     """A recorded motion, smoothed, and what it takes of the joints, arrays (T, n): rad, rad/s, rad/s², N·m."""
 
     qpos: Array
@@ -37,7 +37,7 @@ class Motion(NamedTuple):
     """Inertia, Coriolis and gravity of links and payload."""
 
 
-class Plant(NamedTuple):
+class _Plant(NamedTuple):
     """The numbers of a simulator that its inverse takes, each (n)."""
 
     kp: Array
@@ -49,24 +49,24 @@ class Plant(NamedTuple):
     effort_limit: Array
 
 
-def plant_of(robot: RobotSpec) -> Plant:
+def _plant_of(robot: RobotSpec) -> _Plant:
     """Of a robot, (n) each."""
     model = build_model(robot)
     damping, friction, armature = model.dof_damping, model.dof_frictionloss, model.dof_armature
-    return Plant(robot.kp, robot.kd, damping, friction, armature, robot.offset, robot.effort_limit)
+    return _Plant(robot.kp, robot.kd, damping, friction, armature, robot.offset, robot.effort_limit)
 
 
-def motion_of(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> Motion:
+def _motion_of(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> _Motion:
     """A recording as the robot's inverse dynamics see it."""
     model = build_model(robot, sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt)
     qpos = lowpass(sequence.qpos.astype(float), sequence.dt, cutoff)
     qvel = differentiate(qpos, sequence.dt)
     qacc = differentiate(qvel, sequence.dt)
     own = model.dof_armature * qacc + model.dof_damping * qvel
-    return Motion(qpos, qvel, qacc, inverse_dynamics(model, qpos, qvel, qacc) - own)
+    return _Motion(qpos, qvel, qacc, inverse_dynamics(model, qpos, qvel, qacc) - own)
 
 
-def band(motion: Motion, plant: Plant) -> tuple[Array, Array]:
+def _band(motion: _Motion, plant: _Plant) -> tuple[Array, Array]:
     """The least and the greatest u* of servos that are not late, rad."""
     tau = motion.links + plant.armature * motion.qacc + plant.damping * motion.qvel
     moving = np.tanh(np.abs(motion.qvel) / FRICTION_SPEED)  # 0 at rest: friction is anything within ±limit; 1: all
@@ -76,7 +76,7 @@ def band(motion: Motion, plant: Plant) -> tuple[Array, Array]:
     return low, high
 
 
-def _target(tau: Array, motion: Motion, plant: Plant) -> Array:
+def _target(tau: Array, motion: _Motion, plant: _Plant) -> Array:
     """Targets with which the servos produce these torques."""
     tau = np.clip(tau, -plant.effort_limit, plant.effort_limit)
     return np.asarray(motion.qpos + (tau + plant.kd * motion.qvel) / plant.kp - plant.offset)
@@ -85,7 +85,7 @@ def _target(tau: Array, motion: Motion, plant: Plant) -> Array:
 def inverse_targets(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> tuple[Array, Array]:
     """The least and the greatest u*, (T, n) rad each: held over [t, t+1), they lead the simulator from row t to t+1."""
     robot = robot.with_gains(*sequence.meta.known_gains)
-    low, high = band(motion_of(sequence, robot, cutoff), plant_of(robot))
+    low, high = _band(_motion_of(sequence, robot, cutoff), _plant_of(robot))
     t = np.arange(len(sequence)) * sequence.dt
     for j in np.flatnonzero(robot.delay):
         for target in (low, high):

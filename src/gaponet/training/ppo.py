@@ -23,7 +23,7 @@ from gaponet.training.env import DeltaEnv
 LOWEST, HIGHEST, FACTOR = 1e-6, 1e-3, 1.5  # bounds of the actor's step size, and its change when KL asks for one
 
 
-class Critic(nn.Module):
+class _Critic(nn.Module):
     """Value of each joint, (B, n), from the network's features and what only training knows."""
 
     def __init__(self, features: int, seen: int, hidden: tuple[int, ...], n: int) -> None:
@@ -35,7 +35,7 @@ class Critic(nn.Module):
 
 
 @dataclass
-class Batch:
+class _Batch:
     """What was collected, one row per decision: targets, values and advantages are (B, n), of each joint."""
 
     prepared: Tensor
@@ -74,7 +74,7 @@ class Learner:
         self.trained = [p for p in net.parameters() if p.requires_grad]
         observed = env.get_observations()
         seen = observed["critic"]
-        self.critic = Critic(net.features.dim, seen.shape[1], config.critic_hidden, env.num_actions).to(seen.device)
+        self.critic = _Critic(net.features.dim, seen.shape[1], config.critic_hidden, env.num_actions).to(seen.device)
         ranks.spread(self.critic)
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
@@ -91,7 +91,7 @@ class Learner:
         self.updates += 1
         return self.found
 
-    def collect(self) -> Batch:
+    def collect(self) -> _Batch:
         """Roll out with the present network; returns what was seen and what came of it."""
         env, config = self.env, self.config
         explored = (torch.rand_like(self.noise) < config.noise_share).float()
@@ -114,8 +114,8 @@ class Learner:
             seen["advantage"] = advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
             seen["returns"] = seen["advantage"] + seen["value"]
             self._measure(seen)
-        fields = Batch.__dataclass_fields__
-        return Batch(**{name: x.flatten(0, 1).clone() for name, x in seen.items() if name in fields})
+        fields = _Batch.__dataclass_fields__
+        return _Batch(**{name: x.flatten(0, 1).clone() for name, x in seen.items() if name in fields})
 
     def look(self) -> dict[str, Tensor]:
         """What the network and the critic make of the present state."""
@@ -136,7 +136,7 @@ class Learner:
         found = self.found = Update(explained_variance=explained, mean_delta=delta, reward=reward)
         self.ready |= self.updates >= self.config.critic_warmup and found.explained_variance >= self.config.explained
 
-    def learn(self, batch: Batch) -> None:
+    def learn(self, batch: _Batch) -> None:
         """Fit the critic and, once it explains the returns, move the actor."""
         config, explored = self.config, batch.explored
         own = batch.advantage - (explored * batch.advantage).sum(0) / explored.sum(0)
@@ -152,7 +152,7 @@ class Learner:
         self.found.learning_rate = self.optimiser.param_groups[0]["lr"] if self.ready else 0.0
         self.found.critic_learning_rate = self.config.critic_learning_rate
 
-    def _move(self, batch: Batch, rows: Tensor) -> float:
+    def _move(self, batch: _Batch, rows: Tensor) -> float:
         """One step of the actor; returns its KL from the network that collected, per joint that explored."""
         mean, old, sampled = self.net.correct(batch.prepared[rows]), batch.mean[rows], batch.sampled[rows]
         weight = batch.explored[rows] / batch.explored[rows].sum().clamp_min(1.0)

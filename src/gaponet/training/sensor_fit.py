@@ -24,7 +24,7 @@ Report = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: �
 
 
 @dataclass(frozen=True)
-class Answers:
+class _Answers:
     """States, and what the simulator answered there.
 
     Attributes:
@@ -35,8 +35,8 @@ class Answers:
     features: Tensor
     answers: Tensor
 
-    def __getitem__(self, rows: Any) -> Answers:
-        return Answers(self.features[rows], self.answers[rows])
+    def __getitem__(self, rows: Any) -> _Answers:
+        return _Answers(self.features[rows], self.answers[rows])
 
 
 def sensor_labels(
@@ -49,7 +49,7 @@ def sensor_labels(
     locked: tuple[str, ...],
     seed: int,
     nthread: int = 0,
-) -> Answers:
+) -> _Answers:
     """Standardised features and oracle answers: a third at these states, a third near them, a third anywhere.
 
     "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
@@ -76,7 +76,7 @@ def sensor_labels(
     answers = oracle(q, v)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
-    return Answers(features.clone(), torch.from_numpy(answers.reshape(len(q), -1)))
+    return _Answers(features.clone(), torch.from_numpy(answers.reshape(len(q), -1)))
 
 
 def shift_positions(shift: Array, at: Layout) -> Array:
@@ -89,7 +89,7 @@ def shift_positions(shift: Array, at: Layout) -> Array:
     return out
 
 
-def fit_predictor(net: DeltaNet, asked: Answers, joints: tuple[str, ...], seed: int) -> Report:
+def fit_predictor(net: DeltaNet, asked: _Answers, joints: tuple[str, ...], seed: int) -> Report:
     """Gaussian likelihood on three quarters of the states; returns R² on the rest.
 
     The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
@@ -115,10 +115,10 @@ def fit_predictor(net: DeltaNet, asked: Answers, joints: tuple[str, ...], seed: 
         schedule.step()
     for p in parameters:
         p.requires_grad_(False)
-    return explained(net, asked[:held], joints)
+    return _explained(net, asked[:held], joints)
 
 
-def explained(net: DeltaNet, asked: Answers, joints: tuple[str, ...]) -> Report:
+def _explained(net: DeltaNet, asked: _Answers, joints: tuple[str, ...]) -> Report:
     """R² of the predictor's mean: the share of the answers' variance over these states, averaged over sensor values."""
     with torch.inference_mode():
         truth = net.predictor.outputs(asked.answers)

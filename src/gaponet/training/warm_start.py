@@ -172,14 +172,14 @@ def fit_inputs(
     ranks.pool(net)
     report = None
     if net.predictor is not None:
-        report = ranks.once(lambda: fit_sensors(net, env, states, seed, nthread))
+        report = ranks.once(lambda: _fit_sensors(net, env, states, seed, nthread))
         net.predictor.requires_grad_(False)
         ranks.spread(net.predictor)
     net.to(x.device)
     return report
 
 
-def fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
+def _fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
     """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
     if states < 8:
         raise UsageError(f"--warm-start.sensor-states {states}: too few to fit a predictor on; give 8 or more")

@@ -38,7 +38,7 @@ def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"state follows command after (median and range over motions at {FAST} rad/s or faster) {told}: "
         f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
     )
-    own, jumps = servo_lag(robot), dict(zip(robot.joint_names, sharp([s.response for s in surveys]), strict=True))
+    own, jumps = _servo_lag(robot), dict(zip(robot.joint_names, sharp([s.response for s in surveys]), strict=True))
     asked = [name for name in found if name in robot.operated and not jumps[name]]  # of others `timing` sees more
     extra = {name: float(np.median(found[name])) - own[name] for name in asked}
     usual = float(np.median(list(extra.values()))) if extra else 0.0
@@ -56,7 +56,7 @@ def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("warning", "lag", text, (name,), {"extra_s": late - usual})
 
 
-def servo_lag(robot: RobotSpec) -> dict[str, float]:
+def _servo_lag(robot: RobotSpec) -> dict[str, float]:
     """Lag of a slow motion that kp, kd and the MJCF's damping make, by joint, s."""
     from gaponet.mjcf import compiled, read_mjcf
 

@@ -36,7 +36,7 @@ ODD = 10  # sequences that are told apart
 
 
 @dataclass(frozen=True)
-class Rests:
+class _Rests:
     """Fresh rests (k): their sequence and joint, error (rad), columns of the four numbers, and G of 1 kg over kp."""
 
     sequence: Array
@@ -45,13 +45,13 @@ class Rests:
     columns: Array
     per_kg: Array
 
-    def only(self, keep: Array) -> Rests:
+    def only(self, keep: Array) -> _Rests:
         """Those of a mask (k)."""
-        return Rests(*(values[keep] for values in vars(self).values()))
+        return _Rests(*(values[keep] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
-class Fit:
+class _Fit:
     """Of a joint: the four numbers, their standard errors, scatter (rad), and the numbers without each fold."""
 
     x: Array
@@ -94,7 +94,7 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
     yield from wrong or [Finding("ok", "rests", "rests agree with gravity, gains and payload labels")]
 
 
-def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Rests:
+def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Rests:
     parts = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros((0, 4)), np.zeros(0))]
     for number, s in enumerate(surveys):
         meta, holds = s.entry.meta, s.holds
@@ -111,10 +111,10 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Rests:
             columns = np.column_stack([np.ones(k), ctrl, -load[use, j], -holds.approach[use, j]])
             error = holds.qpos[use, j] - ctrl
             parts.append((np.full(k, number), np.full(k, j), error, columns, -heavier[use, j]))
-    return Rests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return _Rests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _fit(mine: Rests) -> Fit:
+def _fit(mine: _Rests) -> _Fit:
     """The four numbers of the one joint of these rests."""
     x, formal, scatter = _solve(mine.columns, mine.error)
     numbers = sorted(set(mine.sequence.tolist()))
@@ -124,7 +124,7 @@ def _fit(mine: Rests) -> Fit:
     every = np.array(list(without.values()))
     jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
     deviation = np.maximum(formal, jackknife) if len(every) > 2 else 3 * formal
-    return Fit(x, deviation, scatter, {s: without[i % FOLDS] for i, s in enumerate(numbers)})
+    return _Fit(x, deviation, scatter, {s: without[i % FOLDS] for i, s in enumerate(numbers)})
 
 
 def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
@@ -140,11 +140,11 @@ def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
     return x, np.sqrt(np.diag(np.linalg.inv(a.T @ a))), scatter
 
 
-def _sure(fit: Fit) -> Array:
+def _sure(fit: _Fit) -> Array:
     return np.abs(fit.x - PLAIN) > SURE * fit.deviation
 
 
-def _joint(name: str, fit: Fit) -> Iterator[Finding]:
+def _joint(name: str, fit: _Fit) -> Iterator[Finding]:
     offset, scale = float(fit.x[0]), float(1 + fit.x[1])
     if _sure(fit)[1] and abs(scale - 1) > SCALE:
         text = (
@@ -162,7 +162,7 @@ def _joint(name: str, fit: Fit) -> Iterator[Finding]:
         yield Finding("warning" if far else "note", "offset", text, (name,), {"offset": offset})
 
 
-def _relabelled(surveys: list[Survey], found: Rests, judged: list[int]) -> list[Finding]:
+def _relabelled(surveys: list[Survey], found: _Rests, judged: list[int]) -> list[Finding]:
     """Would the labels' masses in another order explain the rests better?"""
     mass = np.array([s.entry.meta.payload_mass for s in surveys])[found.sequence]
     labels = sorted(set(mass.tolist()))
@@ -185,7 +185,7 @@ def _relabelled(surveys: list[Survey], found: Rests, judged: list[int]) -> list[
     return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
 
 
-def _two_units(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: list[int]) -> list[Finding]:
+def _two_units(surveys: list[Survey], robot: RobotSpec, found: _Rests, judged: list[int]) -> list[Finding]:
     """Do the recordings fall into two groups that rest apart, in two joints at least?"""
     middle = np.full((len(surveys), len(judged)), np.nan)
     for column, j in enumerate(judged):
@@ -215,7 +215,7 @@ def _two_units(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: li
     return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
 
 
-def _odd_one(surveys: list[Survey], robot: RobotSpec, found: Rests, judged: list[int]) -> tuple[int, Finding] | None:
+def _odd_one(surveys: list[Survey], robot: RobotSpec, found: _Rests, judged: list[int]) -> tuple[int, Finding] | None:
     """The sequence that rests furthest from where the others say, if any is far."""
     by_joint = {j: found.only(found.joint == j) for j in judged}
     fits = {j: _fit(mine) for j, mine in by_joint.items() if len(mine.error) >= FEW}

@@ -25,7 +25,7 @@ STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i
 MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
 
 
-class RefusedError(Exception):
+class _RefusedError(Exception):
     """What stands in the pickle is none of the things that may."""
 
 
@@ -55,13 +55,13 @@ class _Array:
     def real(self, made: Any) -> Any:
         shape, kind, order, data = self.state[-4:]
         if not isinstance(kind, _Type) or not isinstance(shape, tuple) or not all(type(n) is int for n in shape):
-            raise RefusedError("an array without type or shape")
+            raise _RefusedError("an array without type or shape")
         if kind.text.lstrip("|<>=")[:1] == "O":
             out = np.empty(len(data), object)
             out[:] = [made(x) for x in data]
             return out.reshape(shape)
         if kind.real().kind not in KINDS or not isinstance(data, (bytes, bytearray)):
-            raise RefusedError(f"an array of {kind.text}")
+            raise _RefusedError(f"an array of {kind.text}")
         return np.frombuffer(bytes(data), kind.real()).reshape(shape, order="F" if order else "C")
 
 
@@ -74,13 +74,13 @@ class _Wrapped:
     def read(self, state: Any, stream: io.BytesIO) -> None:
         kind, shape = state.get("dtype"), state.get("shape")
         if not isinstance(kind, _Type) or kind.real().kind not in KINDS or not isinstance(shape, tuple):
-            raise RefusedError("an array of objects inside a joblib file")
+            raise _RefusedError("an array of objects inside a joblib file")
         padding = state.get("numpy_array_alignment_bytes")
         if padding is not None:
             stream.seek(stream.read(1)[0], io.SEEK_CUR)
         size = int(np.prod([int(n) for n in shape], dtype=object)) * kind.real().itemsize
         if not 0 <= size <= LARGEST_ARRAYS:
-            raise RefusedError(f"an array of {size} bytes")
+            raise _RefusedError(f"an array of {size} bytes")
         data = stream.read(size)
         order: Any = "F" if state.get("order") == "F" else "C"
         self.array = np.frombuffer(data, kind.real()).reshape(tuple(map(int, shape)), order=order)
@@ -106,12 +106,12 @@ class _Tensor:
 
     def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> None:
         if not isinstance(storage, np.ndarray) or not isinstance(size, tuple) or not isinstance(stride, tuple):
-            raise RefusedError("a tensor without storage, size or stride")
+            raise _RefusedError("a tensor without storage, size or stride")
         if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)):
-            raise RefusedError("a tensor whose size is not numbers")
+            raise _RefusedError("a tensor whose size is not numbers")
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
         if math.prod(size) and last >= len(storage):
-            raise RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
+            raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
         steps, self.array = [n * storage.itemsize for n in stride], None
         if math.prod(size) <= len(storage):  # one may claim to be large by repeating one number: it is left alone
             self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
@@ -124,7 +124,7 @@ def _new(*_: Any) -> _Array:
 def _codec(text: Any, encoding: Any) -> bytes:
     """How Python 3 wrote bytes into old protocols."""
     if encoding not in ("latin1", "latin-1"):
-        raise RefusedError(f"codec {encoding!r:.40}")
+        raise _RefusedError(f"codec {encoding!r:.40}")
     return str(text).encode("latin1")
 
 
@@ -149,13 +149,13 @@ class _Unpickler(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in MEANT:
-            raise RefusedError(f"it wants to run {module}.{name}")
+            raise _RefusedError(f"it wants to run {module}.{name}")
         return MEANT[module, name]
 
     def persistent_load(self, pid: Any) -> Any:
         known = isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[1], str) and pid[1] in STORAGES.values()
         if self.storage is None or not known:
-            raise RefusedError("a persistent id that is no storage of tensors")
+            raise _RefusedError("a persistent id that is no storage of tensors")
         return np.frombuffer(self.storage(str(pid[2])), np.dtype("<" + pid[1]))
 
     def load_build(self) -> None:
@@ -166,7 +166,7 @@ class _Unpickler(pickle._Unpickler):
         elif isinstance(what, (_Array, _Type)):
             what.__setstate__(state)
         else:
-            raise RefusedError(f"state for a {type(what).__name__}")
+            raise _RefusedError(f"state for a {type(what).__name__}")
 
     dispatch: ClassVar[Any] = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}
 
@@ -186,7 +186,7 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
         nonlocal steps
         steps += 1
         if steps > MOST_STEPS:
-            raise RefusedError("too many values")
+            raise _RefusedError("too many values")
         if isinstance(x, (_Array, _Scalar)):
             return x.real(made)
         if isinstance(x, (_Wrapped, _Tensor)):
@@ -197,7 +197,7 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
             return [made(v) for v in x]
         if x is None or isinstance(x, (bool, int, float, str)):
             return x
-        raise RefusedError(f"a {type(x).__name__}")
+        raise _RefusedError(f"a {type(x).__name__}")
 
     try:
         if data[:1] == b"\x78":

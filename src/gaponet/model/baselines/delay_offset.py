@@ -39,14 +39,14 @@ class DelayOffset:
         hint = "give a complete run folder of gaponet train"
         return read_json(cls, run / "delay_offset.json", ModelError, hint)
 
-    def corrector(self, robot: RobotSpec) -> DelayOffsetCorrector:
-        return DelayOffsetCorrector(self, robot)
+    def corrector(self, robot: RobotSpec) -> _DelayOffsetCorrector:
+        return _DelayOffsetCorrector(self, robot)
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
 
-class DelayOffsetCorrector:
+class _DelayOffsetCorrector:
     """Delays targets and adds the offset; before the first command, the first command."""
 
     def __init__(self, values: DelayOffset, robot: RobotSpec) -> None:

@@ -10,7 +10,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, dense
 
 
-class Block(nn.Module):
+class _Block(nn.Module):
     """x + attention(norm(x)), then x + mlp(norm(x)); written out, since torch's own layer does not export as traced."""
 
     def __init__(self, width: int, heads: int) -> None:
@@ -37,7 +37,9 @@ class DeltaTransformer(DeltaNet):
         super().__init__(config, n)
         width = config.transformer_width
         self.tokens = Tokens(self.features, config, width)
-        self.blocks = nn.Sequential(*(Block(width, config.transformer_heads) for _ in range(config.transformer_layers)))
+        self.blocks = nn.Sequential(
+            *(_Block(width, config.transformer_heads) for _ in range(config.transformer_layers))
+        )
         self.norm = nn.LayerNorm(width)
         self.head = dense(width, (), n, zero=True)
 
