@@ -22,6 +22,7 @@ COMMANDS = [
     ["experiment", "unit", "nowhere", "--out"],
     ["experiment", "data", "nowhere", "--out"],
     ["experiment", "tracking", "nowhere", "--out"],
+    ["experiment", "delivery", "nowhere", "--out"],
     ["run", "--motion", "wave", "--out"],
     ["record", "--motion", "wave", "--payload-mass", "0", "--out"],
     ["demo", "--out"],

@@ -20,7 +20,8 @@ from gaponet_lab.study.compare import Compare, identified
 from gaponet_lab.study.data import Data
 from gaponet_lab.study.found import Question, answer, train_all
 from gaponet_lab.study.options import MODELS, Options
-from gaponet_lab.study.played.session import Session, study_to_play
+from gaponet_lab.study.played.delivery import Delivery
+from gaponet_lab.study.played.session import Playing, Session, study_to_play
 from gaponet_lab.study.played.tracking import Tracking
 from gaponet_lab.study.study import Study, expected_s
 from gaponet_lab.study.unit import Unit
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
 FLAT = tyro.conf.arg(name="")
 Shared = Annotated[Options, FLAT]
+PLAYED = (Tracking, Delivery)
 DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
@@ -59,7 +61,7 @@ def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
 
 def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
     data, robot = open_dataset(dataset, options.robot)
-    if kind is Tracking:
+    if kind in PLAYED:
         _play(question, data, robot, out, options)
         return
     study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
@@ -80,9 +82,10 @@ def _prepared(question: Compare, study: Study) -> Study:
         return identified(study, update)
 
 
-def _play(question: Tracking, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
     """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
     data.require_robot(robot)
+    question.require(data)
     screen, runs, part = Out(options.json), question.runs, data
     if not runs:
         study = study_to_play(question, data, robot, out, options)
@@ -109,7 +112,7 @@ def _command(kind: type[Any]) -> Any:
 
     place = tyro.conf.Positional[str]
     ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
-    trained_on = " that the models were trained on" if kind is Tracking else ""
+    trained_on = " that the models were trained on" if kind in PLAYED else ""
     ask.__doc__ = "\n    ".join((
         f"{inspect.getdoc(kind)}\n\nArgs:",
         f"dataset: Dataset folder{trained_on}, or the address (s3://, gs://) of one that was pushed.",
@@ -124,5 +127,5 @@ def experiment(action: None) -> None:
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.
-ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Unit, Data, Tracking))]  # noqa: UP007
+ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Unit, Data, *PLAYED))]  # noqa: UP007
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

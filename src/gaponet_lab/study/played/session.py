@@ -1,4 +1,4 @@
-"""Everything that is there before a VIRTUAL unit is played: models, unit, payloads, and what it takes to repeat it."""
+"""What questions that play a VIRTUAL unit have in common: models, unit, payloads, and what it takes to repeat them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REHEARSAL = " REHEARSAL: hardly any training, on a slice of the dataset; these n
 
 @dataclass(frozen=True)
 class Playing:
-    """What plays."""
+    """A question for which a unit is played."""
 
     runs: tuple[Path, ...] = ()
     """Run folders, or folders of them such as the cells of gaponet experiment compare; without any, GAPONet and the MLP
@@ -40,6 +40,12 @@ class Playing:
     """Virtual units: hard, easy, shifted, or a .toml file; by default the fleet that was recorded."""
     payloads: tuple[float, ...] = ()
     """kg in each hand; default those trained on, with --quick the lightest and the heaviest of them."""
+
+    def require(self, data: Dataset) -> None:
+        """Refuse what cannot be played, before anything takes time."""
+
+    def play(self, session: Session, tell: Tell) -> Result:
+        raise NotImplementedError
 
 
 def study_to_play(asked: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> Study:
