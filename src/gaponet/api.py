@@ -260,6 +260,7 @@ def identify(
             "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
             "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
             "val_mpjae": {name: float(e.mean()) for name, e in val_errors.items()},
+            "std": found.std,
         })  # fmt: skip
     return Identification(found, val_errors, time.monotonic() - began)
 

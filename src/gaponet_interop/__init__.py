@@ -4,8 +4,10 @@ What it offers to gaponet (gaponet.parts); nothing is imported here.
 """
 
 COMMANDS = {
+    "start": "gaponet_interop.cli.start:start",
     "export": "gaponet_interop.cli.export:export",
     "robot": "gaponet_interop.cli.robot:robot",
+    "replay": "gaponet_interop.cli.replay:replay",
     "push": "gaponet_interop.cli.share:push",
     "pull": "gaponet_interop.cli.share:pull",
 }

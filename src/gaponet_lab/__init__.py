@@ -8,6 +8,7 @@ COMMANDS = {
 }
 PROVIDES = {
     "figure of a gap": "gaponet_lab.report.gap_figure:write_gap",
+    "figure of a replay": "gaponet_lab.report.replay_figure:write",
     "figures of a dataset": "gaponet_lab.report.draw_dataset:draw_all",
     "figures of findings": "gaponet_lab.report.draw_findings:draw_findings",
     "picture of models": "gaponet_lab.view.still:still",

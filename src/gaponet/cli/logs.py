@@ -112,7 +112,7 @@ def doctor(
     data, spec = open_dataset(dataset, robot)
     diagnosis = api.doctor(data, spec)
     out.say(f", {inventory(data)}", spec.name)
-    _show_diagnosis(out, diagnosis)
+    show_diagnosis(out, diagnosis)
     mended = proposal(diagnosis.findings) if fix else ""
     for line in mended.splitlines():
         out.say(line)
@@ -242,7 +242,7 @@ def _show_offsets(out: Out, lags: dict[str, list[float]], offsets: dict[str, Joi
         out.say(f"zero not identified for {joints}: {reason}")
 
 
-def _show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
+def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
     """Tables of sequences and joints, the findings, the verdict."""
     shown = diagnosis.sequences[:MAX_ROWS]
     columns = ["motion", "kg", "s", "Hz", "jitter", "gap", "lag"]

@@ -25,9 +25,9 @@ TASKS = {
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
     "Closing it": ("identify", "calibrate", "train", "export"),
-    "Is it closed?": ("eval", "report", "runs", "experiment"),
+    "Is it closed?": ("eval", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual"),
-    "Try it, time it, share it": ("demo", "bench", "push", "pull"),
+    "Try it, time it, share it": ("start", "demo", "bench", "push", "pull"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 CORE = {
@@ -113,7 +113,7 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 
 def overview() -> str:
     """All commands by task, a line each, on one screen; nothing is imported for it."""
-    lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", "", ABOUT]
+    lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", ABOUT]
     known = commands()
     others = tuple(name for name in known if name not in chain.from_iterable(TASKS.values()))
     for task, names in (TASKS | {"Of other packages": others}).items():

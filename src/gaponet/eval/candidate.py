@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
 from typing_extensions import TypedDict
 
@@ -25,13 +25,14 @@ DATA = "data of the robot that the run was trained for"
 
 
 class _Origin(TypedDict):
-    """What a robot was identified from: dataset (address, or path from the folder), recordings and motions by part, and
-    what that left on validation motions, rad."""
+    """What a robot was identified from: dataset (address, or path from the folder), recordings and motions by part,
+    what that left on validation motions, rad, and each joint's standard errors by field."""
 
     dataset: str
     parts: RunSplit
     motions: dict[str, tuple[str, ...]]
     val_mpjae: dict[str, float]
+    std: NotRequired[dict[str, dict[str, float | None]]]
 
 
 @dataclass(frozen=True)

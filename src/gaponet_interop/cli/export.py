@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import tyro
 
@@ -12,10 +12,6 @@ from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
 from gaponet.robot_folder import KEPT, keeps_robot
-
-if TYPE_CHECKING:
-    from gaponet.data.sequence import Sequence
-    from gaponet.robot import RobotSpec
 
 Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.")]
 
@@ -52,9 +48,10 @@ def export(
     from gaponet.eval.tables import mrad
     from gaponet.progress import bar
     from gaponet_interop.engine.folder import export_robot
+    from gaponet_interop.engine.forms import recordings_of
 
     spec, folder = load_robot(_simulator(robot)), out or robot / to
-    recordings = _recordings(_simulator(robot), data, spec)
+    recordings = recordings_of(_simulator(robot), data, spec)
     with bar("fitting without the law") as update:
         made = export_robot(spec, to, folder, recordings, into, prefix, payload_mass, update)
     of = "of the robot's own answers, VIRTUAL" if made.virtual else "validation motions"
@@ -71,29 +68,6 @@ def export(
 def _simulator(holder: Path) -> Path:
     """The robot folder of a run or an artifact, or the folder itself."""
     return holder / KEPT if keeps_robot(holder) else holder
-
-
-def _recordings(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
-    """Training and validation motions of a dataset, by default those that the robot was identified from."""
-    from gaponet.data.split import split_entries
-    from gaponet.data.store import opened
-    from gaponet.eval.candidate import read_origin
-
-    origin = read_origin(folder)
-    if data is None and origin is not None:
-        there = origin["dataset"]
-        data = there if "://" in there else str(folder / there)
-        data = data if "://" in there or Path(data).is_dir() else None  # it may have moved away
-    if data is None:
-        return None
-    dataset = opened(data)
-    dataset.require_robot(robot)
-    parts = split_entries(dataset, ())
-    if origin is not None:
-        known = {part: set(origin["parts"][part].values()) for part in ("train", "val")}
-        mine = {part: [e for e in dataset.entries if e.hash in hashes] for part, hashes in known.items()}
-        parts |= mine if all(mine.values()) else {}
-    return dataset.sequences(parts["train"]), dataset.sequences(parts["val"])
 
 
 def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: float) -> None:

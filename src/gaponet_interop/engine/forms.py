@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.split import split_entries
+from gaponet.data.store import opened
+from gaponet.eval.candidate import read_origin
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.identify import identify
@@ -18,6 +22,25 @@ from gaponet.sim.replay import replay
 CHECKED = 5  # motions that travel with an export
 LONGEST = 30.0  # s of each
 OWN = 10.0  # s of a motion of our own
+
+
+def recordings_of(folder: Path, data: str | None, robot: RobotSpec) -> tuple[list[Sequence], list[Sequence]] | None:
+    """Training and validation motions of a dataset, by default those that the robot was identified from."""
+    origin = read_origin(folder)
+    if data is None and origin is not None:
+        there = origin["dataset"]
+        data = there if "://" in there else str(folder / there)
+        data = data if "://" in there or Path(data).is_dir() else None  # it may have moved away
+    if data is None:
+        return None
+    dataset = opened(data)
+    dataset.require_robot(robot)
+    parts = split_entries(dataset, ())
+    if origin is not None:
+        known = {part: set(origin["parts"][part].values()) for part in ("train", "val")}
+        mine = {part: [e for e in dataset.entries if e.hash in hashes] for part, hashes in known.items()}
+        parts |= mine if all(mine.values()) else {}
+    return dataset.sequences(parts["train"]), dataset.sequences(parts["val"])
 
 
 def plain_form(

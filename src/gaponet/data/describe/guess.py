@@ -25,6 +25,7 @@ WORDS = {
 CLOCKS = ("time", "t", "timestamp", "stamp", "time_s", "time_ms", "time_us", "time_ns", "clock", "ts")
 NOT_POSITIONS = ("qvel", "tau", "temperature")
 ROWS = 4000  # that are looked at
+APART = 0.5  # of a command's own motion by which repetitions of it differ at the most
 
 
 def guess_logs(recordings: list[Recording], robot: RobotSpec, fmt: str, known: dict[str, Any]) -> str:
@@ -50,9 +51,10 @@ def guess_logs(recordings: list[Recording], robot: RobotSpec, fmt: str, known: d
         if need not in channels:
             lines.append(f'# {need} = "…"          ? none of the names looks like it')
     lines += _names(channels, joints, robot)
+    repeated = _repeated(recordings, channels.get("ctrl", ""))
     lines += ["", "# What the names of the recordings say, or a sheet (file, motion, payload, unit, rep):",
               f"# names here: {', '.join(r.name for r in recordings[:5])}{', …' if len(recordings) > 5 else ''}",
-              f"motion = {_text(_pattern([r.name for r in recordings]))}",
+              f"motion = {_text(_pattern([r.name for r in recordings], repeated))}",
               '# manifest = "sheet.csv"', '# unit = "…"', "# payload = 0.0        # kg",
               "# kp = …               # N·m/rad while recording; default: robot.toml's"]  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -186,12 +188,21 @@ def _positions(recording: Recording, channels: dict[str, str]) -> list[str]:
     return [f'position_unit = "{unit}"  # ? values up to {span:.3g}']
 
 
-def _pattern(names: list[str]) -> str:
+def _repeated(recordings: list[Recording], ctrl: str) -> bool:
+    """Whether the first two recordings were commanded the same: a number at their names' end counts repetitions."""
+    told = [_values(recording, ctrl) for recording in recordings[:2]]
+    if len(told) < 2 or any(x is None for x in told):
+        return True
+    a, b = (np.nan_to_num(x[: min(map(len, told))]) for x in told)  # type: ignore[arg-type, index]
+    return bool(np.abs(a - b).mean() <= APART * np.abs(a - a.mean(axis=0)).mean())
+
+
+def _pattern(names: list[str], repeated: bool) -> str:
     """What the names have in common: a payload with its unit, a trailing number."""
     pattern = "{motion}"
     if all(re.search(r"_\d+(?:[.p]\d+)?kg", n) for n in names):
         pattern += "_{payload:g}kg"
-    if all(re.search(r"_(?:rep|r|run|take)?\d+$", n) for n in names):
+    if repeated and all(re.search(r"_(?:rep|r|run|take)?\d+$", n) for n in names):
         word = re.search(r"_(rep|r|run|take)?\d+$", names[0])
         pattern += f"_{word[1] or '' if word else ''}" + "{rep}"
     return pattern

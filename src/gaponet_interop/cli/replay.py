@@ -1,0 +1,108 @@
+"""gaponet replay."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet import api
+from gaponet.cli.options import Folder, Json
+from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+from gaponet.eval.candidate import read_origin
+from gaponet.eval.tables import mrad
+from gaponet.files import whole
+from gaponet.parts import take
+from gaponet.robot import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from gaponet_interop.engine.rollout import Answer
+
+
+def replay(
+    logs: Folder,
+    robot: Path,
+    data: str | None = None,
+    described: Path | None = None,
+    payload_mass: float = 0.0,
+    out: Path | None = None,
+    figure: Path | None = None,
+    json: Json = False,
+) -> None:
+    """Will a policy transfer: what would this robot have done under the targets of a rollout, with a band.
+
+    The rollout is a log of your simulator, targets as commands, and states, in any format that gaponet import reads.
+    Its targets are played as they stand; a policy that looks at the state would have answered what differs. The band
+    holds nine tenths of every validation motion of the robot, and what its servos' standard errors do to this motion.
+
+    Args:
+        logs: File or folder of rollouts.
+        robot: Folder that gaponet identify wrote.
+        data: Dataset whose validation motions say how far the robot is known; default that of identification.
+        described: A logs.toml that says what the rollouts' columns mean.
+        payload_mass: kg in each hand.
+        out: .npz to write: target, rollout, robot, low and high (T, joints), rad, and dt, s, of each rollout.
+        figure: .png and .svg to draw, of the first rollout.
+    """
+    from gaponet_interop.engine.rollout import SHARE, answers, summary
+
+    screen, spec = Out(json), load_robot(robot)
+    draw = take("PROVIDES", "figure of a replay", "drawing") if figure else None
+    known, std = _known(screen, robot, data, spec)
+    with tempfile.TemporaryDirectory() as place:
+        report = api.import_logs(logs, spec, Path(place) / "data", "rollout", payload_mass, logs=described)
+        rollouts = report.dataset.sequences(report.entries)
+    found = answers(spec, rollouts, known, std)
+    joints = summary(found, spec.operated)
+    differ = sorted((j for j, s in joints.items() if s["inside"] < SHARE), key=lambda j: joints[j]["inside"])
+    _tell(screen, robot, len(found), joints, differ)
+    if out is not None:
+        _keep(out, found, spec)
+    if draw and figure:
+        draw(found, spec.operated, figure)
+    screen.result({"robot": spec.name, "rollouts": [a.name for a in found], "joints": joints, "differ": differ,
+                   "band": {"share": SHARE, "standard_errors": std is not None}})  # fmt: skip
+
+
+def _known(screen: Out, folder: Path, data: str | None, robot: RobotSpec) -> tuple[np.ndarray, Any]:
+    """How far the robot is from its recordings, (n,) rad, and the standard errors of its servos where they are kept."""
+    from gaponet_interop.engine.forms import recordings_of
+    from gaponet_interop.engine.rollout import validation_error
+
+    origin, recordings = read_origin(folder), recordings_of(folder, data, robot)
+    std = None if origin is None else origin.get("std")
+    if recordings is not None:
+        return validation_error(robot, recordings[1]), std
+    if origin is None:
+        raise UsageError(f"{folder}: nothing says how far it is from its robot; give --data, or what identify wrote")
+    screen.say("  its recordings are gone: twice their mean error is each joint's band; or --data", "note", "cyan")
+    return np.full(len(robot.operated), 2.0 * origin["val_mpjae"]["identified"]), std
+
+
+def _tell(screen: Out, robot: Path, count: int, joints: dict[str, dict[str, Any]], differ: list[str]) -> None:
+    columns = ["joint", "behind target", "robot behind", "apart", "in the first s", "band ±", "in band", "worst"]
+    screen.table(f"Simulator and robot under the targets of {count} rollout(s), mrad", columns, [
+        [j, mrad(s["rollout_behind"]), mrad(s["robot_behind"]), mrad(s["apart"]), mrad(s["apart_first_second"]),
+         mrad(s["band"]), f"{s['inside']:.0%}", f"{mrad(s['worst'])} at {s['worst_at']:.1f} s"]
+        for j, s in joints.items()
+    ])  # fmt: skip
+    if differ:
+        screen.say(
+            f"The robot would not do what the simulator did: {', '.join(differ)}. Train in the identified robot "
+            f"(gaponet export {robot} --to …), or compensate on the robot (gaponet run --compensate)"
+        )
+    else:
+        screen.say("The robot would do what the simulator did, as far as it is known: every joint stays in its band")
+
+
+def _keep(out: Path, found: list[Answer], robot: RobotSpec) -> None:
+    held: dict[str, Any] = {"names": np.array([a.name for a in found]), "joints": np.array(robot.operated)}
+    for k, a in enumerate(found):
+        series = {"target": a.target, "rollout": a.rollout, "robot": a.robot}
+        series |= {"low": a.robot - a.half, "high": a.robot + a.half, "dt": np.array(a.dt)}
+        held |= {f"{name}_{k}": values for name, values in series.items()}
+    with whole(out) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **held)

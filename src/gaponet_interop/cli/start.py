@@ -1,0 +1,262 @@
+"""gaponet start: from a model file and a folder of logs to a report, by single commands, which it prints as it goes."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shlex
+import signal
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from gaponet import api
+from gaponet.cli.logs import show_diagnosis
+from gaponet.cli.main import commands, main
+from gaponet.cli.options import Flag, Folder, Json
+from gaponet.cli.out import Out
+from gaponet.errors import GAPONetError, UsageError
+from gaponet.files import write_text, writing
+from gaponet.robot import RobotSpec, as_option, available, load_robot
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from gaponet.data.log import Log
+    from gaponet_interop.setup.new import Wanted
+
+RAN = "commands.sh"  # what ran to its end, a line each
+NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)  # lines of a logs.toml by which joints are told apart
+NEAR = 0.01  # of a rate in whole Hz, from which a clock's rounding is told
+
+
+@dataclass(frozen=True)
+class Understood:
+    """What a model and a folder of logs say of themselves.
+
+    Attributes:
+        robot: Of the model; of a file with its default joints.
+        packaged: What to write after --robot where nothing is to be made; "" for a model file.
+        log: The first recording.
+        recordings: How many there are.
+        described: A logs.toml that was guessed; "" where the logs explain themselves.
+    """
+
+    robot: RobotSpec
+    packaged: str
+    log: Log
+    recordings: int
+    described: str
+
+    @property
+    def rate(self) -> float:
+        """Of the commands, Hz; in whole ones where it is near."""
+        rate = 1 / float(np.median(np.diff(self.log.channels["ctrl"].time)))
+        return float(round(rate)) if abs(rate - round(rate)) < NEAR * rate else rate
+
+
+def start(
+    model: Folder,
+    logs: Folder,
+    out: Path = Path("started"),
+    unit_id: str = "lab",
+    payload_mass: float = 0.0,
+    joints: tuple[str, ...] = (),
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
+    effort_limit: tuple[str, ...] = (),
+    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "json"] = "mjcf",
+    budget: str | None = None,
+    dry_run: Flag = False,
+    anyway: Flag = False,
+    json: Json = False,
+) -> None:
+    """From a model file and a folder of logs to an identified robot, its export and a report; prints every command.
+
+    What ran stands in OUT/commands.sh. The same command again goes on where it was interrupted, or stopped to ask.
+
+    Args:
+        model: MJCF or URDF file; or a robot folder, or a packaged robot's name.
+        logs: Folder of logs, in any format that gaponet import reads.
+        out: Folder for all that is made.
+        unit_id: Which of its kind.
+        payload_mass: kg in each hand while recording.
+        joints: Of the model, those that were recorded, by name or pattern; default those that the logs name.
+        kp: Of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's actuators.
+        kd: Likewise, N·m·s/rad.
+        effort_limit: Likewise, N·m.
+        to: Engine to export to.
+        budget: Time that identification may take, such as 4m; default as long as it takes.
+        dry_run: Say what was understood and which commands would run, and write nothing.
+        anyway: Go on where the doctor found errors in the logs.
+    """
+    from gaponet_interop.setup.new import Wanted
+
+    screen, told = Out(json), out / "logs.toml"
+    wanted = Wanted(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
+    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
+        found = understand(model, logs, told, wanted, keep=not dry_run)
+        _tell(screen, found, model, logs, unit_id, payload_mass)
+        todo = plan(found, model, logs, out, wanted, ["--unit-id", unit_id, "--payload-mass", f"{payload_mass:g}"])
+        for words in todo:
+            words += ["--to", to] if words[0] == "export" else []
+            words += ["--budget", budget] if words[0] == "identify" and budget else []
+        lines = [shlex.join(["gaponet", *words]) for words in todo]
+        if dry_run:
+            for line in lines:
+                screen.say(line, "  ")
+        else:
+            with writing(out, "started"):
+                if found.described:
+                    write_text(told, found.described)
+                _run(screen, todo, lines, out, anyway)
+            screen.say(f"what ran, command by command: {out / RAN}")
+    screen.result({
+        "robot": found.robot.name, "joints": found.log.joint_names, "recordings": found.recordings,
+        "rate_hz": found.rate, "logs_toml": found.described, "commands": lines, "ran": not dry_run,
+    })  # fmt: skip
+
+
+def understand(model: Path, logs: Path, told: Path, wanted: Wanted, keep: bool = True) -> Understood:
+    """Compile the model, and read the first recording as it lies there, or by a logs.toml that is guessed from it.
+
+    Args:
+        model: File, robot folder, or name of a packaged robot.
+        logs: Folder.
+        told: Where a guess goes, is corrected by the user, and is read from the next time.
+        wanted: What the user says about a robot that is made from a file.
+        keep: Write a guess there that these logs cannot be read by, or that a person has to look at.
+
+    Raises:
+        RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
+    """
+    from gaponet.data.formats import find_logs, read_logs
+    from gaponet_interop.setup.new import new_robot
+
+    with tempfile.TemporaryDirectory() as place:
+        if (model / "robot.toml").is_file():
+            robot, packaged = load_robot(model), as_option(model)
+        elif not model.exists() and str(model) in available():
+            robot = load_robot(packaged := str(model))
+        else:
+            robot, packaged = new_robot(model, Path(place) / "robot", wanted).robot, ""
+
+        def by(file: Path | None, described: str = "") -> Understood:
+            log = next(iter(read_logs(logs, robot, logs=file)), None)
+            if log is None:
+                raise UsageError(f"{logs}: holds no recording")
+            return Understood(robot, packaged, log[1], len(find_logs(logs)), described)
+
+        if told.is_file():
+            return by(told)
+        try:
+            return by(None)
+        except GAPONetError as error:
+            return _guessed(logs, robot, told, keep, by, error)
+
+
+def _guessed(
+    logs: Path,
+    robot: RobotSpec,
+    told: Path,
+    keep: bool,
+    by: Callable[[Path, str], Understood],
+    error: GAPONetError,
+) -> Understood:
+    """The same by a logs.toml that is guessed; a person has to look at one that says which joint is which."""
+    from gaponet.data.describe.guess import guess_logs
+    from gaponet.data.formats import look
+
+    try:
+        kind, known, recordings = look(logs)
+    except GAPONetError:
+        raise error from None
+    text = guess_logs(recordings, robot, kind, dict(known))
+    why = "which joint is which is a guess" if NAMED.search(text) else ""
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "logs.toml"
+        write_text(file, text)
+        try:
+            found = by(file, text)
+            if not why or not keep:
+                return found
+        except GAPONetError as again:
+            why = str(again)
+    if not keep:
+        raise UsageError(f"{why}. As far as these logs explain themselves:\n{text}")
+    told.parent.mkdir(parents=True, exist_ok=True)
+    write_text(told, text)
+    raise UsageError(
+        f"{why}: {told} says what these logs show of themselves; look it over, and give the same command again"
+    )
+
+
+def plan(found: Understood, model: Path, logs: Path, out: Path, wanted: Wanted, stated: list[str]) -> list[list[str]]:
+    """The commands of the whole way, as words after `gaponet`; `stated` is what import is told of the recordings."""
+    data, known, todo = str(out / "data"), out / "identified", list[list[str]]()
+    if not found.packaged:
+        given = {name: getattr(wanted, name) for name in ("joints", "kp", "kd", "effort_limit")}
+        if not given["joints"] and len(found.log.joint_names) < len(found.robot.joint_names):
+            given["joints"] = found.log.joint_names
+        words = [x for name, said in given.items() if said for x in (f"--{name.replace('_', '-')}", *said)]
+        todo.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", f"{found.rate:g}", *words])
+    robot, told = found.packaged or as_option(out / "robot"), out / "logs.toml"
+    described = ["--logs", str(told)] if found.described or told.is_file() else []
+    todo += [
+        ["import", str(logs), "--robot", robot, *stated, *described, "--out", data],
+        ["doctor", data],
+        ["gap", data],
+        ["identify", data, "--out", str(known)],
+        ["gap", data, "--robot", as_option(known)],
+        ["export", str(known)],
+        ["report", str(known)],
+    ]
+    return [words for words in todo if words[0] in commands()]
+
+
+def _tell(screen: Out, found: Understood, model: Path, logs: Path, unit_id: str, payload_mass: float) -> None:
+    log, robot = found.log, found.robot
+    time, still = log.channels["ctrl"].time, [j for j in robot.joint_names if j not in log.joint_names]
+    first = f"{time[-1] - time[0]:.1f} s at {found.rate:g} Hz, {', '.join(log.channels)}"
+    rows = {
+        "robot": f"{robot.name}, from {found.packaged or model}; kp {', '.join(f'{x:g}' for x in robot.kp)} N·m/rad",
+        "logs": f"{found.recordings} recording(s) below {logs}; the first: {first}",
+        "joints recorded": ", ".join(log.joint_names),
+        "frozen" if not found.packaged else "taken to stand at home": ", ".join(still),
+        "taken as given": f"unit {unit_id}, {payload_mass:g} kg in each hand (--unit-id, --payload-mass)",
+    }
+    for what, said in rows.items():
+        if said:
+            screen.say(f": {said}", what)
+    for line in found.described.splitlines():
+        screen.say(f"  {line}", "logs.toml, guessed" if line.startswith("# Lines") else "", "yellow")
+
+
+def _run(screen: Out, todo: list[list[str]], lines: list[str], out: Path, anyway: bool) -> None:
+    """Run what has not run to its end yet."""
+    ran = out / RAN
+    done = ran.read_text(encoding="utf-8").splitlines() if ran.is_file() else []
+    for words, line in zip(todo, lines, strict=True):
+        if line in done:
+            screen.say(line, "done before: ", "green")
+            continue
+        screen.say(line, "$ ", "bold cyan")
+        if words[0] == "doctor":
+            diagnosis = api.doctor(words[1])
+            show_diagnosis(screen, diagnosis)
+            if diagnosis.count("error") and not anyway:
+                raise UsageError(
+                    "stopped: what the doctor calls an error is one of the logs, and no fit mends it. "
+                    f"Mend the logs or {out / 'logs.toml'} (gaponet doctor {words[1]} --fix proposes lines), delete "
+                    f"{words[1]} and {ran}, and start again; or --anyway"
+                )
+        elif code := main(words):
+            if code == 128 + signal.SIGINT:
+                raise KeyboardInterrupt
+            raise UsageError(f"stopped at: {line}; what to do is said above; then give the same start command again")
+        done.append(line)
+        write_text(ran, "\n".join(done) + "\n")

@@ -1,0 +1,98 @@
+"""gaponet start: a model file and a folder of logs, as a lab has them, to a report by commands that it prints."""
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import XML, commands, record, write_arm
+
+from gaponet.cli.main import main
+from gaponet_interop.cli import start
+
+SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+ORDER = ["robot", "import", "doctor", "gap", "identify", "gap", "export", "report"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A model file and csv logs of an arm with weaker, later servos; columns and names as no format has them."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>"))
+    robot = write_arm(tmp_path / "nominal")
+    Path("logs").mkdir()
+    for seed in range(5):
+        s = record(robot, commands(300, seed), f"swing_{seed}", kp=0.7, delay=2)
+        table = np.concatenate([1e3 * s.dt * np.arange(300)[:, None], s.ctrl, s.qpos], axis=1)
+        head = "time_ms,shoulder_des,elbow_des,shoulder_meas,elbow_meas"
+        np.savetxt(f"logs/swing_{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f")
+    return tmp_path
+
+
+def test_a_dry_run_says_what_was_understood_and_writes_nothing(place, capsys):
+    before = sorted(place.rglob("*"))
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["joints"], said["recordings"], said["rate_hz"]) == (["shoulder", "elbow"], 5, 50.0)
+    assert 'time_unit = "ms"' in said["logs_toml"]
+    assert 'motion = "{motion}"' in said["logs_toml"]  # other commands: a number at a name's end counts no repetitions
+    assert [shlex.split(line)[1] for line in said["commands"]] == ORDER
+    assert sorted(place.rglob("*")) == before
+
+
+def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, monkeypatch, capsys):
+    ran = []
+
+    def stopping(words):
+        ran.append(words[0])
+        if words[0] != "identify":
+            return main(words)
+        if ran.count("identify") == 1:
+            return 2
+        shutil.copytree("started/robot", "started/identified")
+        return 0
+
+    monkeypatch.setattr(start, "main", stopping)
+    monkeypatch.setattr(start, "commands", lambda: dict.fromkeys(ORDER[:5]))
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "stopped at: gaponet identify started/data" in capsys.readouterr().err
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran == ["robot", "import", "gap", "identify", "identify", "gap"]  # the doctor is asked directly
+    lines = Path("started/commands.sh").read_text().splitlines()
+    assert [shlex.split(line)[1] for line in lines] == ["robot", "import", "doctor", "gap", "identify", "gap"]
+
+
+@pytest.mark.parametrize("name", ["a1", "x"])
+def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, capsys, name):
+    for file in Path("logs").iterdir():
+        text = file.read_text()
+        file.write_text(text.replace("shoulder", name) if name == "a1" else text.replace("meas", name))
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "started/logs.toml says what these logs show of themselves" in capsys.readouterr().err
+    told = Path("started/logs.toml")
+    text = told.read_text()
+    assert ('"a1" = "shoulder"' if name == "a1" else '# qpos = "…"') in text
+    told.write_text(text if name == "a1" else re.sub("# qpos.*", 'qpos = "{joint}_x"', text))
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0, text
+
+
+def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
+    for file in Path("logs").iterdir():  # the shoulder's command with the other sign
+        head, *rows = file.read_text().splitlines()
+        values = np.array([[float(x) for x in row.split(",")] for row in rows])
+        values[:, 1] *= -1
+        file.write_text("\n".join([head, *(",".join(f"{x:.6f}" for x in row) for row in values)]) + "\n")
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "no fit mends it" in capsys.readouterr().err
+    assert not Path("started/identified").exists()
+
+
+def test_the_whole_way_ends_in_a_robot_that_moves_like_the_logs(place, capsys):
+    assert main(["start", "arm.xml", "logs", "--to", "json", "--budget", "4s"]) == 0
+    facts = json.loads(Path("started/identified/json/facts.json").read_text())
+    assert facts["joints"]["elbow"]["kp"] == pytest.approx(14.0, rel=0.1)
+    assert facts["joints"]["elbow"]["delay"] == pytest.approx(0.04, abs=0.008)
+    assert Path("started/identified/report.html").is_file()
