@@ -12,9 +12,10 @@ from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.robot import available, load_robot
 from gaponet.sim.dynamics import gravity_of
-from gaponet_lab.real.bench import _ask, load_method
+from gaponet_lab.real.adversaries import ADVERSARIES
+from gaponet_lab.real.bench import Bench, load_method
 from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
-from gaponet_lab.real.questions import floor, permuted, questions
+from gaponet_lab.real.questions import floor, questions
 from gaponet_lab.real.rivals import METHODS, hanging
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmark.md"
@@ -53,20 +54,36 @@ def test_a_unit_left_out_is_learned_from_by_calibration_alone_and_never_asked_wh
         list(questions("of life", played, arm, None))
 
 
-def test_repetitions_are_no_motions_and_set_the_floor(arm, played):
+def test_repetitions_are_no_motions_set_the_floor_and_are_measured_once(arm, played, tmp_path):
     (question,) = questions("new motions", played, arm, None)
     assert floor(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
+    methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
     card = next(c for c in read_cards().set if c.name == "so101")
-    rows = _ask(
-        card, "new motions", [question], {k: METHODS[k] for k in ("nominal", "delay_offset")}, lambda text: None
-    )
-    told = [row.as_dict() for row in rows]
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=lambda text: None)
+    told = [row.as_dict() for row in bench.ask(card, "new motions", [question])]
     assert [(r["motions"], r["recordings"]) for r in told] == [(1, 6), (1, 6)]
     assert told[0]["standard_error"] is None
     assert told[1]["of_nominal"] < 1.0
-    mixed = permuted(question, 0)
-    assert sorted(s.meta.unit_id for s in mixed.train) == sorted(s.meta.unit_id for s in question.train)
-    assert [s.meta.unit_id for s in mixed.train] != [s.meta.unit_id for s in question.train]
+    stopped = Bench(
+        read_cards(), tmp_path, tmp_path / "work", dict.fromkeys(methods, ("", None)), say=lambda text: None
+    )
+    assert [row.as_dict()["mrad"] for row in stopped.ask(card, "new motions", [question])] == [r["mrad"] for r in told]
+
+
+def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, played):
+    (question,) = questions("new motions", played, arm, None)
+    changed = {name: change(question) for name, change in ADVERSARIES.items()}
+    mixed = changed["labels"]
+    assert sorted(s.meta.unit_id for s in mixed.known) == sorted(s.meta.unit_id for s in question.known)
+    assert [s.meta.unit_id for s in mixed.known] != [s.meta.unit_id for s in question.known]
+    was, later = question.test[0], changed["all_late"].test[0]
+    rows = len(was) - len(later)
+    assert rows * was.dt == pytest.approx(0.04)
+    assert (later.ctrl == was.ctrl[rows:]).all()
+    assert (later.qpos == was.qpos[:-rows]).all()
+    assert sum(len(s) < len(was) for s in changed["late"].known) == -(-len(question.known) // 10)
+    assert (changed["joints"].train[0].qpos == question.train[0].qpos[:, ::-1]).all()
+    assert all(q.test is question.test for name, q in changed.items() if name != "all_late")
 
 
 def test_the_method_on_the_page_is_one(arm, played, tmp_path):

@@ -16,6 +16,7 @@ from gaponet.model.loop import DeltaLoop
 from gaponet.model.observation import frames_before
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.free_runs import IMMOVABLE
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
 
@@ -69,6 +70,8 @@ class DeltaEnv:
         self._load(sequences)
         conditions = [self.conditions[g] for g in self.group]
         sim = BatchSim(robot, conditions, nthread, self.locked)
+        if self.unknown.any():  # stands where it was said to, as in identification
+            sim.batch.expand("dof_armature")[:] += IMMOVABLE * self.unknown[self.group]
         self._place(sim, device)
         self.loop = DeltaLoop(config, sim.range[self.op], num_envs, of=self.now)
         shortest = min(c[2] for c in self.conditions)
@@ -100,9 +103,11 @@ class DeltaEnv:
             )
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
-        keys = [Condition.of(s, self.robot) for s in sequences]
-        self.conditions = list(dict.fromkeys(keys))
-        seq_group = np.array([self.conditions.index(k) for k in keys])
+        keys = [(Condition.of(s, self.robot), s.meta.unrecorded) for s in sequences]
+        groups = list(dict.fromkeys(keys))
+        seq_group = np.array([groups.index(k) for k in keys])
+        self.conditions = [condition for condition, _ in groups]
+        self.unknown = np.array([[j in unrecorded for j in free] for _, unrecorded in groups])
         frames = np.bincount(seq_group, length)
         if self.num_envs < len(frames):
             raise UsageError(
@@ -114,13 +119,15 @@ class DeltaEnv:
         self.weights = [length[m] / length[m].sum() for m in self.members]
         self.payload = np.array([c[0] for c in self.conditions], np.float32)[self.group]
         rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
+        unsaid = np.where(self.unknown[self.group][:, self.op], np.nan, 0.0)  # (num_envs, n): counts nowhere
+        self.unsaid = unsaid.astype(np.float32)
         self.condition_features = np.stack([self.payload / self.config.payload_max, rate / 100], axis=1)
 
     def _place(self, sim: BatchSim, device: str) -> None:
         """Put the simulations, and all that a step looks up or writes, on the device; in numpy nothing is copied."""
         self.sim: Any = _placed(sim, device)
         place, num = self.sim.array, self.num_envs
-        for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features"):
+        for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features", "unsaid"):
             setattr(self, name, place(getattr(self, name)))
         self.at, self.ahead = place(self.op), place(AHEAD)
         self.low, self.high = place(sim.range[self.op].T)
@@ -200,6 +207,7 @@ class DeltaEnv:
     def _reward(self) -> Any:
         c, n = self.reward_config, self.num_actions
         cost = (abs(self.sim.qpos[:, self.at] - self.now[:, :n]) / c.position).clip(max=c.cap)
+        cost = library(cost).nan_to_num(cost + self.unsaid)
         self.reward_sum = self.reward_sum - cost.mean()
         self.reward_count += 1
         return -single(cost)

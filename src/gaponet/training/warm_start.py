@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.arrays import Array, copy_of, host, indices
+from gaponet.arrays import Array, copy_of, host, indices, library
 from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
 from gaponet.training import ranks
@@ -79,11 +79,11 @@ class WarmStart:
         hold = env.config.delta_hold
         for _ in range(0, self.config.steps, hold):
             x = env.get_observations()["actor"]
-            y = self.labels[env.row]
+            y = self.labels[env.row] + env.unsaid
             xs.append(x)
             ys.append(torch.as_tensor(y, device=x.device))
             if follow_labels:
-                delta = y
+                delta = library(y).nan_to_num(y)
             else:
                 with torch.inference_mode():
                     delta = net(x)
@@ -131,7 +131,7 @@ class WarmStart:
             for group in self.optimiser.param_groups:
                 group["lr"] = config.learning_rate * 0.1**progress
             batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
-            loss = ((net(x[batch]) - y[batch]) ** 2).mean()
+            loss = (torch.nan_to_num(net(x[batch]) - y[batch]) ** 2).mean()
             self.optimiser.zero_grad()
             loss.backward()
             ranks.average(*(p.grad for p in self.trained if p.grad is not None))

@@ -27,7 +27,8 @@ def bench(
     out: Path = Path("bench_real"),
     sets: tuple[str, ...] = (),
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    shuffle_labels: int | None = None,
+    networks: int = 0,
+    adversary: Literal["", "labels", "late", "all_late", "joints"] = "",
     json: Json = False,
 ) -> None:
     """Measure speed; or, with real, how near methods come to every public recording of real robots that is present.
@@ -44,8 +45,9 @@ def bench(
         out: Folder for datasets, table and figure, with real.
         sets: Only these data sets, with real.
         method: A method of your own, FILE.py:FUNCTION, with real; may be repeated.
-        shuffle_labels: With real: deal out payloads and units of training recordings anew, by this seed. Gains that
-            rest on them vanish.
+        networks: With real: train networks too, for so many control steps each; 0 for none.
+        adversary: With real, what is done to the recordings that are learned from: labels dealt out anew; late, 40 ms
+            of delay added to one in ten, or to all of them and to those asked (all_late); joints in another order.
         rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
     """
     screen = Out(json)
@@ -56,19 +58,31 @@ def bench(
     elif what == "sim":
         _sim(robot, screen, num_envs or 512, rounds or 15)
     elif what == "real":
-        _real(data, out, sets, method, shuffle_labels, screen)
+        _real(data, out, sets, method, networks, adversary, screen)
     else:
         _train(robot, model, screen, num_envs or 1024, rounds or 3)
 
 
 def _real(
-    data: Path | None, out: Path, sets: tuple[str, ...], method: tuple[str, ...], shuffle: int | None, screen: Out
-) -> None:
-    from gaponet_lab.real.bench import bench
+    data: Path | None,
+    out: Path,
+    sets: tuple[str, ...],
+    method: tuple[str, ...],
+    steps: int,
+    adversary: str,
+    screen: Out,
+) -> None:  # fmt: skip
+    from gaponet_lab.real.bench import Bench, load_method
     from gaponet_lab.real.cards import data_folder, read_cards
     from gaponet_lab.real.page import COLUMNS, table, write_page
+    from gaponet_lab.real.rivals import METHODS
 
-    found = bench(read_cards(), data_folder(data), out, sets, method, shuffle, screen.say)
+    methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
+    if steps:
+        from gaponet_lab.real.networks import networks
+
+        methods |= networks(steps, out / "trainings")
+    found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets)
     screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
     for name, agreement in found["labels"].items():
         screen.say(f"{name}: {agreement}", "labels")

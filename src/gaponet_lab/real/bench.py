@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
+import json
+import re
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +16,14 @@ import numpy as np
 
 from gaponet.data.json_file import finite
 from gaponet.errors import GAPONetError, UsageError
+from gaponet.files import write_text
 from gaponet.metrics import standard_error
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import save_robot
+from gaponet_lab.real.adversaries import ADVERSARIES, Adversary
 from gaponet_lab.real.cards import Card, Cards, prepare
-from gaponet_lab.real.questions import Question, floor, permuted, questions, recorded
-from gaponet_lab.real.rivals import METHODS, Answer, Method, _identify, can_hang
+from gaponet_lab.real.questions import Question, floor, questions, recorded
+from gaponet_lab.real.rivals import Method, can_hang, identified
 
 Said = Callable[[str], None]
 
@@ -25,7 +32,7 @@ Said = Callable[[str], None]
 class Row:
     """What a method leaves of a question: mean |error| of each independent motion, (motions,) rad.
 
-    `nominal` is the same of the nominal simulator, in the same order.
+    `nominal` is the same of the nominal simulator, in the same order; `seconds` is what fitting and asking took.
     """
 
     set: str
@@ -37,6 +44,7 @@ class Row:
     floor: float
     splits: tuple[str, ...]
     by_payload: dict[str, float]
+    seconds: float
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: mrad, with the standard error over motions, of differences paired."""
@@ -46,50 +54,146 @@ class Row:
             "standard_error": 1e3 * standard_error(self.error), "of_nominal": self.error.mean() / self.nominal.mean(),
             "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(self.error),
             "recordings": self.recordings, "floor_mrad": 1e3 * self.floor, "splits": self.splits,
-            "by_payload_mrad": self.by_payload,
+            "by_payload_mrad": self.by_payload, "seconds": round(self.seconds, 1),
         })  # fmt: skip
 
 
-def bench(
-    cards: Cards, data: Path, work: Path, only: tuple[str, ...] = (), also: tuple[str, ...] = (),
-    shuffle: int | None = None, say: Said = print,
-) -> dict[str, Any]:  # fmt: skip
-    """Import, split, fit and measure.
+@dataclass
+class Bench:
+    """One measuring: what is done once lies below `work` and is not done again.
 
-    Args:
+    Attributes:
         cards: What there may be; folders that are not there are left out.
         data: Folder of the public recordings.
-        work: Folder for datasets.
-        only: Names of sets; default all.
-        also: Methods of others, FILE.py:FUNCTION each.
-        shuffle: Seed by which payload and unit of training recordings are dealt out anew: an adversary.
+        work: Folder for datasets, trainings and answers.
+        methods: Name → title and method.
+        adversary: Name of what was done to the recordings, or "".
         say: Told what was done.
-
-    Returns:
-        rows (Row.as_dict), cards, labels (set → agreement), left_out (folder → why).
     """
-    methods = METHODS | {name: (name, method) for name, method in map(load_method, also)}
-    unknown = set(only) - {c.name for c in cards.set}
-    if unknown:
-        raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(c.name for c in cards.set)}")
-    here = [c for c in cards.set if (data / c.folder).exists() and (not only or c.name in only)]
-    left_out = {f.folder: f.why for f in cards.left_out if (data / f.folder).exists()}
-    left_out |= {c.folder: "not there" for c in cards.set if not (data / c.folder).exists()}
-    identified: dict[str, RobotSpec] = {}
-    rows: list[Row] = []
-    labels: dict[str, Any] = {}
-    for card in here:
-        dataset, robot, told = prepare(card, data, work)
-        say(f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min")
-        if told:
-            labels[card.name] = told.agreement
-        before = _before(card, cards, data, work, identified)
-        for name in card.questions:
-            folds = list(questions(name, dataset, robot, before))
-            folds = [permuted(q, shuffle) for q in folds] if shuffle is not None else folds
-            rows += _ask(card, name, folds, methods, say)
-    return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in here}, "labels": labels,
-            "left_out": left_out}  # fmt: skip
+
+    cards: Cards
+    data: Path
+    work: Path
+    methods: dict[str, tuple[str, Method]]
+    adversary: str = ""
+    say: Said = print
+
+    def run(self, only: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Import, split, fit and measure some sets, by default all.
+
+        Returns:
+            rows (Row.as_dict), cards, labels (set → agreement), left_out (folder → why), seconds (set →).
+        """
+        unknown = set(only) - {c.name for c in self.cards.set}
+        if unknown:
+            raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}")
+        here = [c for c in self.cards.set if self._is_there(c) and (not only or c.name in only)]
+        left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
+        left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_there(c)}
+        rows: list[Row] = []
+        labels: dict[str, Any] = {}
+        seconds: dict[str, float] = {}
+        for card in here:
+            began = time.monotonic()
+            dataset, robot, told = prepare(card, self.data, self.work)
+            seconds[card.name] = time.monotonic() - began
+            self.say(
+                f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min, from file to dataset in "
+                f"{seconds[card.name]:.0f} s"
+            )
+            if told:
+                labels[card.name] = told.agreement
+            for name in card.questions:
+                folds = list(questions(name, dataset, robot, self.before(card)))
+                rows += self.ask(card, name, folds)
+            seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)
+        return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in here}, "labels": labels,
+                "left_out": left_out, "adversary": self.adversary,
+                "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
+
+    def _is_there(self, card: Card) -> bool:
+        return (self.data / card.folder).exists()
+
+    def before(self, card: Card) -> Callable[[], RobotSpec] | None:
+        """What makes the robot as it was identified on the data set that a card names; None where that is not there."""
+        other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_there(c)), None)
+        return functools.partial(self._elsewhere, other.name) if other else None
+
+    @functools.cache  # noqa: B019
+    def _elsewhere(self, name: str) -> RobotSpec:
+        kept = self.work / "identified" / name
+        if not (kept / "robot.toml").is_file():
+            card = next(c for c in self.cards.set if c.name == name)
+            dataset, robot, _ = prepare(card, self.data, self.work)
+            save_robot(identified(next(questions(card.questions[0], dataset, robot, None))).robot, kept)
+        return load_robot(kept)
+
+    __hash__ = object.__hash__
+
+    def ask(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
+        """Every method on every fold; those that have nothing to go on are left out."""
+        rows: list[Row] = []
+        noise = float(np.mean([f for q in folds if (f := floor(q)) == f] or [np.nan]))
+        splits = tuple(q.split for q in folds)
+        change: Adversary = ADVERSARIES.get(self.adversary, lambda q: q)
+        folds = [change(q) for q in folds]
+        for method, (title, answer) in self.methods.items():
+            if _nothing_to_go_on(method, folds):
+                continue
+            found: list[tuple[list[float], float]] = []
+            try:
+                for q in folds:
+                    found.append(self._once(card, q, method, answer))
+            except GAPONetError as error:
+                self.say(f"{card.name}, {name}, {title}: {error}")
+                continue
+            by_motion: dict[str, list[float]] = {}
+            by_payload: dict[str, list[float]] = {}
+            for q, (errors, _) in zip(folds, found, strict=True):
+                for s, motion, e in zip(q.test, q.motion, errors, strict=True):
+                    by_motion.setdefault(motion, []).append(e)
+                    by_payload.setdefault(f"{s.meta.payload_mass:g}", []).append(1e3 * e)
+            left = np.array([np.mean(v) for v in by_motion.values()])
+            first = rows[0].error if rows else left
+            masses = {k: float(np.mean(v)) for k, v in sorted(by_payload.items())}
+            count, took = sum(len(errors) for errors, _ in found), sum(s for _, s in found)
+            rows.append(Row(card.name, name, title, left, first, count, noise, splits, masses, took))
+            self.say(f"{card.name}, {name}: {title} leaves {1e3 * left.mean():.2f} of {1e3 * first.mean():.2f} mrad")
+        return rows
+
+    def _once(self, card: Card, question: Question, method: str, answer: Method) -> tuple[list[float], float]:
+        """Mean |error| of each test recording, rad, over the joints that it holds, and s; kept below `work`."""
+        words = (card.name, question.name, question.split, method, self.adversary)
+        file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words).strip()) + ".json")
+        if file.is_file():
+            kept = json.loads(file.read_text(encoding="utf-8"))
+            return kept["errors"], kept["seconds"]
+        began = time.monotonic()
+        answered = answer(question)
+        runs = answered.positions(question.test)
+        errors = [
+            float(np.abs((q - s.qpos)[1:, recorded(s, question.robot)]).mean())
+            for s, q in zip(question.test, runs, strict=True)
+        ]
+        seconds = time.monotonic() - began
+        file.parent.mkdir(parents=True, exist_ok=True)
+        found = answered.robot  # for whoever wants to know what was found
+        servos = {
+            j: {f: float(getattr(found, f)[found.joint_names.index(j)]) for f in ("kp", "delay", "offset")}
+            for j in found.operated
+        }
+        mounts = [m.pos for m in found.payload_mounts]
+        write_text(file, json.dumps({"errors": errors, "seconds": seconds, "servos": servos, "mounts": mounts}))
+        return errors, seconds
+
+
+def _nothing_to_go_on(method: str, folds: list[Question]) -> bool:
+    first = folds[0]
+    if method == "constant":
+        return len({(s.meta.payload_mass, s.meta.unit_id) for s in first.train}) < 2
+    if method == "plain":
+        return not all(can_hang(q) for q in folds)
+    return (method == "elsewhere" and first.before is None) or (method == "calibrated" and not first.few)
 
 
 def load_method(where: str) -> tuple[str, Method]:
@@ -103,57 +207,3 @@ def load_method(where: str) -> tuple[str, Method]:
     if not callable(getattr(module, name, None)):
         raise UsageError(f"--method {where}: {file} has no function {name}")
     return name, getattr(module, name)
-
-
-def _before(card: Card, cards: Cards, data: Path, work: Path, known: dict[str, RobotSpec]) -> RobotSpec | None:
-    """The robot as it was identified on the data set that a card names; all of that set is another session."""
-    if not card.elsewhere:
-        return None
-    if card.elsewhere not in known:
-        other = next((c for c in cards.set if c.name == card.elsewhere), None)
-        if other is None or not (data / other.folder).exists():
-            return None
-        dataset, robot, _ = prepare(other, data, work)
-        first = next(questions(other.questions[0], dataset, robot, None))
-        known[card.elsewhere] = _identify(first.train, first.val, robot)
-    return known[card.elsewhere]
-
-
-def _ask(card: Card, name: str, folds: list[Question], methods: dict[str, tuple[str, Method]], say: Said) -> list[Row]:
-    """Every method on every fold; those that have nothing to go on are left out."""
-    rows: list[Row] = []
-    noise = float(np.mean([f for q in folds if (f := floor(q)) == f] or [np.nan]))
-    splits = tuple(q.split for q in folds)
-    for method, (title, answer) in methods.items():
-        if (method == "elsewhere" and folds[0].before is None) or (method == "calibrated" and not folds[0].few):
-            continue
-        if method == "identified_hanging" and not all(can_hang(q) for q in folds):
-            continue
-        if method == "constant" and len({(s.meta.payload_mass, s.meta.unit_id) for s in folds[0].train}) < 2:
-            continue
-        try:
-            found = [_errors(q, answer(q)) for q in folds]
-        except GAPONetError as error:
-            say(f"{card.name}, {name}, {title}: {error}")
-            continue
-        by_motion: dict[str, list[float]] = {}
-        by_payload: dict[str, list[float]] = {}
-        for q, errors in zip(folds, found, strict=True):
-            for s, motion, e in zip(q.test, q.motion, errors, strict=True):
-                by_motion.setdefault(motion, []).append(e)
-                by_payload.setdefault(f"{s.meta.payload_mass:g}", []).append(1e3 * e)
-        left = np.array([np.mean(v) for v in by_motion.values()])
-        first = rows[0].error if rows else left
-        masses = {k: float(np.mean(v)) for k, v in sorted(by_payload.items())}
-        rows.append(Row(card.name, name, title, left, first, sum(map(len, found)), noise, splits, masses))
-        say(f"{card.name}, {name}: {title} leaves {1e3 * left.mean():.2f} of {1e3 * first.mean():.2f} mrad")
-    return rows
-
-
-def _errors(question: Question, answer: Answer) -> list[float]:
-    """Mean |error| of each test recording, over the joints that it holds, rad."""
-    runs = answer.positions(question.test)
-    return [
-        float(np.abs((q - s.qpos)[1:, recorded(s, question.robot)]).mean())
-        for s, q in zip(question.test, runs, strict=True)
-    ]

@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from gaponet.files import write_text
-from gaponet.spread import Spread
-from gaponet_lab.plot.charts import dots
-from gaponet_lab.plot.style import save
+from gaponet.methods import colour, shade
+from gaponet_lab.plot.style import figure, legend, save, styled
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+LOOKS = {  # method's title → colour, marker
+    "nominal simulator": (colour("nominal"), "|"),
+    "constant offset by joint, payload, unit": (colour("offset"), "x"),
+    "delay + offset": (colour("delay_offset"), "s"),
+    "identified elsewhere": (shade(colour("identified"), 0.5), "o"),
+    "identification": (colour("identified"), "o"),
+    "identified elsewhere, calibrated": (colour("calibrated"), "D"),
+    "shared MLP": (colour("shared_mlp"), "^"),
+    "GAPONet": (colour("gaponet"), "^"),
+    "identification + GAPONet": (colour("identified+gaponet"), "v"),
+}
+WIDEST = 1.6  # of nominal: what lies beyond stands at the edge
 COLUMNS = (
     "set",
     "question",
@@ -47,10 +63,36 @@ def write_page(found: dict[str, Any], out: Path) -> list[Path]:
     lines = ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
     lines += ["| " + " | ".join(cells) + " |" for cells in table(rows)]
     write_text(out / f"{NAME}.md", "\n".join(lines) + "\n")
-    shown = [
-        (f"{r['set']}: {r['question']}", r["method"], Spread(r["of_nominal"], float("nan"), 1),
-         r["method"].startswith("nominal"))
-        for r in rows
-    ]  # fmt: skip
-    figures = save(dots(shown, "error, of the nominal simulator's", "Real robots"), out / NAME) if shown else []
+    figures = save(draw(rows, found["cards"]), out / NAME) if rows else []
     return [out / f"{NAME}.md", out / f"{NAME}.json", *figures]
+
+
+@styled
+def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
+    """What each method leaves of the nominal error, a line for each question, what the robot itself leaves shaded."""
+    asked = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
+    fig = figure(7.2, 0.34 * len(asked) + 1.5)
+    ax = fig.subplots()
+    names = [titles.get(name, name).partition(",")[0] + f": {question}" for name, question in asked]
+    for y, key in enumerate(asked):
+        mine = [r for r in rows if (r["set"], r["question"]) == key]
+        nominal = mine[0]["mrad"]
+        if mine[0]["floor_mrad"] is not None:
+            ax.barh(y, mine[0]["floor_mrad"] / nominal, 0.8, color="#111111", alpha=0.1, lw=0,
+                    label="two recordings of one command differ by")  # fmt: skip
+        shown = [r for r in mine if r["method"] in LOOKS]
+        for i, r in enumerate(shown):
+            own, marker = LOOKS[r["method"]]
+            place = y + 0.5 * (i / max(len(shown) - 1, 1) - 0.5)
+            x, error = r["of_nominal"], (r["standard_error"] or 0.0) / nominal
+            ax.errorbar(min(x, WIDEST), place, xerr=error or None, fmt=marker if x <= WIDEST else ">", ms=4.5,
+                        color=own, elinewidth=0.8, label=r["method"])  # fmt: skip
+    ax.axvline(1.0, color=colour("nominal"), lw=0.8, zorder=0)
+    ax.set_yticks(np.arange(len(asked)), names)
+    ax.tick_params(axis="y", length=0)
+    ax.set_ylim(len(asked) - 0.4, -0.6)
+    ax.set_xlim(0.0, min(1.05 * max(r["of_nominal"] for r in rows if r["method"] in LOOKS), WIDEST))
+    ax.grid(axis="y", visible=False)
+    ax.set_xlabel("mean |error| in free run, of the nominal simulator's; bars: standard error over motions")
+    legend(fig)
+    return fig

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from gaponet.robot import RobotSpec
 
 FOLDS = 3
 FEW = 6  # recordings of a unit, of each joint, to calibrate with
+VAL = 8  # one in so many pairs of motion and payload judges, where motions are too few for a part of their own
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Question:
     """One question: name; recordings for training, validation and testing; `few` of the test's own, to calibrate with.
 
     `motion` says of each test recording which independent motion it is of; `split` is the hash of both sides; `before`
-    is the robot as it was identified elsewhere.
+    makes the robot as it was identified elsewhere; `made` is what methods share.
     """
 
     name: str
@@ -37,15 +40,34 @@ class Question:
     motion: list[str]
     split: str
     few: list[Sequence] = field(default_factory=list)
-    before: RobotSpec | None = None
+    before: Callable[[], RobotSpec] | None = None
+    made: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def known(self) -> list[Sequence]:
+        """All that may be learned from, for methods that choose nothing."""
+        return self.train + self.val
+
+    def once(self, name: str, make: Callable[[], Made]) -> Made:
+        """What several methods rest on, made by the first that asks."""
+        if name not in self.made:
+            self.made[name] = make()
+        return self.made[name]  # type: ignore[return-value]
 
 
-def questions(name: str, dataset: Dataset, robot: RobotSpec, before: RobotSpec | None) -> Iterator[Question]:
+def questions(
+    name: str, dataset: Dataset, robot: RobotSpec, before: Callable[[], RobotSpec] | None
+) -> Iterator[Question]:
     """The parts of a question: one, or a fold for each command or unit that is left out in turn."""
     lead = one_motion(dataset)
     entries = dataset.entries
 
     def ask(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
+        if not val:
+            cell = {e.id: f"{e.meta.motion} {e.meta.payload_mass:g}" for e in train}
+            judges = hash_order(cell.values())[::VAL]
+            val = [e for e in train if cell[e.id] in judges]
+            train = [e for e in train if cell[e.id] not in judges]
         digest = hashlib.sha256(f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()).hexdigest()[:8]
         read = lambda part: dataset.sequences(part)  # noqa: E731
         motion = [lead[e.meta.motion] for e in test]
@@ -94,19 +116,6 @@ def _half_a_minute(entries: list[Entry], seconds: float = 30.0) -> list[Entry]:
     """The first recording by the hash of its name; what is used of it is cut later."""
     name = hash_order({e.meta.motion for e in entries})[0]
     return [e for e in entries if e.meta.motion == name]
-
-
-def permuted(question: Question, seed: int) -> Question:
-    """The same with payload and unit of the training recordings dealt out anew among those of a joint: an adversary."""
-    rng = np.random.default_rng(seed)
-    train = list(question.train)
-    for joints in {s.meta.unrecorded for s in train}:
-        mine = [i for i, s in enumerate(train) if s.meta.unrecorded == joints]
-        for i, j in zip(mine, rng.permutation(mine), strict=True):
-            other = question.train[j].meta
-            meta = replace(train[i].meta, payload_mass=other.payload_mass, unit_id=other.unit_id)
-            train[i] = replace(train[i], meta=meta)
-    return replace(question, train=train)
 
 
 def floor(question: Question) -> float:

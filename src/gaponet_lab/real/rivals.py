@@ -15,17 +15,17 @@ from gaponet.errors import UsageError
 from gaponet.model.baselines.delay_offset import fit as fit_delay_offset
 from gaponet.model.calibration import fit as fit_unit
 from gaponet.robot import RobotSpec
-from gaponet.sim.identify import identify
+from gaponet.sim.identify import Identified, identify
 from gaponet.sim.model import build_model
 from gaponet.sim.refit import WINDOW
 from gaponet.sim.replay import Corrector, replay
 from gaponet_lab.real.questions import Question, recorded
 
 SECONDS = 30.0  # of the test's own session that calibration may use
-BUDGET = 60.0  # s of each identification
-WINDOWS = 120  # of a second at most, where recordings are that short
+WINDOWS = 80  # at most, where recordings are shorter than half of an ordinary window
 EVERY = 5  # rows between those that tell where a payload hangs
 PRIOR_MOUNT = 3.0  # N·m for a metre
+EXPLAINED = 0.9  # of a torque's variance, from which gains are read off it
 WALK = 0.02  # rad/s: friction turns its sign within this
 
 
@@ -58,14 +58,15 @@ def nominal(question: Question) -> Answer:
 
 def delay_offset(question: Question) -> Answer:
     """A delay and an offset of each joint."""
-    return Answer(question.robot, fit_delay_offset(question.train, question.robot).corrector(question.robot))
+    return Answer(question.robot, fit_delay_offset(question.known, question.robot).corrector(question.robot))
 
 
 def constant(question: Question) -> Answer:
-    """An adversary: what the nominal simulator is off by in the mean, for each joint, payload and unit."""
-    robot, n = question.robot, len(question.robot.joint_names)
+    """An adversary: what the nominal simulator is off by in the mean, for each joint, payload and unit; it sees what
+    calibration sees."""
+    robot, n, seen = question.robot, len(question.robot.joint_names), question.known + question.few
     off: dict[tuple[object, ...], list[Array]] = {}
-    for s, q in zip(question.train, Answer(robot).positions(question.train), strict=True):
+    for s, q in zip(seen, Answer(robot).positions(seen), strict=True):
         mine, bias = recorded(s, robot), np.full(n, np.nan)
         bias[mine] = (s.qpos - q)[1:, mine].mean(axis=0)
         for key in ((s.meta.payload_mass, s.meta.unit_id), (s.meta.payload_mass,), ()):
@@ -82,37 +83,41 @@ def constant(question: Question) -> Answer:
     return Answer(robot, shift=shift)
 
 
+def plain(question: Question) -> Answer:
+    """gaponet identify, payloads where the robot folder has them."""
+    return Answer(question.once("plain", lambda: _identify(question.train, question.val, question.robot)).robot)
+
+
+def with_torque(question: Question) -> Answer:
+    """gaponet identify, after torque has said the gains, where the payload hangs and what hand the model lacks."""
+    found, load = question.once("with torque", lambda: _with_torque(question))
+    return Answer(found.robot, load=load)
+
+
 def identified(question: Question) -> Answer:
-    """gaponet identify."""
-    return Answer(_identify(question.train, question.val, question.robot))
-
-
-def identified_hanging(question: Question) -> Answer:
-    """gaponet identify, after torque has said where the payload hangs and what the hand weighs that the model lacks."""
-    robot, load = hanging(question.train, question.robot)
-    return Answer(_identify([load(s) for s in question.train], question.val, robot), load=load)
+    """gaponet identify; torque is believed where validation recordings come out better for it."""
+    if not can_hang(question):
+        return plain(question)
+    question.once("plain", lambda: _identify(question.train, question.val, question.robot))
+    found, _ = question.once("with torque", lambda: _with_torque(question))
+    return with_torque(question) if found.after < question.made["plain"].after else plain(question)  # type: ignore[attr-defined]
 
 
 def calibrated(question: Question) -> Answer:
     """The robot identified elsewhere (or on the others), fitted to a little of what is tested."""
     if not question.few:
         raise UsageError(f"{question.name}: there is nothing of the test's own to calibrate with")
-    load: Callable[[Sequence], Sequence] = lambda s: s  # noqa: E731
-    if question.before is None:
-        before = identified_hanging(question) if can_hang(question) else identified(question)
-        robot, load = before.robot, before.load
-    else:
-        robot = question.before
-    few = [load(s) for s in question.few]
+    start = identified(question) if question.before is None else Answer(question.before())
+    few = [start.load(s) for s in question.few]
     seconds = len(few) * WINDOW if few[0].duration < WINDOW else SECONDS  # all windows that are shorter than one
-    return Answer(fit_unit(robot, few, seconds).robot, load=load)
+    return replace(start, robot=fit_unit(start.robot, few, seconds).robot)
 
 
 def elsewhere(question: Question) -> Answer:
     """The robot as it was identified in another session, as it is."""
     if question.before is None:
         raise UsageError(f"{question.name}: the robot was identified nowhere else")
-    return Answer(question.before)
+    return Answer(question.before())
 
 
 METHODS: dict[str, tuple[str, Method]] = {
@@ -120,21 +125,58 @@ METHODS: dict[str, tuple[str, Method]] = {
     "constant": ("constant offset by joint, payload, unit", constant),
     "delay_offset": ("delay + offset", delay_offset),
     "elsewhere": ("identified elsewhere", elsewhere),
+    "plain": ("identification, payload at the palm, torque not looked at", plain),
     "identified": ("identification", identified),
-    "identified_hanging": ("identification + place of the payload", identified_hanging),
     "calibrated": ("identified elsewhere, calibrated", calibrated),
 }
 
 
-def _identify(train: list[Sequence], val: list[Sequence], robot: RobotSpec) -> RobotSpec:
+def _identify(train: list[Sequence], val: list[Sequence], robot: RobotSpec) -> Identified:
     short = float(np.median([s.duration for s in train])) < WINDOW / 2
-    return identify(train, robot, val, WINDOWS if short else 40, table=bool(robot.tips), budget=BUDGET).robot
+    return identify(train, robot, val, WINDOWS if short else 24, table=bool(robot.tips))
+
+
+def _with_torque(question: Question) -> tuple[Identified, Callable[[Sequence], Sequence]]:
+    robot, load = hanging(question.train, with_gains_of_torque(question.train, question.robot))
+    return _identify([load(s) for s in question.train], [load(s) for s in question.val], robot), load
 
 
 def can_hang(question: Question) -> bool:
     """Whether recordings hold torque, and several payloads."""
     masses = {s.meta.payload_mass for s in question.train}
     return bool(question.robot.payload_mounts) and len(masses) > 1 and all(s.tau is not None for s in question.train)
+
+
+def gains_of_torque(train: list[Sequence], robot: RobotSpec) -> dict[str, tuple[float, float, float]]:
+    """Joint → kp N·m/rad, kd N·m·s/rad, and the share of the torque's variance that they explain.
+
+    Torque of a servo is kp (command − position) − kd velocity, the command a period before; means of five rows, since
+    noise of a small error softens a gain. Joints whose command never moves are left out.
+    """
+    parts: dict[int, list[Array]] = {}
+    for s in train:
+        if s.tau is None:
+            continue
+        for j in recorded(s, robot):
+            if np.ptp(s.ctrl[:, j]) > 0.05:
+                rows = np.stack([s.ctrl[:-1, j] - s.qpos[1:, j], -s.qvel[1:, j], s.tau[1:, j]], axis=1)
+                parts.setdefault(j, []).append(np.stack([np.convolve(x, np.ones(5) / 5, "valid") for x in rows.T]))
+    found = {}
+    for j, each in parts.items():
+        error, speed, tau = np.concatenate(each, axis=1).astype(float)
+        columns = np.stack([error, speed, np.ones_like(error)], axis=1)
+        x = np.linalg.lstsq(columns, tau)[0]
+        found[robot.joint_names[j]] = float(x[0]), float(x[1]), 1 - float((tau - columns @ x).var() / tau.var())
+    return found
+
+
+def with_gains_of_torque(train: list[Sequence], robot: RobotSpec) -> RobotSpec:
+    """The robot with them, where torque is the servo's own law."""
+    kp, kd = robot.kp.copy(), robot.kd.copy()
+    for joint, (stiff, damped, explained) in gains_of_torque(train, robot).items():
+        if explained > EXPLAINED and stiff > 0 <= damped:
+            kp[robot.joint_names.index(joint)], kd[robot.joint_names.index(joint)] = stiff, damped
+    return robot.with_gains(tuple(kp), tuple(kd))
 
 
 def hanging(train: list[Sequence], robot: RobotSpec) -> tuple[RobotSpec, Callable[[Sequence], Sequence]]:
