@@ -1,5 +1,7 @@
 """The training environment against the row convention and the replay."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,9 +9,11 @@ from arm import recordings, write_arm
 
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
 from gaponet.sim.replay import replay
-from gaponet.training.config import RewardConfig
+from gaponet.training.config import RewardConfig, WarmStartConfig
 from gaponet.training.env import AHEAD, DeltaEnv
+from gaponet.training.warm_start import WarmStart
 
 
 @pytest.fixture
@@ -46,6 +50,27 @@ def test_the_reward_of_a_joint_compares_it_one_row_on(robot):
     assert (error > 0.002).any()
     assert (error < 0.002).any()
     np.testing.assert_allclose(reward[~done], -np.minimum(error / 0.02, 0.1), rtol=1e-4, atol=1e-6)
+
+
+def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
+    one, other = recordings(robot, 2, rows=60, kp=0.6)
+    said = replace(one.meta, notes={"posture": {robot.joint_names[1]: 0.3}})
+    still = np.tile(np.float32([np.nan, 0.3]), (len(one), 1))
+    stands = lambda x, at: np.where(np.isnan(still), x, at)  # noqa: E731
+    one = replace(one, meta=said, ctrl=stands(one.ctrl, 0.3), qpos=stands(one.qpos, 0.3), qvel=stands(one.qvel, 0.0))
+    env = make(robot, [one, other])
+    warm = WarmStart(build_network(env.config, 2), env, np.ones((120, 2), np.float32), WarmStartConfig(steps=3), 0)
+    warm.collect(follow_labels=True)
+    unknown = env.first == env.seq_first[0]
+    assert 0 < unknown.sum() < len(unknown)
+    assert np.isnan(warm.pool_y[0].numpy().reshape(3, -1, 2)[0][unknown, 1]).all()
+    np.testing.assert_allclose(env.sim.qpos[unknown, 1], 0.3, atol=1e-4)  # whatever it carries
+    reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
+    assert (reward[unknown, 1] == 0).all()
+    assert (reward[:, 0] < 0).all()
+    assert (reward[~unknown, 1] < 0).all()
+    fit = WarmStart(warm.net, env, warm.labels, WarmStartConfig(steps=3, gradient_steps=2), 0).round(lambda: 0.0)
+    assert np.isfinite(fit["label_rmse"])
 
 
 def test_a_robot_without_a_gap_earns_no_penalty(robot):

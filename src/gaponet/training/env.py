@@ -23,15 +23,6 @@ from gaponet.training.config import RewardConfig
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
 
-def _placed(sim: BatchSim, device: str) -> Any:
-    """The same simulations on a --device: themselves on "cpu", mujoco_warp's elsewhere."""
-    if device == "cpu":
-        return sim
-    from gaponet.sim.warp import WarpSim
-
-    return WarpSim(sim, device)
-
-
 class DeltaEnv:
     """num_envs simulations, each following one recording from a random frame on.
 
@@ -57,8 +48,7 @@ class DeltaEnv:
     ) -> None:
         """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
 
-        On "cpu" C MuJoCo steps and arrays are numpy's; on
-        "cuda" or "warp-cpu" mujoco_warp does (sim/warp.py), and they are tensors that stay there.
+        On "cpu" C MuJoCo steps and arrays are numpy's; elsewhere mujoco_warp's (sim/warp.py), tensors that stay there.
         """
         if not sequences:
             raise UsageError("no sequences to train on; the split left the training set empty")
@@ -75,9 +65,8 @@ class DeltaEnv:
         self._place(sim, device)
         self.loop = DeltaLoop(config, sim.range[self.op], num_envs, of=self.now)
         shortest = min(c[2] for c in self.conditions)
-        under_way = 1 + int(
-            np.ceil(self.sim.robot.delay.max() / shortest)
-        )  # periods whose command a late servo has not met yet
+        # Periods whose command a late servo has not met yet.
+        under_way = 1 + int(np.ceil(self.sim.robot.delay.max() / shortest))
         self.depth = max(self.loop.history.depth, under_way)
         self.reward_sum, self.reward_count = 0.0, 0
         self.reset()
@@ -119,13 +108,16 @@ class DeltaEnv:
         self.weights = [length[m] / length[m].sum() for m in self.members]
         self.payload = np.array([c[0] for c in self.conditions], np.float32)[self.group]
         rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
-        unsaid = np.where(self.unknown[self.group][:, self.op], np.nan, 0.0)  # (num_envs, n): counts nowhere
-        self.unsaid = unsaid.astype(np.float32)
+        self.unsaid = np.where(self.unknown[self.group][:, self.op], np.nan, 0).astype(np.float32)  # counts nowhere
         self.condition_features = np.stack([self.payload / self.config.payload_max, rate / 100], axis=1)
 
     def _place(self, sim: BatchSim, device: str) -> None:
         """Put the simulations, and all that a step looks up or writes, on the device; in numpy nothing is copied."""
-        self.sim: Any = _placed(sim, device)
+        self.sim: Any = sim
+        if device != "cpu":
+            from gaponet.sim.warp import WarpSim
+
+            self.sim = WarpSim(sim, device)
         place, num = self.sim.array, self.num_envs
         for name in ("ctrl", "qpos", "qvel", "track", "payload", "condition_features", "unsaid"):
             setattr(self, name, place(getattr(self, name)))
