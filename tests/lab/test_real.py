@@ -124,7 +124,7 @@ def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(
         made.append(replace(s, tau=tau + 0.01 * rng.standard_normal(tau.shape)))
     (kp, kd, explained), (_, _, noise) = gains_of_torque(made, arm).values()
     assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
-    assert explained > 0.98 > 0.5 > noise
+    assert explained > 0.95 > 0.5 > noise
     robot = with_gains_of_torque(made, arm)
     assert robot.kp[0] == pytest.approx(7.0, rel=0.03)
     assert robot.kp[1] == arm.kp[1]
