@@ -138,8 +138,9 @@ class TrainConfig:
 
     @property
     def learner_threads(self) -> int:
-        """Threads as torch counts them."""
-        return self.threads or os.cpu_count() or 1
+        """Threads as torch counts them: as asked, as OMP_NUM_THREADS says, or all cores."""
+        said = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+        return self.threads or (int(said) if said.isdigit() else 0) or os.cpu_count() or 1
 
 
 def fast(config: TrainConfig) -> TrainConfig:
