@@ -26,8 +26,7 @@ from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
 try:
-    import_module("numba")  # an extra: what it compiles is eight times as fast as numpy
-    jitable = import_module("numba.extending").register_jitable
+    jitable = import_module("numba.extending").register_jitable  # an extra, eight times as fast as numpy
     jitable(servo.passing_friction), jitable(servo.resting_friction)
     advance: Any = import_module("numba").njit(cache=True, nogil=True)(servo.advance)  # anew when servo.py changes
 except ImportError:
