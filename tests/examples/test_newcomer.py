@@ -1,4 +1,4 @@
-"""The newcomer's page: what it shows stands in the code, its commands are understood, its change reaches all engines."""
+"""The newcomer's page: what it shows is there, its commands are understood, its change reaches every engine."""
 
 import inspect
 import os
