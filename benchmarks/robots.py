@@ -1,32 +1,42 @@
 """The standing tournament: robots that nobody tuned on (strangers.py), as a user would have them, by commands alone.
 
     python benchmarks/robots.py WORK --robots 60 --first 0        # goes on where it was cut short
+    python benchmarks/robots.py WORK --robots 200 --small         # of 2 to 6 joints, up to 125 Hz, a minute of logs
     python benchmarks/robots.py WORK --robots 0 --page docs/results/robots.md
 
-Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify, gap
-on motions that nothing was fitted to; and benchmarks/plain_fit.py on the same dataset. One JSON line a robot.
+Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify; and
+benchmarks/plain_fit.py on the same dataset. Both are measured by gaponet gap on FRESH motions that are in no dataset
+that anything was fitted to, as many of each kind. One JSON line a robot; each robot has a process of its own.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
+import multiprocessing
 import resource
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from plain_fit import plain_fit
 from strangers import Stranger, draw
 
-HERE = Path(__file__).parent
-GAPONET = str(Path(sys.executable).with_name("gaponet"))
+from gaponet.cli.main import main as gaponet
+from gaponet.data.split import split_entries
+from gaponet.data.store import open_dataset
+from gaponet.robot import load_robot
+from gaponet.robot_folder import save_robot
+
 FIELDS = ("kp", "damping", "frictionloss", "armature", "delay", "offset")
 WORSE, WORSE_THAN_PLAIN = 1.01, 1.10
+FRESH, LATER = 8, 100  # motions that are measured, and the number of the first
+SMALL = 60.0  # s recorded of a small robot
 Row = dict[str, Any]
 
 
@@ -34,82 +44,93 @@ class RefusedError(Exception):
     """A command ended with an error."""
 
 
-def call(*words: object) -> tuple[str, float, float]:
-    """What a command prints; its seconds, and those of the processor."""
-    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False)
-    seconds, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode:
-        told = (done.stdout + done.stderr).strip().splitlines()
-        raise RefusedError(f"{Path(str(words[0])).name} {words[1]} ended with {done.returncode}: {' '.join(told[-3:])}")
-    return done.stdout, seconds, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+class Taken:
+    """Seconds, and those of the processor, since it was made."""
+
+    def __init__(self) -> None:
+        self.began, self.cpu = time.monotonic(), self._cpu()
+
+    def __call__(self) -> tuple[float, float]:
+        return time.monotonic() - self.began, self._cpu() - self.cpu
+
+    def _cpu(self) -> float:
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        return used.ru_utime + used.ru_stime
 
 
-def write(robot: Stranger, folder: Path, motions: int, seconds: float | None) -> float:
-    """The vendor's file and the logs, a folder for each payload; seconds recorded."""
+def call(*words: object) -> str:
+    """What a command prints."""
+    out, said = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+        code = gaponet(list(map(str, words)))
+    if code:
+        told = (out.getvalue() + said.getvalue()).strip().splitlines()
+        raise RefusedError(f"{words[0]} ended with {code}: {' '.join(told[-3:])}")
+    return out.getvalue()
+
+
+def write(robot: Stranger, folder: Path, logs: Iterable[Any]) -> float:
+    """The logs, a folder for each payload; seconds recorded."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    folder.mkdir(parents=True)
-    (folder / "vendor.xml").write_text(robot.file())
     recorded = 0.0
-    for log in robot.recordings(motions, seconds):
-        place = folder / f"logs_{log.payload:g}"
-        place.mkdir(exist_ok=True)
+    for log in logs:
+        place = folder / f"{log.payload:g}"
+        place.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table(log.columns(robot.joints)), place / f"{log.motion}.parquet")
         recorded += float(log.time[-1])
     return recorded
 
 
-def play(seed: int, folder: Path, motions: int = 12, seconds: float | None = None, rival: bool = True) -> Row:
+def play(seed: int, folder: Path, motions: int, seconds: float | None, small: bool) -> Row:
     """One robot of the tournament."""
-    robot = draw(seed)
+    robot = draw(seed, small=small)
     row: Row = {"seed": seed, "body": robot.body, "joints": len(robot.joints), "rate": robot.rate,
                 "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
-    row["seconds_recorded"] = write(robot, folder, motions, seconds)
-    data, mine, found = folder / "data", folder / "robot", folder / "identified"
+    recordings = list(robot.recordings(motions, seconds))
+    row["seconds_recorded"] = write(robot, folder / "logs", recordings)
+    each, kinds = float(recordings[0].time[-1]), range(LATER, LATER + FRESH)
+    carried = [robot.payload * (i % 2) for i in kinds]
+    write(robot, folder / "fresh_logs", (
+        robot.play(f"fresh{i}", robot.commands(i, each), kg, i) for i, kg in zip(kinds, carried, strict=True)
+    ))  # fmt: skip
+    (folder / "vendor.xml").write_text(robot.file())
+    data, fresh, mine, found = (folder / x for x in ("data", "fresh", "robot", "identified"))
     mounts = ["--mounts", f"hand={robot.bodies[-1]}:0,0,0"] if robot.payload else []
-    call(GAPONET, "robot", "new", folder / "vendor.xml", "--out", mine, "--rate", robot.rate, "--name", "stranger",
+    call("robot", "new", folder / "vendor.xml", "--out", mine, "--rate", robot.rate, "--name", "stranger",
          "--joints", *robot.joints, *mounts)  # fmt: skip
-    for place in sorted(folder.glob("logs_*")):
-        call(GAPONET, "import", place, "--robot", mine, "--out", data, "--unit-id", "a", "--payload-mass",
-             place.name.removeprefix("logs_"), "--position-unit", "rad", "--time-unit", "s")  # fmt: skip
-    told = json.loads(call(GAPONET, "doctor", data, "--json")[0])
+    for logs, out in ((folder / "logs", data), (folder / "fresh_logs", fresh)):
+        for place in sorted(logs.iterdir()):
+            call("import", place, "--robot", mine, "--out", out, "--unit-id", "a", "--payload-mass",
+                 place.name, "--position-unit", "rad", "--time-unit", "s")  # fmt: skip
+    told = json.loads(call("doctor", data, "--json"))
     row["doctor"] = [f"{f['level']} {f['check']}" for f in told["findings"] if f["level"] in ("warning", "error")]
-    row["nominal"] = held_out(data, mine)
+    row["nominal"] = left(fresh, mine)
     try:
-        out, row["seconds"], row["cpu"] = call(GAPONET, "identify", data, "--out", found, "--json")
-        fit = json.loads(out)
-        row["warnings"] = fit["warnings"]
+        took = Taken()
+        fit = json.loads(call("identify", data, "--out", found, "--json"))
+        row["seconds"], row["cpu"] = took()
+        row |= {"warnings": fit["warnings"], "chosen": fit["chosen"], "val": fit["val_mpjae"]}
         row |= inside(robot, found, fit["std"])
     except RefusedError as refused:
         row["refused"] = str(refused)
-    row["identified"] = held_out(data, found) if (found / "robot.toml").exists() else row["nominal"]
-    if rival:
-        try:
-            plain = (sys.executable, HERE / "plain_fit.py", data, "--out", folder / "plain")
-            row["plain_seconds"], row["plain_cpu"] = call(*plain)[1:]
-            row["plain"] = held_out(data, folder / "plain")
-        except RefusedError as refused:
-            row["plain_refused"] = str(refused)
+    row["identified"] = left(fresh, found) if (found / "robot.toml").exists() else row["nominal"]
+    took, (dataset, spec) = Taken(), open_dataset(str(data), None, None)
+    save_robot(plain_fit(dataset.sequences(split_entries(dataset)["train"]), spec), folder / "plain")
+    row["plain_seconds"], row["plain_cpu"] = took()
+    row["plain"] = left(fresh, folder / "plain")
     return row
 
 
-def held_out(data: Path, robot: Path) -> float:
-    """Mean |error| on the test motions, rad."""
-    from gaponet.data.split import split_entries
-    from gaponet.data.store import Dataset
-
-    test = sorted({e.meta.motion for e in split_entries(Dataset(data))["test"]})
-    gap = json.loads(call(GAPONET, "gap", data, "--robot", robot, "--motions", *test, "--json")[0])
-    methods = gap["methods"]  # an identified folder is measured beside the robot that it was identified from
+def left(data: Path, robot: Path) -> float:
+    """Mean |error| of all motions of a dataset, rad."""
+    methods = json.loads(call("gap", data, "--robot", robot, "--json"))["methods"]
     return float(methods.get("identified", methods["nominal"])["mpjae"])
 
 
 def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]]) -> Row:
     """Distance of each parameter from the truth in its standard errors, and in its own size: field → numbers."""
-    from gaponet.robot import load_robot
-
     spec, law = load_robot(folder), robot.law
     truth = {"kp": law.kp, "damping": law.kd + law.damping, "frictionloss": law.friction, "armature": law.armature,
              "delay": law.delay, "offset": law.offset}  # fmt: skip
@@ -191,20 +212,24 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--motions", type=int, default=12)
     parser.add_argument("--seconds", type=float, help="recorded of each robot; default two to five minutes")
+    parser.add_argument("--small", action="store_true", help="small robots, a minute of logs")
+    parser.add_argument("--seeds", type=int, nargs="*", help="these, instead of a range; measured again")
     parser.add_argument("--keep", action="store_true", help="keep each robot's folder")
     parser.add_argument("--page", type=Path, help="write the tables here")
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     journal = args.work / "robots.jsonl"
     rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
-    for seed in range(args.first, args.first + args.robots):
+    seconds = args.seconds or (SMALL if args.small else None)
+    rows = [r for r in rows if r["seed"] not in (args.seeds or ())]
+    for seed in args.seeds or range(args.first, args.first + args.robots):
         if any(r["seed"] == seed for r in rows):
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
-        rows.append(play(seed, folder, args.motions, args.seconds))
-        with journal.open("a") as file:
-            file.write(json.dumps(rows[-1]) + "\n")
+        with multiprocessing.get_context("fork").Pool(1) as process:
+            rows.append(process.apply(play, (seed, folder, args.motions, seconds, args.small)))
+        journal.write_text("".join(json.dumps(row) + "\n" for row in rows))
         r = rows[-1]
         print(
             f"{seed} {r['body']} {r['joints']} joints {r['rate']:g} Hz {','.join(r['laws']) or 'in form'}: "

@@ -26,6 +26,7 @@ RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
 LAWS = ("stribeck", "load", "backlash", "dead_band", "speed", "saturation", "filter")  # not of the form that is fitted
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
+SMALL, SLOW = 6, 125.0
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
 <worldbody>{}</worldbody></mujoco>"""
 
@@ -258,8 +259,12 @@ def _lag(target: Array, share: Array) -> Array:
     return found
 
 
-def draw(seed: int, public: bool | None = None) -> Stranger:
-    """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance."""
+def draw(seed: int, public: bool | None = None, small: bool = False) -> Stranger:
+    """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance.
+    small: the first made here of at most SMALL joints, at no more than SLOW Hz."""
+    if small:
+        next(i for i in range(100) if len((found := draw(seed + 1000 * i, False)).joints) <= SMALL)
+        return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))
     spec, body = None, ""

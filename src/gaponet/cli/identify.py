@@ -78,7 +78,7 @@ def identify(
     _tell(screen, found, made.val, details)
     screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {as_option(out)}")
     screen.result({
-        "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
+        "chosen": found.chosen, "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},
         "terms": {t.name: {"gain": t.gain[0], "standard_error": t.gain[1], "kept": t.kept} for t in found.tried},
         "shared": {

@@ -126,15 +126,16 @@ class Identified:
 class Clock:
     """How far a fit is, told with what is fitted; and, where its time is limited, when a search has had its part."""
 
-    def __init__(self, seconds: float | None, iterations: int, progress: Progress) -> None:
-        self.began, self.seconds, self.iterations, self.progress = time.monotonic(), seconds, iterations, progress
-        self.done, self.end = 0, np.inf
+    def __init__(self, seconds: float | None, steps: list[int], progress: Progress) -> None:
+        """steps: Iterations until the end of each search."""
+        self.began, self.seconds, self.steps, self.progress = time.monotonic(), seconds, steps, progress
+        self.iterations, self.done, self.end = steps[-1], 0, np.inf
 
-    def share(self, part: float, done: int) -> None:
-        """The next search may take this part of the time that is left; so many iterations were before it."""
+    def share(self, part: float, search: int) -> None:
+        """The search of this number may take this part of the time that is left."""
         gone = time.monotonic() - self.began
         self.end = np.inf if self.seconds is None else gone + part * max(self.seconds - gone, 0.0)
-        self.done = done
+        self.done = self.steps[search - 1] if search else 0
 
     def over(self) -> bool:
         """Whether the present search has had its time."""
@@ -182,44 +183,20 @@ def identify(
         stops: Give joints that stayed behind several commands a stop there.
     """
     steps = np.cumsum([sum(SEARCH), sum(TOGETHER), *[sum(SEARCH) + POLISH] * len(terms)]).tolist()
-    clock = Clock(budget, steps[-1], progress)
+    clock = Clock(budget, steps, progress)
     progress(0, clock.iterations, "inertias along the recordings")
-    given, met = robot, with_stops(robot, sequences)
-    robot = met  # for the fit; a stop that nobody confirmed is taken back in the end
+    given, robot = robot, with_stops(robot, sequences)  # for the fit; what nobody confirmed is taken back in the end
     heights = tip_heights(sequences, robot)
-    below = touching_below(robot, heights)
+    below, parts = touching_below(robot, heights), cut(sequences, windows)
     bounds = Bounds(robot, sequences)
-    parts = cut(sequences, windows)
     fit = Fit(JointRuns(parts, robot, below, nthread), robot, bounds)
-    judge = _Judge(list(validation), robot, below, nthread) if validation else _Judge(parts, robot, below, nthread)
-
-    clock.share(PARTS["joints"], 0)
-    balanced = fit.runs.regressed()
-    scaled = {f: x * (np.divide(bounds.first["kp"], balanced["kp"], out=np.ones(bounds.n), where=balanced["kp"] > 0)
-                      if f not in ("offset", "delay") else 1.0) for f, x in balanced.items()}  # fmt: skip
-    starts = [
-        {f: np.where(balanced["kp"] > 0, x - bounds.spare * (f == "damping"), bounds.start[f]) for f, x in b.items()}
-        for b in (balanced, scaled)
-    ]
-    alone = fit.search(CLASSIC, bounds.start, clock, "joints, each on its own", starts)
-    whole = fit.whole(nthread)
-    clock.share(PARTS["whole"] / (1 - PARTS["joints"]), steps[0])
-    first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
-    together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
-    chosen, values = judge.best({"given": bounds.first, "joints": alone, "whole": together})
-
-    tried = []
-    for i, term in enumerate(terms):
-        clock.share(1 / (len(terms) - i + 1), steps[1 + i])
-        base = values if chosen != "given" else together
-        richer = fit.search(TERMS[term], base | {f: bounds.guess[f] for f in TERMS[term]}, clock, term)
-        if not set(TERMS[term]) & set(ALONE):
-            searched = fit.fields_of(richer)
-            x = whole.axes(searched, richer).of(richer)[None]
-            richer = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
-        tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
-        if tried[-1].kept:
-            chosen, values = "whole" if chosen == "given" else chosen, richer
+    judge = _Judge(list(validation) or parts, robot, below, nthread)
+    whole, candidates = _classic(fit, clock, nthread)
+    chosen, values = judge.best(candidates)
+    base = values if chosen != "given" else candidates["whole"]
+    tried, richer = _with_terms(fit, whole, judge, terms, values, base, clock)
+    if richer is not values:
+        chosen, values = "whole" if chosen == "given" else chosen, richer
     std, over_kp = whole.uncertainty(values)
     common = []
     for servo, places in (same_servos(robot) if shared else {}).items():
@@ -232,21 +209,52 @@ def identify(
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
         note = lambda error: progress(clock.iterations, clock.iterations, f"table {error * 1e3:.2f} mrad")  # noqa: E731
+        score = (lambda one: float(whole_errors(validation, one, nthread).mean())) if validation else None
         touch = fit_table(low, found, lowest, nthread, note)
         found = touch.robot
-    before, after = (judge.by_joint(v) for v in (bounds.first, values))
-    doubts = (
-        *fit.bounds_met(values),
-        *_asked_stops(given, met),
-        *far_from_published(found),
-        *fit.undetermined(values, std, over_kp),
-    )
     if not stops:
         found = replace(found, stop_low=given.stop_low, stop_high=given.stop_high)
         found = given if chosen == "given" and not (touch and touch.kept) else found
+    doubts = (
+        *fit.bounds_met(values),
+        *_asked_stops(given, robot),
+        *far_from_published(found),
+        *fit.undetermined(values, std, over_kp),
+    )
+    before, after = (judge.by_joint(v) for v in (bounds.first, values))
     by_joint = {j: (float(a), float(b)) for j, a, b in zip(robot.operated, before, after, strict=True)}
     began, ended = (float(judge.errors(v).mean()) for v in (bounds.first, values))
     return Identified(found, began, ended, chosen, doubts, std, tuple(tried), touch, tuple(common), by_joint)
+
+
+def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Values]]:
+    """The classic fields, joints on their own and then together: the whole robot's fit, and what may be chosen."""
+    bounds = fit.bounds
+    clock.share(PARTS["joints"], 0)
+    alone = fit.search(CLASSIC, bounds.start, clock, "joints, each on its own", fit.balanced())
+    whole = fit.whole(nthread)
+    clock.share(PARTS["whole"] / (1 - PARTS["joints"]), 1)
+    first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
+    together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
+    return whole, {"given": bounds.first, "joints": alone, "whole": together}
+
+
+def _with_terms(
+    fit: Fit, whole: Fit, judge: _Judge, terms: tuple[str, ...], values: Values, base: Values, clock: Clock
+) -> tuple[list[Tried], Values]:
+    """Terms of the law, each fitted from the base and kept in it where it does better than the values."""
+    tried: list[Tried] = []
+    for i, term in enumerate(terms):
+        clock.share(1 / (len(terms) - i + 1), 2 + i)
+        richer = fit.search(TERMS[term], base | {f: fit.bounds.guess[f] for f in TERMS[term]}, clock, term)
+        if not set(TERMS[term]) & set(ALONE):
+            searched = fit.fields_of(richer)
+            x = whole.axes(searched, richer).of(richer)[None]
+            richer = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
+        tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
+        if tried[-1].kept:
+            values = base = richer
+    return tried, values
 
 
 class _Judge:
@@ -324,6 +332,17 @@ class Fit:
     def fields_of(self, values: Values) -> list[str]:
         """Names that the whole robot can be searched for, classic ones first."""
         return [f for f in (*CLASSIC, *LAW) if f in values and f not in ALONE]
+
+    def balanced(self) -> list[Values]:
+        """What balances the recorded accelerations, by itself and with the file's kp."""
+        own, first, balanced = self.bounds.start, self.bounds.first["kp"], self.runs.regressed()
+        known = balanced["kp"] > 0
+        more = np.divide(first, balanced["kp"], out=np.ones(self.n), where=known)
+        scaled = {f: x if f in ("offset", "delay") else x * more for f, x in balanced.items()}
+        return [
+            {f: np.where(known, x - self.bounds.spare * (f == "damping"), own[f]) for f, x in values.items()}
+            for values in (balanced, scaled)
+        ]
 
     def search(
         self, fields: ListOf[str], start: Values, clock: Clock, what: str, others: ListOf[Values] = ()
