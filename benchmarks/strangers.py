@@ -263,7 +263,7 @@ def draw(seed: int, public: bool | None = None, small: bool = False) -> Stranger
     """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance.
     small: the first made here of at most SMALL joints, at no more than SLOW Hz."""
     if small:
-        next(i for i in range(100) if len((found := draw(seed + 1000 * i, False)).joints) <= SMALL)
+        next(i for i in range(100) if len((found := draw(seed + 10**6 * i, False)).joints) <= SMALL)
         return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))

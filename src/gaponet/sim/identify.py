@@ -23,6 +23,7 @@ from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
 from gaponet.sim.free_runs import FreeRuns
 from gaponet.sim.joint_runs import SOFT, JointRuns
+from gaponet.sim.model import build_model
 from gaponet.sim.multistart import better_half, descend, slopes
 from gaponet.sim.refit import cut
 from gaponet.sim.replay import replay
@@ -37,8 +38,9 @@ WINDOWS, WHOLE = 40, 8  # windows of joints on their own, and of the whole robot
 STARTS, SPREAD = 4, 2.0  # of each search, and how far apart in the parameters' scales
 SHORT = 0.5  # s: a search begins with runs so short
 SEARCH = (10, 8, 15)  # iterations: of all starts on short runs, of all on whole windows, of the better half
-TOGETHER = (2, 6)  # iterations of the whole robot: from both starts, from the better one
-ENOUGH = 2e-3  # of the whole robot's cost: a fall that is worth another iteration
+TOGETHER = (2, 3)  # iterations of the whole robot, joint by joint: from both starts, from the better one
+LIMBS = 8  # and of limbs, whose joints answer for each other
+ENOUGH, LITTLE = 2e-3, 2e-4  # of the whole robot's cost, of the limbs': a fall that is worth another iteration
 POLISH = 2  # iterations of the whole robot with a term of the law
 CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
@@ -182,7 +184,7 @@ def identify(
             is the same on every machine.
         stops: Give joints that stayed behind several commands a stop there.
     """
-    steps = np.cumsum([sum(SEARCH), sum(TOGETHER), *[sum(SEARCH) + POLISH] * len(terms)]).tolist()
+    steps = np.cumsum([sum(SEARCH), sum(TOGETHER) + LIMBS, *[sum(SEARCH) + POLISH] * len(terms)]).tolist()
     clock = Clock(budget, steps, progress)
     progress(0, clock.iterations, "inertias along the recordings")
     given, robot = robot, with_stops(robot, sequences)  # for the fit; what nobody confirmed is taken back in the end
@@ -235,8 +237,8 @@ def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Value
     whole = fit.whole(nthread)
     clock.share(PARTS["whole"] / (1 - PARTS["joints"]), 1)
     first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
-    together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
-    return whole, {"given": bounds.first, "joints": alone, "whole": together}
+    together = whole.limbs(whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot"), clock)
+    return whole, {"given": bounds.first, "whole": together, "joints": alone}
 
 
 def _with_terms(
@@ -285,7 +287,7 @@ class _Judge:
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
     def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
-        """Name and values of what does best; the first unless it is beaten by more than a hundredth."""
+        """Name and values of what does best; an earlier one where it is not beaten by more than a hundredth."""
         names = list(candidates)
         joints = np.array([self.by_joint(v) for v in candidates.values()])
         which = joints.argmin(axis=0)
@@ -294,8 +296,9 @@ class _Judge:
             rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
             candidates = candidates | {"mixed": {f: x[which, np.arange(len(which))] for f, x in rows.items()}}
         costs = {name: float(self.errors(v).mean()) for name, v in candidates.items()}
-        name = min(costs, key=lambda name: costs[name])
-        name = name if costs[name] < BETTER * costs[names[0]] else names[0]
+        name = names[0]
+        for other in candidates:
+            name = other if costs[other] < BETTER * costs[name] else name
         return name, candidates[name]
 
 
@@ -308,6 +311,27 @@ def _touching_rows(sequences: ListOf[Sequence], robot: RobotSpec, below: float) 
     return np.array([np.r_[h < below, np.zeros(rows - len(h), bool)] for h in heights])
 
 
+class Limbs:
+    """Joints that move each other, side by side: numbers of joints (…, n, P) and of limbs (…, limbs, most · P)."""
+
+    def __init__(self, robot: RobotSpec) -> None:
+        model = build_model(replace(robot, table=None), bare=True)
+        tree = model.dof_treeid[[model.joint(j).dofadr[0] for j in robot.operated]]
+        limbs = [np.flatnonzero(tree == t) for t in np.unique(tree)]
+        most = max(map(len, limbs))
+        self.at = np.array([[*limb, *[-1] * (most - len(limb))] for limb in limbs])  # (limbs, most), -1 for no joint
+
+    def pack(self, x: Array) -> Array:
+        """Of joints → of limbs; 0 where a limb has fewer."""
+        padded = np.concatenate([x, np.zeros_like(x[..., :1, :])], axis=-2)[..., self.at, :]
+        return padded.reshape(*x.shape[:-2], len(self.at), -1)
+
+    def unpack(self, x: Array) -> Array:
+        """Of limbs → of joints."""
+        split = x.reshape(*x.shape[:-2], self.at.size, -1)
+        return np.asarray(split[..., np.argsort(self.at.ravel(), kind="stable")[(self.at < 0).sum() :], :])
+
+
 class Fit:
     """Windows of recordings, joints on their own or the whole robot, and what a parameter may be."""
 
@@ -315,6 +339,7 @@ class Fit:
         self.runs, self.base, self.bounds, self.company = runs, robot, bounds, whole
         self.n = len(robot.operated)
         self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
+        self.together = Limbs(robot)
 
     def whole(self, nthread: int) -> Fit:
         """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
@@ -382,6 +407,17 @@ class Fit:
                 x = np.concatenate([better_half(x, cost)[:1], x[[cost.sum(axis=1).argmin()]]])
                 x = x[:1] if np.array_equal(x[0], x[1]) else x
         return {f: v[0].copy() for f, v in axes.values(x[[cost.sum(axis=1).argmin()]]).items()}
+
+    def limbs(self, values: Values, clock: Clock) -> Values:
+        """Fit what `descend` found once more, a joint's parameters by the errors of all joints of its limb."""
+        assert self.company is not None
+        runs, axes, limbs = self.company, self.axes(self.fields_of(values), values), self.together
+        errors = lambda xs: limbs.pack(self.errors(axes.values(limbs.unpack(xs)), runs))  # noqa: E731
+        rows, first = limbs.pack(runs.rows[:, None]).sum(axis=1), [self.base.operated[i] for i in limbs.at[:, 0]]
+        x, (low, high) = limbs.pack(axes.of(values)[None]), map(limbs.pack, (axes.low, axes.high))
+        tell = clock.tell("limbs", tuple(first), rows)
+        x, _ = descend(x, low, high, errors, LIMBS, tell, clock.over, LITTLE)
+        return {f: v[0].copy() for f, v in axes.values(limbs.unpack(x)).items()}
 
     def learn(self, cost: Array, rows: Array) -> None:
         """What the best fit leaves of each joint says how much a file's value weighs."""
