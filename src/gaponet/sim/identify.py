@@ -211,7 +211,6 @@ def identify(
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
         note = lambda error: progress(clock.iterations, clock.iterations, f"table {error * 1e3:.2f} mrad")  # noqa: E731
-        score = (lambda one: float(whole_errors(validation, one, nthread).mean())) if validation else None
         touch = fit_table(low, found, lowest, nthread, note)
         found = touch.robot
     if not stops:
@@ -311,7 +310,7 @@ def _touching_rows(sequences: ListOf[Sequence], robot: RobotSpec, below: float) 
     return np.array([np.r_[h < below, np.zeros(rows - len(h), bool)] for h in heights])
 
 
-class Limbs:
+class _Limbs:
     """Joints that move each other, side by side: numbers of joints (…, n, P) and of limbs (…, limbs, most · P)."""
 
     def __init__(self, robot: RobotSpec) -> None:
@@ -339,7 +338,7 @@ class Fit:
         self.runs, self.base, self.bounds, self.company = runs, robot, bounds, whole
         self.n = len(robot.operated)
         self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
-        self.together = Limbs(robot)
+        self.together = _Limbs(robot)
 
     def whole(self, nthread: int) -> Fit:
         """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
