@@ -21,7 +21,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from plain_fit import plain_fit
@@ -32,9 +32,14 @@ from gaponet.data.split import split_entries
 from gaponet.data.store import open_dataset
 from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
+from gaponet_lab.plot.style import figure, save, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "delay", "offset")
 WORSE, WORSE_THAN_PLAIN = 1.01, 1.10
+MARK = "<!-- below by hand -->\n"
 FRESH, LATER = 8, 100  # motions that are measured, and the number of the first
 SMALL = 60.0  # s recorded of a small robot
 Row = dict[str, Any]
@@ -86,7 +91,7 @@ def write(robot: Stranger, folder: Path, logs: Iterable[Any]) -> float:
 def play(seed: int, folder: Path, motions: int, seconds: float | None, small: bool) -> Row:
     """One robot of the tournament."""
     robot = draw(seed, small=small)
-    row: Row = {"seed": seed, "body": robot.body, "joints": len(robot.joints), "rate": robot.rate,
+    row: Row = {"seed": seed, "small": small, "body": robot.body, "joints": len(robot.joints), "rate": robot.rate,
                 "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
     recordings = list(robot.recordings(motions, seconds))
     row["seconds_recorded"] = write(robot, folder / "logs", recordings)
@@ -204,6 +209,37 @@ def losers(rows: list[Row]) -> list[str]:
     return said
 
 
+@styled
+def picture(rows: list[Row]) -> Figure:
+    """What identification leaves beside what the plain script leaves, each of the vendor's file."""
+    fig = figure(4.6, 4.2)
+    ax = fig.subplots()
+    for name, colour, kind in (("servo of the form", "#1f77b4", True), ("of another form", "#d95f02", False)):
+        some = [r for r in rows if (not r["laws"]) == kind]
+        x, y = ([r[k] / r["nominal"] for r in some] for k in ("plain", "identified"))
+        ax.scatter(x, y, 14, colour, label=f"{name}, {len(some)}", alpha=0.8)
+    ends = [1e-3, 2.0]
+    ax.plot(ends, ends, color="0.6", lw=0.8)
+    ax.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal",
+           xlabel="plain script, share of the file's error", ylabel="gaponet identify")  # fmt: skip
+    ax.legend(loc="upper left")
+    ax.set_title("Robots that nobody tuned on (VIRTUAL)")
+    return fig
+
+
+def publish(page: Path, rows: list[Row], text: str) -> None:
+    """The page and its figure; what stands below the page's mark is kept."""
+    head = (
+        "# Robots that nobody tuned on\n\n"
+        f"`python benchmarks/robots.py WORK --robots N{' --small' * all(r['small'] for r in rows)}`: {len(rows)} "
+        "**virtual** robots drawn by seed (`benchmarks/strangers.py`), their\nlogs made by plain MuJoCo with a servo "
+        "that gaponet's simulator does not know; by commands alone, as a user would.\n\n"
+    )
+    kept = page.read_text().partition(MARK)[2] if page.exists() else ""
+    page.write_text(f"{head}![]({page.stem}.svg)\n\n{text}\n{MARK}{kept}")
+    save(picture(rows), page.with_suffix(".svg"))
+
+
 def main() -> None:
     """Play what is missing, one robot at a time; print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -242,13 +278,7 @@ def main() -> None:
     text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
     print(text)
     if args.page:
-        head = (
-            "# Robots that nobody tuned on\n\n"
-            "`python benchmarks/robots.py WORK --robots N`; every robot is **virtual**, "
-            "its logs are of plain MuJoCo\nwith a servo that gaponet's simulator does not know "
-            "(`benchmarks/strangers.py`).\n\n"
-        )
-        args.page.write_text(head + text)
+        publish(args.page, rows, text)
 
 
 if __name__ == "__main__":

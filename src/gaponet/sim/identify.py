@@ -211,7 +211,8 @@ def identify(
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
         note = lambda error: progress(clock.iterations, clock.iterations, f"table {error * 1e3:.2f} mrad")  # noqa: E731
-        touch = fit_table(low, found, lowest, nthread, note)
+        score = lambda one: float(whole_errors(validation, one, nthread).mean())  # noqa: E731
+        touch = fit_table(low, found, lowest, nthread, note, score if validation else None)
         found = touch.robot
     if not stops:
         found = replace(found, stop_low=given.stop_low, stop_high=given.stop_high)

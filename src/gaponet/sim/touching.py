@@ -35,6 +35,7 @@ ZERO, PRICE = 0.02, 2e-3  # rad: an ordinary zero, and what it costs (soft squar
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
+STARTS = tuple(np.log((500.0, 2000.0, 8000.0)))  # stiffness from which the search begins, each by itself
 
 
 @dataclass(frozen=True)
@@ -102,9 +103,14 @@ def _most_wrong(scene: _Scene, away: Array) -> list[Sequence]:
 
 
 def fit_table(
-    parts: list[Sequence], robot: RobotSpec, lowest: float, nthread: int, progress: Callable[[float], None]
+    parts: list[Sequence],
+    robot: RobotSpec,
+    lowest: float,
+    nthread: int,
+    progress: Callable[[float], None],
+    judge: Callable[[RobotSpec], float] | None = None,
 ) -> Touch:
-    """Fit height, friction and stiffness of the table, and the zeros.
+    """Fit height, friction and stiffness of the table, and the zeros, from several starts.
 
     Args:
         parts: Windows in which a tip is low; those that fit worst without a table are fitted.
@@ -112,6 +118,8 @@ def fit_table(
         lowest: Tip height in them, m.
         nthread: Threads, 0 for all cores.
         progress: Called in each iteration with the root mean square error, rad.
+        judge: Error of a robot, rad, on recordings that are not fitted: says which start's table is taken; without
+            it the windows do.
     """
     if not parts:
         return Touch(robot, False, np.zeros(0), np.zeros(0), ())
@@ -122,15 +130,26 @@ def fit_table(
     scene = _Scene(_most_wrong(scene, away), with_table, nthread)
     motions = tuple(dict.fromkeys(s.meta.motion for s in scene.parts))
     before = scene.errors(away)
-    guesses = np.repeat(away, HEIGHTS, axis=0)
-    guesses[:, 0] = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else measured.height
-    start = guesses[np.argmin(soft(scene.soft_errors(guesses)))]
+    heights = lowest + STEP * np.arange(-2, HEIGHTS - 2) if measured is None else np.array([measured.height])
+    guesses = np.repeat(away, len(STARTS) * len(heights), axis=0)
+    guesses[:, 0], guesses[:, 2] = np.tile(heights, len(STARTS)), np.repeat(STARTS, len(heights))
+    costs = soft(scene.soft_errors(guesses)).reshape(len(STARTS), -1)
+    starts = guesses.reshape(*costs.shape, -1)[np.arange(len(STARTS)), costs.argmin(axis=1)]
+    found = [_searched(scene, start, measured is not None, progress) for start in starts]
+    tables = [_with_table(robot, x) for x, _ in found]
+    errors = [cost for _, cost in found] if judge is None else [judge(one) for one in tables]
+    best = int(np.argmin(errors))
+    without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
+    kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
+    return Touch(tables[best] if kept else robot, kept, without, within, motions)
+
+
+def _searched(scene: _Scene, start: Array, measured: bool, progress: Callable[[float], None]) -> tuple[Array, float]:
+    """Table and zeros (3 + n,) near a start that fit best, and their cost; its height stays where it was measured."""
+    n, rows = len(scene.op), scene.counted.sum() * len(scene.op)
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
-    low = np.array([start[0] - 0.03, FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
-    high = np.array([start[0] + 0.03, FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
-    if measured is not None:
-        low[0] = high[0] = measured.height
-    rows = scene.counted.sum() * n
+    low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
+    high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
 
     def cost(xs: Array) -> Array:
         """Of tables and zeros, one to a column."""
@@ -143,19 +162,19 @@ def fit_table(
     rng = np.random.default_rng(0)
     population = start + AROUND * unit * rng.standard_normal((CANDIDATES, len(unit)))
     population[0] = start
-    best = differential_evolution(
+    found = differential_evolution(
         cost, Bounds(low, high), init=np.clip(population, low, high), maxiter=GENERATIONS, tol=0, polish=False,
         vectorized=True, updating="deferred", callback=tell, rng=rng,
-    ).x  # fmt: skip
-    without, within = (scene.mean(e)[0] for e in (before, scene.errors(best[None])))
-    kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
-    found = robot
-    if kept:
-        zeros = robot.zero[robot.operated_index] + best[3:]
-        servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
-        height, friction, stiffness = (float(f"{x:.4g}") for x in (best[0], best[1], np.exp(best[2])))
-        found = replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
-    return Touch(found, kept, without, within, motions)
+    )  # fmt: skip
+    return found.x, float(found.fun)
+
+
+def _with_table(robot: RobotSpec, x: Array) -> RobotSpec:
+    """The robot with a table and zeros (3 + n,)."""
+    zeros = robot.zero[robot.operated_index] + x[3:]
+    servos = {j: {"zero": float(f"{z:.4g}")} for j, z in zip(robot.operated, zeros, strict=True)}
+    height, friction, stiffness = (float(f"{v:.4g}") for v in (x[0], x[1], np.exp(x[2])))
+    return replace(robot.with_servos(servos), table=Table(height, friction, stiffness))
 
 
 class _Scene:
