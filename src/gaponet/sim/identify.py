@@ -44,6 +44,7 @@ ENOUGH, LITTLE = 2e-3, 2e-4  # of the whole robot's cost, of the limbs': a fall 
 POLISH = 2  # iterations of the whole robot with a term of the law
 CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
+LASTS = 4.0  # s of recording that count as one independent measurement beside a belief
 BELIEF = {"kp": 0.5, "armature": 1.5}  # standard deviation of the logarithm of a file's value
 TOLD = 0.1  # the same of a kp that recordings state
 BETTER = 0.99  # of the given robot's error: less is an improvement
@@ -99,7 +100,7 @@ class Identified:
     Attributes:
         robot: The same robot with identified parameters; as it was given where nothing did better.
         before, after: Mean |error| of the motions that judged, rad: of the given robot, of this one.
-        chosen: What did best: given, joints (each on its own), whole (all together), or mixed.
+        chosen: What did best: given, joints (each on its own), whole (all together), limbs (each as one), or mixed.
         warnings: What ended at a bound, what to look at, and what the recordings do not determine (last).
         std: Joint → field → standard error; none of a shared law.
         tried: The terms of the law in the order tried.
@@ -195,7 +196,7 @@ def identify(
     judge = _Judge(list(validation) or parts, robot, below, nthread)
     whole, candidates = _classic(fit, clock, nthread)
     chosen, values = judge.best(candidates)
-    base = values if chosen != "given" else candidates["whole"]
+    base = values if chosen != "given" else candidates["limbs"]
     tried, richer = _with_terms(fit, whole, judge, terms, values, base, clock)
     if richer is not values:
         chosen, values = "whole" if chosen == "given" else chosen, richer
@@ -237,8 +238,9 @@ def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Value
     whole = fit.whole(nthread)
     clock.share(PARTS["whole"] / (1 - PARTS["joints"]), 1)
     first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
-    together = whole.limbs(whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot"), clock)
-    return whole, {"given": bounds.first, "whole": together, "joints": alone}
+    together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
+    limbs = whole.limbs(together, clock)
+    return whole, {"given": bounds.first, "limbs": limbs, "joints": alone, "whole": together}
 
 
 def _with_terms(
@@ -252,7 +254,8 @@ def _with_terms(
         if not set(TERMS[term]) & set(ALONE):
             searched = fit.fields_of(richer)
             x = whole.axes(searched, richer).of(richer)[None]
-            richer = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
+            polished = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
+            richer = min(richer, polished, key=lambda v: float(judge.errors(v).mean()))
         tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
         if tried[-1].kept:
             values = base = richer
@@ -424,8 +427,7 @@ class Fit:
         self.noise = np.maximum(SOFT * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
 
     def errors(self, values: Values, runs: JointRuns | FreeRuns) -> Array:
-        """Of (k, n) values, (k, n, rows), in SOFT; then, two more, how far kp and armature are from the file's: a
-        second of recording counts as one independent measurement."""
+        """Of (k, n) values, (k, n, rows), in SOFT; then, two more, how far kp and armature are from the file's."""
         if isinstance(runs, JointRuns):
             found = runs.errors(values)
             found = found.reshape(*found.shape[:2], -1)
@@ -433,7 +435,7 @@ class Fit:
             found = runs.run(values)
         told = {"kp": TOLD if self.bounds.stated else BELIEF["kp"], "armature": BELIEF["armature"]}
         given = {f: np.where(self.bounds.first[f] > 0, self.bounds.first[f], np.nan) for f in told}
-        weight = self.noise / SOFT * np.sqrt(1 / max(self.runs.dt, 0.01))
+        weight = self.noise / SOFT * np.sqrt(LASTS / max(self.runs.dt, 0.01))
         far = [np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / v)) * weight / told[f] for f, v in given.items()]
         return np.concatenate([found / np.float32(SOFT), np.stack(far, axis=-1)], axis=2, dtype=np.float32)
 

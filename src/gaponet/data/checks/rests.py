@@ -32,6 +32,7 @@ EVIDENCE = 10.0  # of other labels: rests times the logarithm by which their sca
 UNITS, CLEAR = 0.006, 6.0  # rad between two groups of recordings, and times the scatter inside them
 PLAIN = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
 USUAL = np.array([0.5, 0.5, 1.0, 0.1])  # how far they may be from it, where rests do not say
+ALONE = 3  # joints that must say so of one recording among others
 ODD = 10  # sequences that are told apart
 
 
@@ -76,6 +77,7 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
     while len(wrong) < ODD and (odd := _odd_one(surveys, robot, found, judged)) is not None:
         wrong.append(odd[1])
         found = found.only(found.sequence != odd[0])
+    wrong = wrong or _two_units(surveys, robot, found, judged, 1, ALONE)
     judged = [j for j in judged if (found.joint == j).sum() >= FEW]
     soft = {}
     for j in judged:
@@ -185,27 +187,29 @@ def _relabelled(surveys: list[Survey], found: _Rests, judged: list[int]) -> list
     return [Finding("warning", "payload", text, (), {"labels": labels, "rests_as": best[1]})]
 
 
-def _two_units(surveys: list[Survey], robot: RobotSpec, found: _Rests, judged: list[int]) -> list[Finding]:
-    """Do the recordings fall into two groups that rest apart, in two joints at least?"""
+def _two_units(
+    surveys: list[Survey], robot: RobotSpec, found: _Rests, judged: list[int], least: int = 2, joints: int = 2
+) -> list[Finding]:
+    """Do the recordings fall into two groups, of so many at least, that rest apart in so many joints?"""
     middle = np.full((len(surveys), len(judged)), np.nan)
     for column, j in enumerate(judged):
         mine = found.only(found.joint == j)
         left = mine.error - mine.columns @ _solve(mine.columns, mine.error)[0]
         for number in set(mine.sequence.tolist()):
-            if (mine.sequence == number).sum() > 2:
+            if (mine.sequence == number).sum() > 1:
                 middle[number, column] = np.median(left[mine.sequence == number])
     told = np.flatnonzero(np.isfinite(middle).all(axis=1))
-    best: tuple[int, float, list[str], Array] = (1, 0.0, [], told[:0])
+    best: tuple[int, float, list[str], Array] = (joints - 1, 0.0, [], told[:0])
     for column in range(len(judged)):
         order = told[np.argsort(middle[told, column])]
-        for cut in range(2, len(order) - 1):
+        for cut in range(least, len(order) + 1 - least) if len(order) > 2 else ():
             a, b = middle[order[:cut]], middle[order[cut:]]
             gap = np.abs(a.mean(axis=0) - b.mean(axis=0))
             within = np.sqrt((a.var(axis=0) * len(a) + b.var(axis=0) * len(b)) / (len(order) - 2))
             apart = (gap > UNITS) & (gap > CLEAR * np.maximum(within, 5e-4))
             names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
             best = max(best, (len(names), float(gap.max()), names, order[:cut]), key=lambda x: x[:2])
-    if best[0] < 2:
+    if best[0] < joints:
         return []
     motions = [[surveys[i].motion for i in told if (i in best[3]) == side] for side in (True, False)]
     text = (
