@@ -2,6 +2,7 @@
 
     python benchmarks/robots.py WORK --robots 60 --first 0        # goes on where it was cut short
     python benchmarks/robots.py WORK --robots 200 --small         # of 2 to 6 joints, up to 125 Hz, a minute of logs
+    python benchmarks/robots.py WORK --robots 1 --named ur5e --spoil units      # one public model
     python benchmarks/robots.py WORK --robots 0 --page docs/results/robots.md
 
 Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify; and
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from plain_fit import plain_fit
-from strangers import Stranger, draw
+from strangers import SPOILS, Stranger, draw, spoiled
 
 from gaponet.cli.main import main as gaponet
 from gaponet.data.split import split_entries
@@ -88,11 +89,13 @@ def write(robot: Stranger, folder: Path, logs: Iterable[Any]) -> float:
     return recorded
 
 
-def play(seed: int, folder: Path, motions: int, seconds: float | None, small: bool) -> Row:
+def play(
+    seed: int, folder: Path, motions: int, seconds: float | None, small: bool, named: str = "", spoil: str = SPOILS[0]
+) -> Row:
     """One robot of the tournament."""
-    robot = draw(seed, small=small)
-    row: Row = {"seed": seed, "small": small, "body": robot.body, "joints": len(robot.joints), "rate": robot.rate,
-                "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
+    robot = spoiled(draw(seed, small=small, named=named), spoil)
+    row: Row = {"seed": seed, "small": small, "spoil": spoil, "body": robot.body, "joints": len(robot.joints),
+                "rate": robot.rate, "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
     recordings = list(robot.recordings(motions, seconds))
     row["seconds_recorded"] = write(robot, folder / "logs", recordings)
     each, kinds = float(recordings[0].time[-1]), range(LATER, LATER + FRESH)
@@ -249,6 +252,8 @@ def main() -> None:
     parser.add_argument("--motions", type=int, default=12)
     parser.add_argument("--seconds", type=float, help="recorded of each robot; default two to five minutes")
     parser.add_argument("--small", action="store_true", help="small robots, a minute of logs")
+    parser.add_argument("--named", default="", help="part of a public model's path: every robot is this one")
+    parser.add_argument("--spoil", default=SPOILS[0], choices=SPOILS, help="what its file has wrong beyond that")
     parser.add_argument("--seeds", type=int, nargs="*", help="these, instead of a range; measured again")
     parser.add_argument("--keep", action="store_true", help="keep each robot's folder")
     parser.add_argument("--page", type=Path, help="write the tables here")
@@ -264,7 +269,7 @@ def main() -> None:
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
         with multiprocessing.get_context("fork").Pool(1) as process:
-            rows.append(process.apply(play, (seed, folder, args.motions, seconds, args.small)))
+            rows.append(process.apply(play, (seed, folder, args.motions, seconds, args.small, args.named, args.spoil)))
         journal.write_text("".join(json.dumps(row) + "\n" for row in rows))
         r = rows[-1]
         print(

@@ -27,6 +27,7 @@ LAWS = ("stribeck", "load", "backlash", "dead_band", "speed", "saturation", "fil
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
 SMALL, SLOW = 6, 125.0
+STILL, SPOILS = 3, ("as drawn", "units", "damping", "armature", "still")
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
 <worldbody>{}</worldbody></mujoco>"""
 
@@ -259,17 +260,27 @@ def _lag(target: Array, share: Array) -> Array:
     return found
 
 
-def draw(seed: int, public: bool | None = None, small: bool = False) -> Stranger:
+def spoiled(robot: Stranger, how: str) -> Stranger:
+    """The same robot, whose file is wrong in one way more (of SPOILS), or that does not move its first joints."""
+    if how == "still":
+        low, high = robot.low.copy(), robot.high.copy()
+        low[:STILL] = high[:STILL] = robot.home[:STILL]
+        return replace(robot, low=low, high=high)
+    factor = {"units": {"kp": np.pi / 180, "kd": np.pi / 180}, "damping": {"kd": 12.0, "damping": 12.0},
+              "armature": {"armature": 0.0}, "as drawn": {}}[how]  # fmt: skip
+    return replace(robot, said={f: x * factor.get(f, 1.0) for f, x in robot.said.items()})
+
+
+def draw(seed: int, public: bool | None = None, small: bool = False, named: str = "") -> Stranger:
     """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance.
-    small: the first made here of at most SMALL joints, at no more than SLOW Hz."""
+    small: the first made here of at most SMALL joints, at no more than SLOW Hz. named: one of PUBLIC, in part."""
     if small:
         next(i for i in range(100) if len((found := draw(seed + 10**6 * i, False)).joints) <= SMALL)
         return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))
-    spec, body = None, ""
-    if (chance if public is None else public) and (folder := _folder()) is not None:
-        body = list(PUBLIC)[place]
+    spec, body = None, next((m for m in PUBLIC if named and named in m), list(PUBLIC)[place])
+    if (bool(named) or (chance if public is None else public)) and (folder := _folder()) is not None:
         spec = _public(folder / body, PUBLIC[body])
     if spec is None:
         body = ("arm", "legs", "hand")[rng.integers(3)]
