@@ -1,7 +1,7 @@
 """The standing tournament: robots that nobody tuned on (strangers.py), as a user would have them, by commands alone.
 
     python benchmarks/robots.py WORK --robots 60 --first 0        # goes on where it was cut short
-    python benchmarks/robots.py WORK --robots 200 --small         # of 2 to 6 joints, up to 125 Hz, a minute of logs
+    python benchmarks/robots.py WORK --robots 200 --small         # of 2 to 4 joints, up to 60 Hz, a minute of logs
     python benchmarks/robots.py WORK --robots 1 --named ur5e --spoil units      # one public model
     python benchmarks/robots.py WORK --robots 0 --page docs/results/robots.md
 
@@ -95,7 +95,8 @@ def play(
     """One robot of the tournament."""
     robot = spoiled(draw(seed, small=small, named=named), spoil)
     row: Row = {"seed": seed, "small": small, "spoil": spoil, "body": robot.body, "joints": len(robot.joints),
-                "rate": robot.rate, "laws": list(robot.laws), "payload": robot.payload, "dirt": vars(robot.dirt)}  # fmt: skip
+                "rate": robot.rate, "laws": list(robot.laws), "payload": robot.payload,
+                "dirt": vars(robot.dirt)}  # fmt: skip
     recordings = list(robot.recordings(motions, seconds))
     row["seconds_recorded"] = write(robot, folder / "logs", recordings)
     each, kinds = float(recordings[0].time[-1]), range(LATER, LATER + FRESH)

@@ -26,7 +26,7 @@ RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
 LAWS = ("stribeck", "load", "backlash", "dead_band", "speed", "saturation", "filter")  # not of the form that is fitted
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
-SMALL, SLOW = 6, 125.0
+SMALL, SLOW = 4, 60.0
 STILL, SPOILS = 3, ("as drawn", "units", "damping", "armature", "still")
 ARM = """<mujoco><compiler angle="radian" autolimits="true"/><option integrator="implicitfast"/>
 <worldbody>{}</worldbody></mujoco>"""
