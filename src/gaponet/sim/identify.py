@@ -237,7 +237,7 @@ def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Value
     alone = fit.search(CLASSIC, bounds.start, clock, "joints, each on its own", fit.balanced())
     whole = fit.whole(nthread)
     clock.share(PARTS["whole"] / (1 - PARTS["joints"]), 1)
-    first = np.stack([whole.axes(CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
+    first = np.stack([Axes(whole.bounds, CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
     together = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "whole robot")
     limbs = whole.limbs(together, clock)
     return whole, {"given": bounds.first, "limbs": limbs, "joints": alone, "whole": together}
@@ -253,7 +253,7 @@ def _with_terms(
         richer = fit.search(TERMS[term], base | {f: fit.bounds.guess[f] for f in TERMS[term]}, clock, term)
         if not set(TERMS[term]) & set(ALONE):
             searched = fit.fields_of(richer)
-            x = whole.axes(searched, richer).of(richer)[None]
+            x = Axes(whole.bounds, searched, richer).of(richer)[None]
             polished = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
             richer = min(richer, polished, key=lambda v: float(judge.errors(v).mean()))
         tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
@@ -353,10 +353,6 @@ class Fit:
         fit.noise = self.noise
         return fit
 
-    def axes(self, fields: ListOf[str], rest: Values) -> Axes:
-        """Of these fields."""
-        return Axes(self.bounds, fields, rest)
-
     def fields_of(self, values: Values) -> list[str]:
         """Names that the whole robot can be searched for, classic ones first."""
         return [f for f in (*CLASSIC, *LAW) if f in values and f not in ALONE]
@@ -378,7 +374,7 @@ class Fit:
         """Fit the classic fields, those of the law that `start` has and these, every joint on its own, from a start,
         from at most two others, and from some beside the first, STARTS in all."""
         names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in start or f in fields]
-        axes = self.axes(names, start)
+        axes = Axes(self.bounds, names, start)
         rng = np.random.default_rng(0)
         x = np.repeat(axes.of(start)[None], STARTS, axis=0)
         x[1:] += SPREAD * rng.standard_normal(x[1:].shape)
@@ -399,7 +395,7 @@ class Fit:
     ) -> Values:
         """Fit these fields in the simulator of the whole robot, from starts on their axes, of which half go on."""
         assert self.company is not None
-        runs, axes = self.company, self.axes(fields, rest)
+        runs, axes = self.company, Axes(self.bounds, fields, rest)
         tell = clock.tell(what, self.base.operated, runs.rows)
         for i, count in enumerate(iterations):
             errors = lambda xs: self.errors(axes.values(xs), runs)  # noqa: E731
@@ -414,7 +410,7 @@ class Fit:
     def limbs(self, values: Values, clock: Clock) -> Values:
         """Fit what `descend` found once more, a joint's parameters by the errors of all joints of its limb."""
         assert self.company is not None
-        runs, axes, limbs = self.company, self.axes(self.fields_of(values), values), self.together
+        runs, axes, limbs = self.company, Axes(self.bounds, self.fields_of(values), values), self.together
         errors = lambda xs: limbs.pack(self.errors(axes.values(limbs.unpack(xs)), runs))  # noqa: E731
         rows, first = limbs.pack(runs.rows[:, None]).sum(axis=1), [self.base.operated[i] for i in limbs.at[:, 0]]
         x, (low, high) = limbs.pack(axes.of(values)[None]), map(limbs.pack, (axes.low, axes.high))
@@ -451,7 +447,7 @@ class Fit:
         end and how much windows pull against each other (a sandwich estimate, windows as clusters), together with how
         far one more step would go."""
         names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
-        axes, runs = self.axes(names, values), self.runs if self.company is None else self.company
+        axes, runs = Axes(self.bounds, names, values), self.runs if self.company is None else self.company
         x = axes.of(values)
         here, jac = (y[0] for y in slopes(x[None], axes.high, lambda xs: self.errors(axes.values(xs), runs)))
         weight = 1 / np.sqrt(1 + here**2)
@@ -489,7 +485,7 @@ class Fit:
     def bounds_met(self, values: Values) -> tuple[str, ...]:
         """Every parameter at a bound, with what to check; no friction, armature or delay at all are ordinary."""
         names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
-        axes, found = self.axes(names, values), []
+        axes, found = Axes(self.bounds, names, values), []
         x = axes.of(values)
         for i, joint in enumerate(self.base.operated):
             for k, f in enumerate(names):
@@ -510,7 +506,7 @@ class Fit:
     def undetermined(self, values: Values, std: Std, over_kp: Std) -> tuple[str, ...]:
         """Joints that stood, and parameters whose standard error is as large as what they may mean."""
         names, found = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"], []
-        axes = self.axes(names, values)
+        axes = Axes(self.bounds, names, values)
         x = axes.of(values)
         ahead = axes.values(x + 1)
         for i, joint in enumerate(self.base.operated):
