@@ -26,14 +26,14 @@ from gaponet_robots.control.driver import Driver, DriverError, Fault, State
 from gaponet_robots.control.following import Following
 from gaponet_robots.control.guard import Guard
 from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
-from gaponet_robots.control.plan import MOVED, Fence, Plan, Planner
+from gaponet_robots.control.plan import MOVED, SLOW, Fence, Plan, Planner
 from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Event, Recording
 from gaponet_robots.control.rows import Row
 from gaponet_robots.control.safety import ASTRAY, SOFT, Limits, SafetyConfig, Watch, limit_command, limit_delta
 from gaponet_robots.control.stop import Keys, StopRequest, on_signal
 from gaponet_robots.motion.minjerk import blend
-from gaponet_robots.motion.way import Way
+from gaponet_robots.motion.way import Search, Way
 from gaponet_robots.targets.policy import NotYet, Policy, play
 
 
@@ -54,6 +54,7 @@ PROVEN = 0.3  # weight beyond which a robot is not handed over before a joint ha
 FAR = 0.4  # … rad to the first target: at that weight more than friction may swallow
 PAST = 0.05  # rad beyond its range in which a joint may be found, where only the MJCF says where it ends
 WEIGHED = 2.0  # s of the run after which what the hands hold is compared with what was told
+LOOK = 0.3  # share of a period in which it looks for the way back
 PROMPT = 0.001  # s between the last look at the clock and a command's leaving that its limits allow for
 
 
@@ -125,6 +126,7 @@ class Controller:
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
             self._planner = Planner(robot, driver.commanded, self.config, self.safety)
         self._fence: Fence | None = None
+        self._looking: Search[Way] | None = None  # for the way back from targets that were not known in advance
         self._cut = ""  # what a target was cut for in the last period
         self._since = self._fresh = 0
         self._unfresh: Fault | None = None
@@ -484,9 +486,16 @@ class Controller:
                 return self._end(k, now, "end of the motion")
             self._enter(Phase.BLEND_OUT, k, now, "end", "end of the motion")
             self._from = self._last
-            if self._fence:
-                self._fence.homeward()
             self._go(self.plan.back if self.plan else None, self._last, self._found, state)
+            if self._fence and self._planner:
+                self._fence.homeward()
+                ends = self._full(self._last, state), self._full(self._found, state)
+                self._looking = self._planner.back(*ends) if self.dt >= SLOW else None
+        if self._looking:
+            if why := self._look(self._looking, k, state):
+                return self._end(k, now, f"where it is: {why}")
+            if self._looking:
+                return self._last, 1.0
         passed = (k - self._since) * self.dt
         if self.phase is Phase.RELEASE:
             if self._weight == 0.0:
@@ -500,6 +509,20 @@ class Controller:
             self._last = self._found
             return self._end(k, now, "back where it was found")
         return self._along(passed, self._from, self._found), 1.0
+
+    def _look(self, search: Search[Way], k: int, state: State) -> str:
+        """Go on looking for the way back for a share of this period, while the robot stands; why there is none."""
+        until = self.clock.now() + LOOK * self.dt
+        try:
+            while self.clock.now() <= until:
+                next(search)
+        except StopIteration as end:
+            self._looking, self._since = None, k
+            self._go(end.value, self._last, self._found, state)
+        except UsageError as error:
+            self._looking = None
+            return str(error)
+        return ""
 
     def _end(self, k: int, now: float, text: str) -> tuple[Array | None, float]:
         """The end of a run without fault, as the driver's robot can have it."""

@@ -20,7 +20,7 @@ from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.safety import SafetyConfig
 from gaponet_robots.motion.feasible import STILL_SHARE, Feasibility, stretch
 from gaponet_robots.motion.motion import GRID, Motion
-from gaponet_robots.motion.way import Way, find_points
+from gaponet_robots.motion.way import Search, Way, ended, find_points
 
 MOVED = 0.02  # rad by which the robot may have moved since the plan was made
 TOUCH = 0.001  # m by which what was found near may come nearer
@@ -110,8 +110,11 @@ class Planner:
             raise UsageError(f"motion '{motion.name}' begins with {self._said(start)}. Begin it elsewhere")
         fitted = self._calm(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
-        into = self._way(found, fitted.ctrl[0], columns, near)
-        back = self._way(fitted.ctrl[-1], found, columns, near) if self.config.blend_out else None
+        by_hand = "(bring the robot nearer by hand, or name more joints)"
+        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to where the motion begins {by_hand}"))
+        back = None
+        if self.config.blend_out:
+            back = ended(self._way(fitted.ctrl[-1], found, columns, near, f"back to where the robot is {by_hand}"))
         return self._judged(Plan(found, into, fitted, back, changed=_changes(wanted, fitted)), near)
 
     def begin(self, first: Array, found: Array) -> Plan:
@@ -131,7 +134,7 @@ class Planner:
         shares = np.linspace(1.0, 0.0, 41)[:, None]  # one that is only too near is not gone to as far as that
         clear = (self.collision.distances(found + shares * (goal - found)) >= near).all(axis=1)
         goal = found + float(shares[int(clear.argmax()), 0]) * (goal - found)
-        return self._judged(Plan(found, self._way(found, goal, moved, near)), near)
+        return self._judged(Plan(found, ended(self._way(found, goal, moved, near, "to the first target"))), near)
 
     def _calm(self, motion: Motion) -> Motion:
         """The motion, slowed where it accelerates more than joints can."""
@@ -156,7 +159,16 @@ class Planner:
         near = f"{100 * at:.1f} cm from each other" if at > 0 else f"{-100 * at:.1f} cm into each other"
         return f"{self.collision.nearest(free)} {near}; {100 * self.collision.clearance:g} cm are kept"
 
-    def _way(self, start: Array, goal: Array, columns: Array, near: Array) -> Way:
+    def back(self, start: Array, found: Array) -> Search[Way]:
+        """The way from where targets ended to where the robot was found, both (n,) rad; looks for it step by step.
+
+        Raises:
+            UsageError: There is none that keeps clear.
+        """
+        near = np.minimum(self._near(found), self.collision.along(start[None]) - 1e-9)
+        return self._way(start, found, self.robot.index(self.commanded), near, "back to where it was found")
+
+    def _way(self, start: Array, goal: Array, columns: Array, near: Array, what: str) -> Search[Way]:
         """From a posture (n,) rad to another by moving these joints."""
         low, high = start.copy(), start.copy()
         low[columns], high[columns] = self.limits.low[columns], self.limits.high[columns]
@@ -169,13 +181,10 @@ class Planner:
                 return False
             return all((np.abs(static_torque(m, rows[::4])) <= most).all() for m in self.limits.models)
 
-        points = find_points(free, start, goal, low, high, home)
+        points = yield from find_points(free, start, goal, low, high, home)
         if points is None:
-            free_space = self.collision.along(np.linspace(start, goal, 200))
-            raise UsageError(
-                f"no clear way was found from where the robot is to where the motion begins: the straight one brings "
-                f"{self._said(free_space)}. Bring the robot nearer to the motion's begin by hand, or name more joints"
-            )
+            straight = self.collision.along(np.linspace(start, goal, 200))
+            raise UsageError(f"no clear way was found {what}: the straight one brings {self._said(straight)}")
         return Way.along(points, self.config.blend_speed, self.safety.acceleration, self.config.blend)
 
     def _judged(self, plan: Plan, near: Array) -> Plan:

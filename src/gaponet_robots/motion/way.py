@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,11 +13,15 @@ from gaponet_robots.motion.collision import FINE
 from gaponet_robots.motion.minjerk import PEAK_ACCELERATION, blend, move_time
 
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
+T = TypeVar("T")
+Search = Generator[None, None, T]  # looks for a T in steps of a millisecond or so, one per next()
+Straight = Callable[[Array, Array], Search[bool]]
 
 REACH = 0.5  # rad by which a tree grows at once
 GROWTHS = 250  # before it is given up
 CUTS = 60  # attempts to cut a corner
 LEG = 0.5  # s, the least duration of one leg of several
+ROWS = 16  # postures that are looked at in one step of a search
 
 
 @dataclass(frozen=True)
@@ -62,9 +67,18 @@ def line(a: Array, b: Array) -> Array:
     return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / FINE)) + 1))
 
 
+def ended(search: Search[T]) -> T:
+    """What a search finds, whatever time it takes."""
+    while True:
+        try:
+            next(search)
+        except StopIteration as end:
+            return end.value
+
+
 def find_points(
     free: Free, start: Array, goal: Array, low: Array, high: Array, home: Array, seed: int = 0
-) -> Array | None:
+) -> Search[Array | None]:
     """Points (k, n) rad of a polygon from start to goal along which all is free, or None where none was found.
 
     Straight if possible, else by way of home, else by two random trees that grow towards each other (RRT-Connect,
@@ -75,26 +89,32 @@ def find_points(
         low, high: Where to search, (n,) rad; a joint with equal bounds is not moved.
     """
 
-    def straight(a: Array, b: Array) -> bool:
-        return free(line(a, b))
+    def straight(a: Array, b: Array) -> Search[bool]:
+        rows = line(a, b)
+        for at in range(0, len(rows), ROWS):
+            if not free(rows[at : at + ROWS]):
+                return False
+            yield
+        return True
 
-    if straight(start, goal):
+    if (yield from straight(start, goal)):
         return np.stack([start, goal])
-    if straight(start, home) and straight(home, goal):
+    if (yield from straight(start, home)) and (yield from straight(home, goal)):
         return np.stack([start, home, goal])
     rng = np.random.default_rng(seed)
-    points = _connect(straight, start, goal, low, high, rng)
-    return None if points is None else _cut(straight, points, rng)
+    points = yield from _connect(straight, start, goal, low, high, rng)
+    return None if points is None else (yield from _cut(straight, points, rng))
 
 
-def _connect(straight: Callable[[Array, Array], bool], start: Array, goal: Array, low: Array, high: Array,
-             rng: np.random.Generator) -> list[Array] | None:  # fmt: skip
+def _connect(
+    straight: Straight, start: Array, goal: Array, low: Array, high: Array, rng: np.random.Generator
+) -> Search[list[Array] | None]:
     trees = [([start], [-1]), ([goal], [-1])]  # postures, and from which each was reached
     for growth in range(GROWTHS):
         (here, came), (there, _) = trees
-        reached = _grow(straight, here, came, rng.uniform(low, high), once=growth % 8 > 0)
+        reached = yield from _grow(straight, here, came, rng.uniform(low, high), once=growth % 8 > 0)
         if reached is not None:
-            met = _grow(straight, there, trees[1][1], here[reached], once=False)
+            met = yield from _grow(straight, there, trees[1][1], here[reached], once=False)
             if met is not None and np.abs(there[met] - here[reached]).max() < 1e-9:
                 halves = [_back(*tree, at) for tree, at in zip(trees, (reached, met), strict=True)]
                 if growth % 2:
@@ -104,14 +124,13 @@ def _connect(straight: Callable[[Array, Array], bool], start: Array, goal: Array
     return None
 
 
-def _grow(straight: Callable[[Array, Array], bool], tree: list[Array], came: list[int], aim: Array, once: bool
-          ) -> int | None:  # fmt: skip
+def _grow(straight: Straight, tree: list[Array], came: list[int], aim: Array, once: bool) -> Search[int | None]:
     """Grow a tree towards `aim`, once or as far as it goes; where it got to, None if nowhere."""
     at = int(np.argmin(np.abs(np.array(tree) - aim).max(axis=1)))
     reached = None
     while (far := float(np.abs(aim - tree[at]).max())) > 1e-9:
         step = tree[at] + min(1.0, REACH / far) * (aim - tree[at])
-        if not straight(tree[at], step):
+        if not (yield from straight(tree[at], step)):
             break
         tree.append(step)
         came.append(at)
@@ -130,12 +149,12 @@ def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
     return found
 
 
-def _cut(straight: Callable[[Array, Array], bool], points: list[Array], rng: np.random.Generator) -> Array:
+def _cut(straight: Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:
     """The same with corners cut."""
     for _ in range(CUTS):
         if len(points) == 2:
             break
         i, k = sorted(rng.choice(len(points), 2, replace=False))
-        if k - i > 1 and straight(points[i], points[k]):
+        if k - i > 1 and (yield from straight(points[i], points[k])):
             points = [*points[: i + 1], *points[k:]]
     return np.array(points)

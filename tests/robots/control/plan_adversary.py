@@ -137,8 +137,9 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=1000)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--robot", choices=list(ROBOTS), nargs="+", default=list(ROBOTS))
     asked, bad = parser.parse_args(), 0
-    for name in ROBOTS:
+    for name in asked.robot:
         robot, began = load_robot(name), time.monotonic()
         told = {"robot": name, "plans": plans(robot, asked.poses, asked.seed)}
         told["live"] = live(robot, asked.seconds, asked.seed)

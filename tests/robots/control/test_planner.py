@@ -11,16 +11,17 @@ from contacts import Contacts
 
 from gaponet.cli.main import main
 from gaponet.errors import UsageError
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet_robots.control.clock import SimulatedClock
 from gaponet_robots.control.controller import Controller
+from gaponet_robots.control.driver import State
 from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.plan import Fence, Planner
 from gaponet_robots.drivers.virtual import VirtualDriver
 from gaponet_robots.motion.files import read_motion
 from gaponet_robots.motion.motion import Motion
-from gaponet_robots.motion.way import Way, find_points
+from gaponet_robots.motion.way import Way, ended, find_points
 from gaponet_robots.virtual.fleet import load_fleet
 
 FOLDED = np.array([0.2, -1.70, 1.65, 0.9, 0.4, 1.2])  # pan, lift, elbow, wrist flex and roll, gripper
@@ -58,12 +59,12 @@ def test_a_way_around_is_found_where_there_is_one():
     wall = lambda rows: bool(((np.abs(rows[:, 0]) > 0.2) | (rows[:, 1] > 0.6)).all())  # noqa: E731
     ends = np.array([[-1.0, -0.5, 0.3], [1.0, -0.5, 0.3]])
     low, high = np.array([-1.5, -1.0, 0.3]), np.array([1.5, 1.0, 0.3])
-    points = find_points(wall, *ends, low, high, home=np.zeros(3))
+    points = ended(find_points(wall, *ends, low, high, home=np.zeros(3)))
     np.testing.assert_array_equal(points[[0, -1]], ends)
     assert wall(np.concatenate([np.linspace(a, b, 200) for a, b in itertools.pairwise(points)]))
     assert (points[:, 2] == 0.3).all(), "a joint that may not move does not"
     shut = lambda rows: bool((np.abs(rows[:, 0]) > 0.2).all())  # noqa: E731
-    assert find_points(shut, *ends, low, high, home=np.zeros(3)) is None
+    assert ended(find_points(shut, *ends, low, high, home=np.zeros(3))) is None
 
 
 def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
@@ -123,6 +124,51 @@ def test_a_controller_cuts_them_and_says_what_for(so101, judge):
     assert recording.fault is None
     assert max(judge.deepest(q)[0] for q in sent) == 0
     assert any("targets are cut: " in e.text and "the plane at 0 m" in e.text for e in recording.events)
+
+
+ACROSS = np.array([-1.34, 0.86, 2.96, 2.27, -0.21, -1.15, -0.1, -2.5, 1.97, 1.78])  # straight from there to HERE …
+HERE = np.array([0.36, 2.83, -1.86, 1.95, 1.71, 1.47, -0.22, -0.6, 3.08, 2.84])  # … its arms go 14 cm into each other
+
+
+@pytest.mark.parametrize("way", ["by way of home", "none"])
+def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(way, monkeypatch):
+    robot = load_robot("h1_2")
+    judge, found, far = Contacts(robot), robot.qpos_home.copy(), robot.qpos_home.copy()
+    at = robot.index(robot.operated)
+    found[at], far[at] = HERE, ACROSS
+    controller, sent = virtual(robot, found)
+    driver = controller.driver
+    driver.read = lambda: State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))))
+    controller.watch.noisy = False
+    assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
+    legs = [found, robot.qpos_home, far]
+    rows = np.concatenate([Way.along(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)])
+
+    def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
+        for _ in find_points(*given) if way != "none" else range(50):
+            controller.clock._now += 0.001
+            yield
+        return None if way == "none" else ended(find_points(*given))
+
+    def policy(k, state):
+        if k:
+            monkeypatch.setattr("gaponet_robots.control.plan.find_points", search)
+        return rows[k] if k < len(rows) else None
+
+    recording = controller.run(policy)
+    assert recording.fault is None, recording.fault
+    last = recording.events[-1].text
+    assert judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0] == 0
+    back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
+    if way == "none":
+        assert last.startswith("where it is: no clear way was found back to where it was found: the straight one ")
+        assert last.endswith("; hold")
+        np.testing.assert_allclose(sent[-1][at], ACROSS, atol=0.02)
+        return
+    assert last == "back where it was found; hold"
+    np.testing.assert_allclose(sent[-1][at], HERE, atol=0.02)
+    still = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
+    assert 2 < still < 100, "it looks for a share of each period"
 
 
 @pytest.mark.parametrize(("beyond", "kind"), [(0.03, None), (0.2, "plan")])
