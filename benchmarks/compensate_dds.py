@@ -38,7 +38,7 @@ def main(
     """
     print(f"VIRTUAL h1_2 unit {unit}, {payload_mass:g} kg per hand, DDS on lo, states at {state_rate:g} Hz")
     for motion in motions:
-        options = ["--motion", motion, "--payload-mass", f"{payload_mass:g}"]
+        options = ["--motion", motion, "--payload-mass", f"{payload_mass:g}", "--max-payload", "3"]
         raw, compensated = (
             play(
                 domain,

@@ -49,16 +49,16 @@ def record(
         unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
     request = Request(**vars(asked), payload_mass=payload_mass)
     spec = asked_robot(request)
-    if Dataset.peek(out, spec) is not None:  # before anything moves
+    known = Dataset.peek(out, spec)
+    if known is not None:  # before anything moves
         require_kept(out, spec, DatasetError, MOVE_KEPT)
-    known = Dataset.create(out, spec)
     written: list[str] = []
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):
         recording, played, spec = perform(screen, name, request, count, out / "recordings")
         assert played
         slot = (played.name, unit_id, payload_mass, side)
-        same = [e for e in known.entries if e.meta.slot == slot]
+        same = [e for e in known.entries if e.meta.slot == slot] if known else []
         stem = f"{played.name}-{unit_id}-{payload_mass:g}kg-{len(same)}"
         stem = recording.save(out / "recordings", stem).stem
         if recording.fault:
@@ -71,6 +71,7 @@ def record(
             f"recordings/{stem}.parquet", notes={"controller": recording.summary()},
         )  # fmt: skip
         sequence = to_sequence(recording.log(stem), spec, meta)
+        known = known or Dataset.create(out, spec)  # not before there is something to keep
         written.append(known.append(sequence, findings(sequence)).id)
         errors.append(tracking(recording))
         screen.say(f"added to {out}: {written[-1]}, {len(sequence)} rows at {sequence.rate:.2f} Hz")

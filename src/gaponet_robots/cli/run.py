@@ -69,8 +69,8 @@ class Asked:
     payload_side: str = "both"
     """both, or one hand."""
     max_payload: float | None = None
-    """kg that the motion must be possible with; default 3 for named motions, so that all payloads play the same one,
-    and payload_mass for files."""
+    """kg in each hand that the motion must be possible with; default payload_mass, 0 without one. A motion of the
+    library that several payloads shall play alike needs the heaviest of them here."""
     reach: tyro.conf.OmitArgPrefixes[Reach] = Reach()
     """How to reach the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
@@ -186,7 +186,7 @@ def perform(
             compensator.require_gains(robot.joint_names, robot.kp, robot.kd)
         if motion:
             controller.plan = planner.plan(motion, robot.read().qpos)
-            _show(screen, controller.plan, spec, robot, asked)
+            _show(screen, controller.plan, spec, robot, limits.max_payload)
         if asks:
             _ask(screen, robot, f"as {asked.targets} says" if motion is None else "as planned")
 
@@ -287,19 +287,17 @@ def _require_hung(asked: Request) -> None:
 
 def find_motion(name: str | None, asked: Request, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
     """A motion file as it is, or a motion of the library, or None for live targets; and the limits it must keep."""
-    from gaponet_robots.motion.feasible import MAX_PAYLOAD
     from gaponet_robots.motion.files import SUFFIXES, read_motion
     from gaponet_robots.motion.library import Library
 
     payload = asked.payload_mass or 0.0
-    is_name = name is not None and not name.endswith(SUFFIXES)
-    heaviest = max(payload, MAX_PAYLOAD if is_name else 0.0) if asked.max_payload is None else asked.max_payload
+    heaviest = payload if asked.max_payload is None else asked.max_payload
     if heaviest < payload:
         raise UsageError(f"--max-payload {heaviest:g} is less than --payload-mass {payload:g}")
     library = Library(robot, max_payload=heaviest, height=asked.plane, unchecked=asked.unchecked)
     if name is None:
         return None, library.limits
-    return library.make(name) if is_name else read_motion(name, robot), library.limits
+    return read_motion(name, robot) if name.endswith(SUFFIXES) else library.make(name), library.limits
 
 
 def make_driver(asked: Request, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
@@ -370,7 +368,7 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
     return compensator, unit if unit in known else None
 
 
-def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, asked: Request) -> None:
+def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: float) -> None:
     """From where to where, what moves and what is held, how near it comes to what, and how it ends."""
     from gaponet_robots.control.plan import STILL
 
@@ -386,6 +384,7 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, asked: Requ
     ])  # fmt: skip
     around = len(plan.into.points) - 2
     how = {"hand_over": "handed over to the robot's own controller", "hold": "held", "damp": "damped, then let go"}
+    load = f"with up to {heaviest:g} kg in each hand" if heaviest else "with nothing in the hands (--payload-mass)"
     back = "goes back to where it was found and is " if plan.back else "is "
     for text in (
         f"held where found: {', '.join(held)}" if held else "",
@@ -393,8 +392,8 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, asked: Requ
         f"it goes around what is in between ({around} stops)" if around else "",
         "nobody looks whether it meets itself or what it stands on" if not np.isfinite(plan.clearance)
         else f"nearest to each other: {plan.nearest}, {100 * plan.clearance:.1f} cm",
-        f"most torque: {plan.joint}, {plan.torque:.2f} of what may be used",
-        f"at the end it {back}{how[driver.at_end]}; a stop damps it",
+        f"most torque, {load}: {plan.joint}, {plan.torque:.2f} of what may be used",
+        f"at the end it {back}{how[driver.at_end]}; a stop {driver.at_stop} it",
     ):  # fmt: skip
         if text:
             screen.say(f"  {text}")

@@ -62,6 +62,7 @@ class Driver(Protocol):
             it); final once connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
             takes over), hold (servos keep the last target after `close`), damp (nobody holds it afterwards).
+        at_stop: What `damp` does to it, as a verb: damps, lowers.
     """
 
     address: str
@@ -75,6 +76,7 @@ class Driver(Protocol):
     qpos_range: Array | None
     facts: dict[str, Any]
     at_end: End
+    at_stop: str
 
     def connect(self) -> None:
         """Open the bus and wait for a first state; commands nothing, publishes nothing.

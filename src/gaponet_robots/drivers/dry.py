@@ -27,7 +27,7 @@ class DryRun:
         self.driver = driver
         self.address = driver.address  # under the same lock: a serial bus has one speaker, who only reads too
         self.joint_names, self.commanded = driver.joint_names, driver.commanded
-        self.noisy, self.at_end = driver.noisy, driver.at_end
+        self.noisy, self.at_end, self.at_stop = driver.noisy, driver.at_end, driver.at_stop
         self.reads_back = True  # of what was not sent nothing can be read
         self._adopt()
         self._at = np.array([driver.joint_names.index(name) for name in driver.commanded])

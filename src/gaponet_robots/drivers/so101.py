@@ -67,6 +67,7 @@ class SO101Driver:
     noisy = False  # a resting encoder reads the same for ever
     reads_back = True
     at_end: End = "hold"
+    at_stop = "lowers"
 
     def __init__(
         self,

@@ -89,6 +89,7 @@ class UnitreeDriver:
         self.qpos_range: Array | None = None
         self.facts: dict[str, Any] = {}
         self.at_end: End = "hand_over" if topic == "arm_sdk" else "damp"
+        self.at_stop = "damps"
         self.domain, self.interface, self.sole, self.silent = domain, interface, sole, silent
         self.address = f"unitree dds domain {domain}"
         self.virtual = False

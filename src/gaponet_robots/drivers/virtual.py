@@ -70,6 +70,7 @@ class VirtualDriver:
     noisy = True
     reads_back = True
     at_end: End = "hold"
+    at_stop = "damps"
     qpos_range: Array | None = None
 
     def __init__(

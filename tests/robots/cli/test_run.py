@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -55,7 +56,29 @@ def test_a_stopped_run_says_so_and_is_not_added(arm, motion, tmp_path, capsys):
     command += ["--robot", str(arm.mjcf.parent), *FAST, "--safety.temperature", "20"]
     assert main(command) == 2
     assert "it was not added" in capsys.readouterr().err
-    assert len(Dataset(out)) == 0
+    assert not (out / "dataset.json").exists()
+    assert main([*command[:-2]]) == 0, "the next one makes it"
+    assert len(Dataset(out)) == 1
+
+
+def test_a_refused_plan_leaves_nothing_behind(tmp_path, capsys):
+    (tmp_path / "down.csv").write_text("time,shoulder_lift,elbow_flex\n0,1.7,0.3\n0.5,1.7,0.3\n")
+    command = ["record", "--robot", "so101", "--motion", str(tmp_path / "down.csv"), "--payload-mass", "0", *FAST]
+    assert main([*command, "--out", str(tmp_path / "set"), "--unit", "1"]) == 2
+    assert "'down' begins with" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(("told", "load"), [([], "with nothing in the hands"), (["--payload-mass", "0.1"], "0.1 kg")])
+def test_the_plan_says_the_payload_that_it_is_for_and_how_a_stop_ends(told, load, capsys):
+    """And a motion of the library is for that payload, not for the 3 kg that an SO-101 cannot hold."""
+    command = ["run", "--robot", "so101", "--motion", "tour-all-0", "--unit", "1", *told, *FAST]
+    assert main([x for x in command if x != "--json"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    share = re.search(rf"most torque, [^:]*{re.escape(load)}[^:]*: \w+, (\d\.\d\d) of what may be used", said)
+    assert share, said
+    assert 0 < float(share[1]) <= 1.1
+    assert "is held; a stop damps it" in said
 
 
 def test_a_motion_of_legs_is_refused_before_anything_is_opened(tmp_path, capsys):
