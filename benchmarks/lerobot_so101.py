@@ -63,6 +63,7 @@ def main(
     register_third_party_plugins()
     wait_longer()
     count_frames()
+    tell_where_it_is()
     excitation, data, arm, run, out = (work / x for x in ("excitation", "data", "identified", "run", "exported"))
     if not excitation.is_dir():
         call("excite", "--robot", "so101", "--minutes", f"{minutes:g}", "--out", excitation)
@@ -103,6 +104,21 @@ def wait_longer() -> None:
         self.packet_timeout += 10_000
 
     feetech.patch_setPacketTimeout = patient
+
+
+def tell_where_it_is() -> None:
+    """gaponet_motion plans from where the arm is; LeRobot's own robot tells it."""
+    from lerobot.robots.so_follower import SO101Follower
+    from lerobot_robot_gaponet import saw
+
+    observe = SO101Follower.get_observation
+
+    def observed(self):  # type: ignore[no-untyped-def]
+        found = observe(self)
+        saw(found)
+        return found
+
+    SO101Follower.get_observation = observed
 
 
 def softer(folder: Path) -> Path:

@@ -10,7 +10,6 @@ import shlex
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -49,6 +48,14 @@ class Units:
     def named(self, qpos: np.ndarray) -> dict[str, float]:
         """(n,) rad as LeRobot has it."""
         return dict(zip(self.keys, ((qpos - self.zero) / self.scale).tolist(), strict=True))
+
+
+_seen: dict[str, float] = {}
+
+
+def saw(observation: dict[str, Any]) -> None:
+    """Where the arm of this process is, for gaponet_motion: gaponet_so101 says it; for another robot a program does."""
+    _seen.update({key: float(value) for key, value in observation.items() if key.endswith(".pos")})
 
 
 @RobotConfig.register_subclass("gaponet_so101")
@@ -144,6 +151,7 @@ class GaponetSO101(Robot):
         if state is None:
             said = self._log.read_text(errors="replace").strip().splitlines() if self._process else []
             raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(said[-2:])}")
+        saw(self.units.named(state.qpos))
         return self.units.named(state.qpos) | {name: camera.read_latest() for name, camera in self.cameras.items()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
@@ -180,11 +188,16 @@ class GaponetMotionConfig(TeleoperatorConfig):
 
     motions: str = ""  # a folder, or files and names with commas between; each begins where the last one ended
     fps: float = DEFAULT_RATE  # as --dataset.fps
-    lead: float = 4.0  # s for which the first target stands, until the arm is there
+    lead: float = 4.0  # s for which it stands where it was found, until the controller is there
+    payload_mass: float = 0.0  # kg in the gripper that the plan is for
 
 
 class GaponetMotion(Teleoperator):
-    """Says one row of its motions a call, the last one for ever."""
+    """Says one row of its motions a call, the last one for ever.
+
+    One plan from where the arm was found through all of them, checked before the first row is said, as of gaponet run:
+    joints that a motion does not name stay where they are, and ways from one to the next keep clear.
+    """
 
     config_class = GaponetMotionConfig
     name = "gaponet_motion"
@@ -194,7 +207,9 @@ class GaponetMotion(Teleoperator):
         self.config = config
         self.spec = load_robot("so101")
         self.units = Units(self.spec)
-        self._rows: Iterator[np.ndarray] | None = None
+        self._connected = False
+        self._rows: np.ndarray | None = None
+        self._said = 0
 
     @property
     def action_features(self) -> dict[str, type]:
@@ -206,7 +221,7 @@ class GaponetMotion(Teleoperator):
 
     @property
     def is_connected(self) -> bool:
-        return self._rows is not None
+        return self._connected
 
     @property
     def is_calibrated(self) -> bool:
@@ -219,43 +234,52 @@ class GaponetMotion(Teleoperator):
         """Nothing to do."""
 
     def connect(self, calibrate: bool = True) -> None:
-        self._rows = self._all_rows()
+        self._connected, self._rows, self._said = True, None, 0
 
-    def _all_rows(self) -> Iterator[np.ndarray]:
+    def plan(self, found: np.ndarray) -> np.ndarray:
+        """All rows (T, n) rad from where the arm was found, (n,) rad.
+
+        Raises:
+            UsageError: Some part of it would touch arm or table, or needs too much; the message says which.
+        """
+        from gaponet_robots.control.phases import ControlConfig
+        from gaponet_robots.control.plan import Planner
         from gaponet_robots.motion.files import SUFFIXES, read_motion
         from gaponet_robots.motion.library import Library
-        from gaponet_robots.motion.minjerk import blend, move_time
 
         given, dt = self.config.motions, 1 / self.config.fps
         files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES) if Path(given).is_dir() else []
-        library, last = Library(self.spec, max_payload=0.0), None
+        library = Library(self.spec, max_payload=self.config.payload_mass)
+        one = ControlConfig(blend=1.0, blend_out=False)
+        planner = Planner(self.spec, self.spec.joint_names, one, limits=library.limits)
+        parts = [np.repeat(found[None], max(1, round(self.config.lead / dt)), axis=0)]
         for word in files or given.split(","):
-            name = word
-            if word.endswith(SUFFIXES):
-                motion = read_motion(word, self.spec)
-                library.add(motion)
-                name = motion.name
-            rows = library.make(name).sample(dt)
-            if last is None:
-                yield from [rows[0]] * round(self.config.lead / dt)
-            else:
-                steps = round(float(move_time(np.abs(rows[0] - last).max(), 0.5, 1.0)) / dt)
-                yield from (last + float(blend(np.array(k / steps))) * (rows[0] - last) for k in range(steps))
-            yield from rows
-            last = rows[-1]
-        while True:
-            yield last
+            motion = read_motion(word, self.spec) if word.endswith(SUFFIXES) else library.make(word)
+            plan = planner.plan(motion, parts[-1][-1])
+            assert plan.motion
+            parts += [plan.into.rows(dt)[1:], plan.motion.sample(dt)]
+        return np.concatenate(parts)
 
     def get_action(self) -> dict[str, float]:
-        if self._rows is None:
+        if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected")
-        return self.units.named(next(self._rows))
+        if self._rows is None:
+            found = self.units.rad(_seen)
+            if not np.isfinite(found).all():
+                raise DeviceNotConnectedError(
+                    "gaponet_motion plans from where the arm is, and nobody has said that: use it with gaponet_so101, "
+                    "or call lerobot_robot_gaponet.saw(observation) with your robot's first observation"
+                )
+            self._rows = self.plan(found)
+        row = self._rows[min(self._said, len(self._rows) - 1)]
+        self._said += 1
+        return self.units.named(row)
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Nobody feels it."""
 
     def disconnect(self) -> None:
-        self._rows = None
+        self._connected = False
 
 
 @ProcessorStepRegistry.register("gaponet_correct")

@@ -63,7 +63,7 @@ def calibrate(
         )
         servos = _servos(made.robot)
         _show(screen, made.unit, servos, made.payload_mass, made.payload_std)
-        screen.say(f"next: gaponet run MOTION --robot {as_option(out)} --compensate")
+        screen.say(f"next: gaponet run --motion FILE --robot {as_option(out)} --compensate")
         screen.result({
             "unit_id": made.unit, "before": before, "after": after, "servos": servos, "robot": str(out),
             "payload_mass": made.payload_mass, "payload_std": made.payload_std,

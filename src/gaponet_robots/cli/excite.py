@@ -44,7 +44,7 @@ def excite(
     write_text(out / "sheet.md", sheet(spec, plan, files, rate))
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
     screen.say(f"{len(files)} motions, {plan.minutes:.1f} min at {masses} kg for {spec.name}: {out!s}")
-    screen.say(f"Next: print {out / 'sheet.md'}; play them (gaponet run FILE, gaponet record FILE, or your own player)")
+    screen.say(f"Next: print {out / 'sheet.md'}; play them (gaponet run or record --motion FILE, or your own player)")
     screen.result(
         {"motions": files, "minutes": plan.minutes, "payloads": plan.payloads, "sheet": str(out / "sheet.md")}
     )

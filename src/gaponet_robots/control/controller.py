@@ -21,6 +21,8 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model
 from gaponet_robots.control.clock import Clock, MonotonicClock, uncollected
 from gaponet_robots.control.driver import Driver, DriverError, Fault, State
 from gaponet_robots.control.following import Following
@@ -104,6 +106,7 @@ class Controller:
         self.watch = Watch(driver.joint_names, self.joints, self.dt, self.safety, driver.noisy)
         share = 0.0 if driver.reads_back else self.safety.following
         self.following = Following(driver.commanded, self.dt, share)
+        self._laden = build_model(robot.nominal or robot, payload_mass or 0.0) if share else None
         self.stop = StopRequest()
         self.phase = Phase.IDLE
         self.recording = Recording(
@@ -117,7 +120,7 @@ class Controller:
         self._ctrl: Array | None = None  # commanded joints
         self._weight: float | None = None  # that was sent last; None: nothing was ever commanded
         self._error: BaseException | None = None
-        self._handed, self._weighed = 0.0, False  # weight in blend_in
+        self._handed, self._passed, self._weighed = 0.0, 0.0, False  # weight, and s on the way, in blend_in
         self._soft = False  # whether a robot that cannot brake is lowered while it damps
         self._loose = False  # whether nobody has confirmed that it is damped
         self._delta = np.zeros(len(self.joints))
@@ -254,13 +257,15 @@ class Controller:
 
     def _follows(self, state: State) -> Fault | None:
         """The joint that does not go where the last commands went."""
-        if self._ctrl is None or self.phase not in (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT):
+        watched = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT)
+        if self._laden is None or self._ctrl is None or self.phase not in watched:
             self.following.rest()
             return None
         handed = self._handed if self.driver.at_end == "hand_over" else 1.0
-        effort = state.tau[self.joints] * self.safety.torque_share / self.limits.effort
+        limit = self.limits.effort / self.safety.torque_share
         asked = self._found + handed * (self._asked - self._found)
-        return self.following.check(asked, state.qpos[self.joints], effort)
+        load = lambda: static_torque(self._laden, state.qpos[None])[0, self.joints] / limit  # noqa: E731
+        return self.following.check(asked, state.qpos[self.joints], state.tau[self.joints] / limit, load)
 
     def _latched(self, fault: Fault | None) -> Fault | None:
         if self._ended:
@@ -452,8 +457,7 @@ class Controller:
 
     def _target(self, k: int, now: float, state: State, policy: Policy) -> tuple[Array | None, float]:
         """Target of the commanded joints, and how far the robot is handed over; None where the phase just ended."""
-        passed = (k - self._since) * self.dt
-        arrived = passed >= self._blend_time + self.config.settle
+        arrived = self._passed >= self._blend_time + self.config.settle
         if self.phase is Phase.BLEND_IN and arrived and self._handed > 1.0 - 1e-9:
             self._enter(Phase.RUN, k, now, "", "motion")
         asked = None
@@ -469,11 +473,13 @@ class Controller:
             if waiting and arrived:
                 self._fail(k, now, self.following.blame(int(way.argmax())))
                 return None, 0.0
-            most = PROVEN if waiting else 1.0
-            leg = float(self._way.times[1])  # straight, so a robot that is handed over in part is on it too
-            handed = min(passed / leg, self._handed + self.dt / leg, most)
-            self._handed = max(self._handed, handed)
-            return self._along(passed, self._found, goal), self._handed
+            at, more = self._passed, self._handed + self.dt / self.config.blend
+            self._handed = max(self._handed, min(more, PROVEN if waiting else 1.0))
+            lags = self.driver.at_end == "hand_over" and way.max() >= FAR and self._handed < 1.0 - 1e-9
+            if waiting or not lags:  # while it is handed over joints lag, each in its own way: it stands meanwhile
+                self._passed += self.dt
+            return self._along(at, self._found, goal), self._handed
+        passed = (k - self._since) * self.dt
         if self.phase is Phase.RUN:
             if not self._weighed and passed >= WEIGHED:
                 self._weighed = True

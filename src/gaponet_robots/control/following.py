@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from gaponet.arrays import Array
@@ -10,7 +12,8 @@ from gaponet_robots.control.driver import Fault
 LAG = 0.15  # s: time constant of a servo that is slower than any here; joints are compared with what it would do
 STRIDE = 0.05  # rad of that slow servo's way on which a joint must have moved along
 RANGE = 0.25  # rad that its way may span without that; friction was seen to hold a joint in a band of 0.14 rad
-STRAINED = 0.5  # share of its effort limit from which on a joint pushes
+STRAINED = 0.5  # share of its effort limit from which on a joint pushes …
+LADEN = 0.5  # … against its load, where gravity alone asks for that much of this
 
 
 class Following:
@@ -35,15 +38,16 @@ class Following:
         """Nothing is commanded that joints could follow."""
         self._slow = None
 
-    def check(self, command: Array, qpos: Array, effort: Array) -> Fault | None:
+    def check(self, command: Array, qpos: Array, effort: Array, load: Callable[[], Array]) -> Fault | None:
         """Take in one period; the joint that has not followed for long.
 
         Args:
             command: Where the robot is asked to be, (n) rad, as far as it was handed over. Not what was sent: that
                 never goes further from a joint than its torque allows, and so goes with one that hangs.
             qpos: Measured, (n) rad.
-            effort: Measured torque as a share of the effort limit, (n): a joint that pushes as hard as it can towards
-                its command obeys, though it does not move.
+            effort: Measured torque as a share of the effort limit, (n).
+            load: Gravity's torque as a share of it, (n), asked where a joint pushes: one that pushes as hard as it can
+                against a load that it was told of obeys, though it does not move; one that is held does not.
         """
         if self._slow is None:
             self._slow = command.copy()
@@ -56,7 +60,10 @@ class Following:
         up, down = slow - self._low >= STRIDE, self._high - slow >= STRIDE
         went = np.where(up, qpos - self._at_low, self._at_high - qpos)
         done = up | down
-        pushes = effort * np.sign(command - qpos) >= STRAINED
+        side = np.sign(command - qpos)
+        pushes = effort * side >= STRAINED
+        if (done & pushes).any():
+            pushes &= load() * side >= LADEN * STRAINED
         follows = done & ((went >= self.share * STRIDE) | pushes)
         self.shown |= follows & ~pushes
         self._least = np.where(follows, slow, np.minimum(self._least, slow))
@@ -66,13 +73,11 @@ class Following:
         for place in (self._at_low, self._at_high):
             place[done] = qpos[done]
         deaf = self._most - self._least >= RANGE
-        if not deaf.any() or not self.share:
-            return None
-        return self.blame(int(deaf.argmax()))
+        return self.blame(int(deaf.argmax())) if deaf.any() else None
 
     def blame(self, joint: int) -> Fault:
         """The fault of a joint that does not follow."""
         return Fault(
-            "obedience", f"{self.names[joint]} does not go where it is told; is the robot in a mode that ignores "
-            "commands, is the joint blocked, or does it take another joint's commands?"
+            "obedience", f"{self.names[joint]} does not follow: blocked, limp or not listening (in a mode that ignores "
+            "commands, or to another joint's)"
         )  # fmt: skip

@@ -13,9 +13,9 @@ from gaponet_robots.motion.collision import FINE
 from gaponet_robots.motion.minjerk import PEAK_ACCELERATION, blend, move_time
 
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
-T = TypeVar("T")
-Search = Generator[None, None, T]  # looks for a T in steps of a millisecond or so, one per next()
-Straight = Callable[[Array, Array], Search[bool]]
+_T = TypeVar("_T")
+Search = Generator[None, None, _T]  # looks for something in steps of a millisecond or so, one per next()
+_Straight = Callable[[Array, Array], Search[bool]]
 
 REACH = 0.5  # rad by which a tree grows at once
 GROWTHS = 250  # before it is given up
@@ -67,7 +67,7 @@ def line(a: Array, b: Array) -> Array:
     return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / FINE)) + 1))
 
 
-def ended(search: Search[T]) -> T:
+def ended(search: Search[_T]) -> _T:
     """What a search finds, whatever time it takes."""
     while True:
         try:
@@ -107,7 +107,7 @@ def find_points(
 
 
 def _connect(
-    straight: Straight, start: Array, goal: Array, low: Array, high: Array, rng: np.random.Generator
+    straight: _Straight, start: Array, goal: Array, low: Array, high: Array, rng: np.random.Generator
 ) -> Search[list[Array] | None]:
     trees = [([start], [-1]), ([goal], [-1])]  # postures, and from which each was reached
     for growth in range(GROWTHS):
@@ -124,7 +124,7 @@ def _connect(
     return None
 
 
-def _grow(straight: Straight, tree: list[Array], came: list[int], aim: Array, once: bool) -> Search[int | None]:
+def _grow(straight: _Straight, tree: list[Array], came: list[int], aim: Array, once: bool) -> Search[int | None]:
     """Grow a tree towards `aim`, once or as far as it goes; where it got to, None if nowhere."""
     at = int(np.argmin(np.abs(np.array(tree) - aim).max(axis=1)))
     reached = None
@@ -149,7 +149,7 @@ def _back(tree: list[Array], came: list[int], at: int) -> list[Array]:
     return found
 
 
-def _cut(straight: Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:
+def _cut(straight: _Straight, points: list[Array], rng: np.random.Generator) -> Search[Array]:
     """The same with corners cut."""
     for _ in range(CUTS):
         if len(points) == 2:

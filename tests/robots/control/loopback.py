@@ -70,6 +70,9 @@ class Disobedient(VirtualH12):
             hg.LowCmd.set_motors(data, "q", q)
             hg.LowCmd.set_motors(data, "kp", kp)
         super()._apply(topic, data, now)
+        if wrong and self.way == "blocked":  # something holds the forearm: it creeps
+            for damping in (self.live.unit._damping, self.live.unit._cold_damping):
+                damping[:, self.live.unit.batch.model.joint("left_elbow_joint").dofadr[0]] = 1000.0
         if wrong and self.way == "weak":
             kp, kd, effort, torque = self.live._law
             self.live.set_gains(kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque)
