@@ -25,7 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.eval.whose import label
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
-from gaponet.model.calibration import EVALUATIONS, FIELDS, PRIOR, calibrate, recordings
+from gaponet.model.calibration import calibrate, recordings
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import DEFAULT_TERMS
 from gaponet.sim.refit import refit
@@ -77,7 +77,7 @@ class Played:
 def methods_of(bench: Bench, models: list[GapModel], given: list[Sequence]) -> dict[str, Method]:
     """Identification, and 30 s of the unit, each without and with the operators."""
     law = bench.identified(DEFAULT_TERMS)
-    alone = refit(given, law, 4, FIELDS, None, PRIOR, EVALUATIONS).robot
+    alone = refit(given, law).robot
     own = [calibrate(m, law, given).robot(law) for m in models]
     return {
         IDENTIFIED: [(law, None)], OPERATOR: [(law, m.corrector(law)) for m in models], CALIBRATED: [(alone, None)],
@@ -89,7 +89,7 @@ def untold(bench: Bench, models: list[GapModel], given: list[Sequence]) -> dict[
     """The heaviest payload, of which no method is told; 30 s with it estimate its mass too. Errors as Played's."""
     law, most = bench.identified(DEFAULT_TERMS), max(s.meta.payload_mass for s in given)
     heavy, given = ([s for s in part if s.meta.payload_mass == most] for part in (bench.test, given))
-    alone = refit(given, law, 4, FIELDS, None, PRIOR, EVALUATIONS, True)
+    alone = refit(given, law, unknown_payload=True)
     own = [calibrate(m, law, given, unknown_payload=True) for m in models]
 
     def errors(mass: float | None, simulator: RobotSpec, model: GapModel | None = None) -> Array:

@@ -37,11 +37,11 @@ from gaponet.model.artifact import GapModel
 from gaponet.model.baselines import delay_offset
 from gaponet.robot import LAW, RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
+from gaponet.sim.free_runs import cut
 from gaponet.sim.identify import DEFAULT_TERMS, identify
 from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import descend
-from gaponet.sim.refit import cut
 from gaponet.sim.replay import Corrector, replay
 from gaponet.spread import Spread, Table
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig

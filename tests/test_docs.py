@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 import gaponet as gp
-from gaponet.model.calibration import PRIOR
 from gaponet.model.config import ModelConfig
 from gaponet.sim.free_runs import TOGETHER
+from gaponet.sim.refit import PRIOR
 from gaponet.training.config import TrainConfig
 from gaponet.training.gain import GAINS
 from gaponet_lab.study.options import TRAINING

@@ -453,9 +453,9 @@ def calibrate_robot(
     import tempfile
 
     from gaponet.files import write_text, writing
-    from gaponet.model import calibration
     from gaponet.robot_folder import ORIGIN, save_robot
     from gaponet.sim.identify import BETTER, whole_errors
+    from gaponet.sim.refit import refit
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
     with tempfile.TemporaryDirectory() as place, writing(Path(out), "robot"):
@@ -471,8 +471,8 @@ def calibrate_robot(
         sequences = data.sequences([e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])])
         believed = all(s.meta.known_gains[1] is not None for s in sequences)
         with bar("calibrating") as update:
-            found = calibration.fit(
-                spec, sequences, seconds, unknown_payload, None,
+            found = refit(
+                sequences, spec, seconds, unknown_payload, None,
                 lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"), believed,
             )  # fmt: skip
         if found.payload_mass is not None:

@@ -1,4 +1,4 @@
-"""The Jacobian of free runs, in which joints are on their own."""
+"""Candidates for the servos of a whole robot beside recordings."""
 
 from dataclasses import replace
 
@@ -6,37 +6,65 @@ import numpy as np
 import pytest
 from arm import recordings, write_arm
 
-from gaponet.sim.free_runs import BOUNDS, FreeRuns
-from gaponet.sim.refit import cut
-
-FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
+from gaponet.sim.axes import CLASSIC, Bounds
+from gaponet.sim.free_runs import FreeRuns, cut
+from gaponet.sim.replay import replay
 
 
 @pytest.fixture(scope="module")
-def problem(tmp_path_factory):
-    robot = write_arm(tmp_path_factory.mktemp("arm"))
-    return FreeRuns(cut(recordings(robot, 2, rows=60, kp=0.6), 2), robot, 0, FIELDS)
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
 
 
-def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(problem):
-    x = problem.start()
-    base, steps = problem.errors(x[None])[0], np.repeat([BOUNDS[f][2] for f in FIELDS], 2)
-    fast = problem.jacobian(x, base)
+@pytest.fixture(scope="module")
+def parts(robot):
+    return cut(recordings(robot, 2, rows=60, kp=0.6), 2)
+
+
+def own(robot, parts):
+    return {f: x[None] for f, x in Bounds(robot, parts).first.items() if f in CLASSIC}
+
+
+def test_the_robot_as_it_is_errs_as_in_a_replay_and_each_candidate_on_its_own(robot, parts):
+    runs, values = FreeRuns(parts, robot), own(robot, parts)
+    both = {f: np.concatenate([x, x * (1.3 if f == "kp" else 1.0)]) for f, x in values.items()}
+    errors = runs.run(both)
+    assert np.abs(errors[1] - errors[0]).max() > 1e-3
+    for window, (part, twin) in enumerate(zip(parts, replay(parts, robot), strict=True)):
+        expected = (twin.qpos - part.qpos)[1:][runs.counted[: len(part) - 1, window]].T
+        np.testing.assert_allclose(errors[0][:, runs.window == window], expected, atol=1e-6)
+
+
+def test_joints_on_their_own_answer_for_themselves_nearly_as_in_company(robot, parts):
+    runs, values = FreeRuns(parts, robot), own(robot, parts)
+    stiffer = np.array([[1.0, 1.0], [1.02, 1.02], [1.02, 1.0], [1.0, 1.02]])
+    errors = runs.run({f: x * stiffer if f == "kp" else np.repeat(x, 4, axis=0) for f, x in values.items()})
+    together = errors[1] - errors[0]
     for joint in range(2):
-        gain = np.eye(len(x))[joint] * steps  # kp of this joint alone
-        slow = (problem.errors((x + gain)[None])[0, joint] - base[joint]) / steps[joint]
-        assert np.abs(fast[joint, :, 0] - slow).mean() < 0.2 * np.abs(slow).mean()
+        alone = errors[2 + joint, joint] - errors[0, joint]
+        assert np.abs(together[joint] - alone).mean() < 0.2 * np.abs(alone).mean()
 
 
-def test_damping_below_zero_is_taken_from_the_servo(problem):
-    robot = problem.robot.with_gains(None, (0.4, 0.4))
-    less = replace(robot.nominal or robot, kd=np.array([0.4, 0.4]))
-    runs = FreeRuns(problem.parts, less, 0, FIELDS, believed=False)
-    values = {f: x[None] for f, x in runs.values(runs.start()).items()}
-    softer = runs.run(values | {"damping": np.full((1, 2), -0.3)})
+def test_a_run_goes_on_from_the_recording_where_something_may_be_touched(robot, parts):
+    touch = np.zeros((2, 60), bool)
+    touch[0, 30] = True
+    free, held, values = FreeRuns(parts, robot), FreeRuns(parts, robot, touch=touch), own(robot, parts)
+    assert free.counted[29, 0]
+    assert not held.counted[29, 0]
+    assert held.counted[29, 1]
+    one, other = ([runs.run(values)[0][:, runs.window == w] for w in (0, 1)] for runs in (free, held))
+    np.testing.assert_array_equal(one[1], other[1])
+    late = FreeRuns([parts[0].rows(slice(30, 60))], robot)
+    afresh = late.run(values)[0][:, 1:]  # the first rows after it do not count
+    np.testing.assert_allclose(other[0][:, -afresh.shape[1] :], afresh, atol=1e-6)
+
+
+def test_damping_below_zero_is_taken_from_the_servo(robot, parts):
+    less, softer = (replace(robot, kd=np.array([kd, kd])) for kd in (0.4, 0.1))
+    values = own(less, parts)
     np.testing.assert_allclose(
-        softer, FreeRuns(problem.parts, replace(less, kd=np.array([0.1, 0.1])), 0, FIELDS).run(
-            values | {"damping": np.zeros((1, 2))}), atol=1e-6
+        FreeRuns(parts, less).run(values | {"damping": np.full((1, 2), -0.3)}),
+        FreeRuns(parts, softer).run(values | {"damping": np.zeros((1, 2))}), atol=1e-6,
     )  # fmt: skip
     written = less.with_servos({"elbow": {"damping": -0.3}})
     assert written.kd.tolist() == pytest.approx([0.4, 0.1])

@@ -7,8 +7,8 @@ import pytest
 from arm import TOML, recordings, write_arm
 
 from gaponet.errors import UsageError
+from gaponet.sim.free_runs import cut
 from gaponet.sim.identify import identify, with_stops
-from gaponet.sim.refit import cut
 
 
 @pytest.fixture(scope="module")

@@ -84,10 +84,10 @@ def _show(
     screen: Out, unit: str, servos: Mapping[str, Mapping[Any, float]], mass: float | None, std: float | None
 ) -> None:
     """A unit's servos, and its payload."""
-    from gaponet.model import calibration
+    from gaponet.sim.refit import FIELDS
 
-    screen.table(f"Unit {unit}", ["joint", *(COLUMNS[f][0] for f in calibration.FIELDS)], [
-        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in calibration.FIELDS)] for j, v in servos.items()
+    screen.table(f"Unit {unit}", ["joint", *(COLUMNS[f][0] for f in FIELDS)], [
+        [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in FIELDS)] for j, v in servos.items()
     ])  # fmt: skip
     if mass is not None:
         spread = f" ± {std:.2f}" if std is not None and isfinite(std) else ""  # it takes two windows to tell
@@ -95,10 +95,10 @@ def _show(
 
 
 def _servos(robot: RobotSpec) -> dict[str, dict[str, float]]:
-    from gaponet.model import calibration
+    from gaponet.sim.refit import FIELDS
 
     at = robot.joint_names.index
-    return {j: {f: float(getattr(robot, f)[at(j)]) for f in calibration.FIELDS} for j in robot.operated}
+    return {j: {f: float(getattr(robot, f)[at(j)]) for f in FIELDS} for j in robot.operated}
 
 
 def _mass(text: str) -> float:

@@ -1,9 +1,8 @@
 """What is particular to one unit, beside a model: a small file per unit in RUN/calibration/.
 
 No model can know a unit's gain, damping, friction, zero offsets and delay before it has seen the unit. They are fitted
-to half a minute of its log, as servo parameters of the simulator under the trained correction; the network stays as it
-is. So little log does not say much of one joint, and more of all of them: what joints do together is cheaper than what
-one does alone. If nobody weighed what the unit carried, its mass is fitted with them.
+to half a minute of its log, as servo parameters of the simulator under the trained correction (sim/refit.py); the
+network stays as it is. If nobody weighed what the unit carried, its mass is fitted with them.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated
 
 from annotated_types import Interval
 
@@ -24,15 +23,8 @@ from gaponet.errors import ModelError, UsageError
 from gaponet.files import writing
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.free_runs import Prior
-from gaponet.sim.refit import WINDOW, Refitted, refit
-from gaponet.sim.replay import Corrector
+from gaponet.sim.refit import FIELDS, Field, refit
 from gaponet.structure import read_json
-
-Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
-FIELDS: tuple[Field, ...] = get_args(Field)
-PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together (docs/log.md, 2026-11-21)
-EVALUATIONS = 8
 
 
 @dataclass(frozen=True)
@@ -91,10 +83,10 @@ def calibrate(
         model: Its correction is applied while fitting.
         sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
         unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
-        progress: Called with evaluations done, at most, RMS error in rad.
+        progress: As refit's.
     """
     unit = _one_unit(sequences)
-    found = fit(simulator, sequences, seconds, unknown_payload, model.corrector(simulator), progress)
+    found = refit(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
     servos = {
         j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
         for j in simulator.operated
@@ -112,32 +104,6 @@ def _one_unit(sequences: ListOf[Sequence]) -> str:
     if len(units) != 1:
         raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
     return units[0]
-
-
-def fit(
-    simulator: RobotSpec,
-    sequences: ListOf[Sequence],
-    seconds: float,
-    unknown_payload: bool = False,
-    corrector: Corrector | None = None,
-    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    believed: bool = True,
-) -> Refitted:
-    """Fit one unit's parameters near a simulator's own, with a correction or without; arguments as of `calibrate`.
-
-    believed: whether kd is what the servos have.
-    """
-    payloads = sorted({s.meta.payload_mass for s in sequences})
-    if unknown_payload and len(payloads) > 1:
-        raise UsageError(
-            f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
-            "one and the same: give recordings of one mass"
-        )
-    prior = Prior(simulator, dict.fromkeys(FIELDS, PRIOR))
-    return refit(
-        sequences, simulator, max(1, round(seconds / WINDOW)), FIELDS, corrector, prior, EVALUATIONS,
-        unknown_payload, progress=progress, believed=believed,
-    )  # fmt: skip
 
 
 def save(calibration: Calibration, run: Path) -> Path:

@@ -21,11 +21,10 @@ from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
-from gaponet.sim.free_runs import FreeRuns
+from gaponet.sim.free_runs import FreeRuns, cut
 from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import better_half, descend, slopes
-from gaponet.sim.refit import cut
 from gaponet.sim.replay import replay
 from gaponet.sim.shared import far_from_published, same_servos, share
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
@@ -266,7 +265,7 @@ class _Judge:
     """Motions that were not fitted, whole, in the simulator of the whole robot."""
 
     def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
-        self.runs = FreeRuns(sequences, robot, nthread, CLASSIC, touch=_touching_rows(sequences, robot, below))
+        self.runs = FreeRuns(sequences, robot, nthread, touch=_touching_rows(sequences, robot, below))
         each = [self.runs.window == i for i in range(len(sequences))]
         self.motions = [rows for rows in each if rows.any()]
         self.known: dict[bytes, Array] = {}
@@ -348,7 +347,7 @@ class Fit:
         """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
         parts = self.runs.parts
         some = np.unique(np.arange(WHOLE) * len(parts) // WHOLE)
-        runs = FreeRuns([parts[i] for i in some], self.base, nthread, CLASSIC, touch=self.runs.touch[some])
+        runs = FreeRuns([parts[i] for i in some], self.base, nthread, touch=self.runs.touch[some])
         fit = Fit(self.runs, self.base, self.bounds, runs)
         fit.noise = self.noise
         return fit

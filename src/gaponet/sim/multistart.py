@@ -29,6 +29,7 @@ def descend(
     progress: Callable[[Array], None] = lambda cost: None,
     out_of_time: Callable[[], bool] = lambda: False,
     flat: float = FLAT,
+    derive: Callable[[Array, Array, Errors], tuple[Array, Array]] | None = None,
 ) -> tuple[Array, Array]:
     """Starts, moved downhill, and their costs (soft squares, summed), (S, n).
 
@@ -42,6 +43,7 @@ def descend(
         progress: Called after each with the least cost of every problem, (n,).
         out_of_time: Asked before each but the first.
         flat: Ends when no start's cost falls by a larger share.
+        derive: In place of `slopes`, where it takes fewer candidates than P + 1.
     """
     damping = np.full(x.shape[:2], 1e-2)
     best = np.full(x.shape[:2], np.inf)
@@ -49,7 +51,7 @@ def descend(
     for i in range(iterations):
         if i and out_of_time():
             break
-        here, jac = slopes(x, high, errors)
+        here, jac = (derive or slopes)(x, high, errors)
         weight = 1 / np.sqrt(1 + here**2)
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
         slope = (np.swapaxes(jac, -1, -2) @ (weight * here)[..., None])[..., 0].astype(float)

@@ -1,36 +1,37 @@
-"""One unit's servo parameters near a robot's own, from half a minute of its log: least squares with a prior.
+"""One unit's servo parameters near a robot's own, from half a minute of its log: identification with a prior.
 
-What so little log does not determine stays with the robot's values; with a corrector the fit is made under it.
+What so little log does not determine stays with the robot's values; with a corrector the fit is made under it. Half a
+minute says little of one joint and more of all of them, so what joints do together is cheaper than what one does alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
-from scipy.optimize import lsq_linear
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
-from gaponet.sim.free_runs import FreeRuns, Prior, rms
+from gaponet.sim.axes import Axes, Bounds, Values
+from gaponet.sim.free_runs import WINDOW, FreeRuns, cut
+from gaponet.sim.joint_runs import SOFT
+from gaponet.sim.multistart import STEP, Errors, descend
 from gaponet.sim.replay import Corrector
 
-WINDOW = 8.0  # s; what is fitted on a second or two does not hold over whole motions
-SHORTEST = 0.8  # s
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Parameters (P,), errors (n, rows) and Jacobian (n, rows, fields) at the end, and how many evaluations it took."""
-
-    x: Array
-    errors: Array
-    jac: Array
-    evaluations: int
+Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
+FIELDS: tuple[Field, ...] = get_args(Field)
+PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together (docs/log.md, 2026-11-21)
+TOGETHER = 0.05  # of it, where all joints leave their values by the same share: a cold day, a slow bus …
+COMMON = ("damping", "frictionloss", "delay")  # … which does not turn zeros, nor soften gains
+ITERATIONS, ENOUGH = 8, 1e-3  # at most, and the share of the cost by which it falls in one that is not the last
+LATE = 0.005  # s: a first delay, since a delay of zero hides what it does
+MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
+MAX_MASS = 20.0  # kg
 
 
 @dataclass(frozen=True)
@@ -53,104 +54,148 @@ class Refitted:
 def refit(
     sequences: ListOf[Sequence],
     robot: RobotSpec,
-    windows: int,
-    fields: tuple[str, ...],
-    corrector: Corrector | None,
-    prior: Prior | None,
-    evaluations: int,
+    seconds: float = 30.0,
     unknown_payload: bool = False,
-    nthread: int = 0,
+    corrector: Corrector | None = None,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
     believed: bool = True,
 ) -> Refitted:
-    """Fit parameters of all operated joints at once.
+    """Fit FIELDS of all operated joints at once.
 
     Args:
-        sequences: Recordings.
-        robot: Where to start from; its payloads' masses are taken as true.
-        windows: Free runs of 8 s, taken evenly from the recordings.
-        fields: Which parameters; the others stay the robot's.
-        corrector: Corrects the targets on the way, as in replay.
-        prior: What leaving a robot's values costs.
-        evaluations: At most so many.
+        sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
+        robot: Where to start from and what the prior is about; its payloads' masses are taken as true.
+        seconds: How much of the recordings.
         unknown_payload: Do not believe the recordings' payload mass; fit one for all of them.
-        nthread: Threads, 0 for all cores.
-        progress: Called with evaluations done, at most, and the present RMS error in rad.
+        corrector: Corrects the targets on the way, as in replay.
+        progress: Called with iterations done, at most, and the present RMS error in rad.
         believed: Whether kd is what the servos have.
+
+    Raises:
+        UsageError: An unknown payload, and recordings filed under several.
     """
-    parts = cut(sequences, windows)
-    problem = FreeRuns(parts, robot, nthread, fields, corrector, prior, unknown_payload, believed)
-    fit = _descend(problem, problem.start(), evaluations, 1e-3, progress)
-    before, after = rms(problem.errors(problem.own()[None])[0]), rms(fit.errors)
-    mass = {"payload_mass": float(fit.x[-1]), "payload_std": _jackknife(problem, fit)} if unknown_payload else {}
-    return Refitted(problem.robot_of(fit.x), before, after, **mass)
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    if unknown_payload and len(payloads) > 1:
+        raise UsageError(
+            f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
+            "one and the same: give recordings of one mass"
+        )
+    runs = FreeRuns(cut(sequences, max(1, round(seconds / WINDOW))), robot, corrector=corrector)
+    problem = _Problem(runs, Bounds(robot, sequences), unknown_payload, believed)
+    done = 0
+
+    def tell(cost: Array) -> None:
+        nonlocal done
+        done += 1
+        progress(done, ITERATIONS, SOFT * float(np.sqrt(2 * cost[0] / problem.size)))
+
+    x, _ = descend(
+        problem.start(payloads[0])[None, None], problem.low, problem.high, problem.errors, ITERATIONS, tell,
+        flat=ENOUGH, derive=problem.slopes,
+    )  # fmt: skip
+    before, after = (problem.rms(p) for p in (problem.own(float(np.mean(payloads))), x[0, 0]))
+    mass = {"payload_mass": float(x[0, 0, -1]), "payload_std": problem.jackknife(x)} if unknown_payload else {}
+    return Refitted(problem.robot_of(x[0, 0]), before, after, **mass)
 
 
-def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
-    """Windows of WINDOW seconds (shorter where a recording is), evenly picked."""
-    parts = []
-    for s in sequences:
-        rows = min(round(WINDOW / s.dt), len(s))
-        parts += [s.rows(slice(a, a + rows)) for a in range(0, len(s) - rows + 1, rows)]
-    parts = [p for p in parts if p.duration >= SHORTEST]
-    if not parts:
-        raise UsageError(f"no recording is as long as {SHORTEST:g} s; identification needs longer ones")
-    return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
+class _Problem:
+    """All joints as one problem: x (P,) holds the fields of each of n joints, then the payload mass in kg, if unknown.
 
-
-def _jackknife(problem: FreeRuns, fit: _Fit) -> float:
-    """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
-
-    The model's own errors last as long as a motion, so that rows of a window say little about each other.
+    A servo's parameters act on its own joint first: what they do to the others is weaker by the ratio of the inertias.
+    So one simulation moves a field of all joints, and each joint's error is put down to its own parameter: six
+    simulations for all slopes, however many joints. A payload loads all of them.
     """
-    moved = []
-    for window in range(len(problem.parts)):
-        keep = problem.window != window
-        matrix, side = problem.normal(fit.x, fit.errors[:, keep], fit.jac[:, keep])
-        moved.append(np.linalg.lstsq(matrix, -side)[0][-1])
-    m = len(moved)
-    return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")
 
+    def __init__(self, runs: FreeRuns, bounds: Bounds, unknown_payload: bool, believed: bool) -> None:
+        bounds.still = np.zeros(runs.n, bool)  # what all joints do together is true of one that stands
+        bounds.spare = bounds.spare * 0 if believed else runs.robot.kd[runs.op]
+        self.runs, self.unknown, self.n = runs, unknown_payload, runs.n
+        self.axes, self.first = Axes(bounds, FIELDS, bounds.first), bounds.first
+        more = [[end] * unknown_payload for end in (0.0, MAX_MASS)]
+        self.low, self.high = np.append(self.axes.low, more[0])[None], np.append(self.axes.high, more[1])[None]
+        self.size = int(runs.rows.sum())
+        kp = self.first["kp"]
+        self.scale = {
+            "kp": np.ones(self.n), "damping": np.maximum(self.first["damping"], 0.01 * kp),  # a time constant of 10 ms
+            "frictionloss": np.maximum(self.first["frictionloss"], 0.005 * kp),
+            "offset": np.full(self.n, 0.02), "delay": np.full(self.n, 0.02),
+        }  # fmt: skip
 
-def _descend(
-    problem: FreeRuns,
-    x: Array,
-    evaluations: int,
-    tolerance: float,
-    progress: Callable[[int, int, float], None],
-) -> _Fit:
-    """Levenberg and Marquardt within bounds: each step is the minimum of the damped quadratic inside the box.
+    def own(self, mass: float) -> Array:
+        """The robot as it is."""
+        return np.append(self.axes.of(self.first).ravel(), [mass] * self.unknown)
 
-    Many parameters end at a bound (no delay, no friction), where scipy's trust regions creep: two to four times the
-    evaluations. Errors beyond SOFT count linearly, by weights (soft_l1).
+    def start(self, mass: float) -> Array:
+        """The robot, a little late; an unknown payload at the mass of MASSES that fits best."""
+        late = self.first | {"delay": np.maximum(self.first["delay"], LATE)}
+        x = np.append(self.axes.of(late).ravel(), [mass] * self.unknown)
+        if not self.unknown:
+            return x
+        xs = np.repeat(x[None], len(MASSES), axis=0)
+        xs[:, -1] = MASSES
+        return np.asarray(xs[np.square(self._runs(xs)).sum(axis=(1, 2)).argmin()])
 
-    Args:
-        problem: Its bounds, errors and Jacobian.
-        x: Start, (P,).
-        evaluations: At most.
-        tolerance: Ends when the cost falls by a smaller share.
-        progress: Called with evaluations done, at most, and the present RMS error in rad.
-    """
-    low, high = problem.bounds()
-    errors = problem.errors(x[None])[0]
-    jac = problem.jacobian(x, errors)
-    damping, count, fresh = 1e-2, 1, True
-    progress(count, evaluations, rms(errors))
-    while count < evaluations:
-        if not fresh:
-            jac, fresh = problem.jacobian(x, errors), True
-        normal, slope = problem.normal(x, errors, jac)
-        normal[np.diag_indices_from(normal)] = normal.diagonal() * (1 + damping) + 1e-12
-        root = np.linalg.cholesky(normal).T
-        step = lsq_linear(root, -np.linalg.solve(root.T, slope), (low - x - 1e-12, high - x + 1e-12)).x
-        trial = np.clip(x + step, low, high)
-        tried = problem.errors(trial[None])[0]
-        count += 1
-        gained = 1 - problem.cost(trial, tried) / problem.cost(x, errors)
-        damping = max(damping / 10, 1e-3) if gained > 0 else damping * 30
-        if gained > 0:
-            x, errors, fresh = trial, tried, False
-        progress(count, evaluations, rms(errors))
-        if 0 <= gained < tolerance or damping > 10:
-            break
-    return _Fit(x, errors, jac, count)
+    def values(self, x: Array) -> Values:
+        """(k, P) → field: (k, n)."""
+        return self.axes.values(x[:, : self.n * len(FIELDS)].reshape(len(x), self.n, len(FIELDS)))
+
+    def robot_of(self, x: Array) -> RobotSpec:
+        """The robot with these parameters; joints that are not operated keep theirs."""
+        values = {f: v[0] for f, v in self.values(x[None]).items() if f in FIELDS}
+        joints = enumerate(self.runs.robot.operated)
+        return self.runs.robot.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in joints})
+
+    def rms(self, x: Array) -> float:
+        """Root mean square error of the windows, rad."""
+        return SOFT * float(np.sqrt(np.square(self._runs(x[None])).mean()))
+
+    def errors(self, xs: Array) -> Array:
+        """(k, 1, P) → (k, 1, rows) in SOFT: of every joint's free runs, then the prior's."""
+        own = self._runs(xs[:, 0]).reshape(len(xs), -1)
+        return np.concatenate([own, self._priced(xs[:, 0])], axis=1)[:, None]
+
+    def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
+        """As multistart.slopes, of one start."""
+        here, count = x[0, 0], len(FIELDS) + self.unknown
+        field = np.append(np.tile(np.arange(len(FIELDS)), self.n), [count - 1] * self.unknown).astype(int)
+        step = np.where(here + STEP > high[0], -STEP, STEP)
+        tried = here + np.concatenate([np.zeros((1, len(here))), (field == np.arange(count)[:, None]) * step])
+        found = self._runs(tried)  # (1 + count, n, rows)
+        rows = found.shape[2]
+        jac = np.zeros((self.n, rows, len(here)), np.float32)
+        for i in range(len(here)):
+            mine = slice(None) if self.unknown and i == len(here) - 1 else i // len(FIELDS)
+            jac[mine, :, i] = (found[1 + field[i], mine] - found[0, mine]) / step[i]
+        priced = self._priced(np.concatenate([here[None], here + np.diag(step)]))
+        price = ((priced[1:] - priced[0]) / step[:, None]).T
+        base = np.concatenate([found[0].ravel(), priced[0]])
+        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), price])[None, None]
+
+    def jackknife(self, x: Array) -> float:
+        """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
+
+        The model's own errors last as long as a motion, so that rows of a window say little about each other.
+        """
+        here, jac = (y[0, 0] for y in self.slopes(x, self.high, self.errors))
+        window = np.append(np.tile(self.runs.window, self.n), np.full(len(here) - self.n * len(self.runs.window), -1))
+        weight, moved = 1 / np.sqrt(1 + here**2), []
+        for left_out in range(len(self.runs.parts)):
+            w = weight * (window != left_out)
+            moved.append(np.linalg.lstsq(jac.T @ (w[:, None] * jac), -jac.T @ (w * here))[0][-1])
+        m = len(moved)
+        return float(np.sqrt((m - 1) / m * np.square(moved - np.mean(moved)).sum())) if m > 1 else float("nan")
+
+    def _runs(self, xs: Array) -> Array:
+        """Errors of free runs, (k, n, rows) in SOFT."""
+        parts = self.runs.parts
+        if self.unknown:
+            parts = [replace(s, meta=replace(s.meta, payload_mass=float(x[-1]))) for x in xs for s in parts]
+        return self.runs.run(self.values(xs), parts if self.unknown else None) / np.float32(SOFT)
+
+    def _priced(self, xs: Array) -> Array:
+        """The prior's errors, (k, fields · n) in SOFT."""
+        far = []
+        for f, v in ((f, v) for f, v in self.values(xs).items() if f in FIELDS):
+            away = np.log(v / self.first[f]) if f == "kp" else (v - self.first[f]) / self.scale[f]
+            far.append(away - (1 - TOGETHER) * away.mean(axis=1, keepdims=True) * (f in COMMON))
+        return np.concatenate(far, axis=1) * (PRIOR / SOFT)

@@ -143,8 +143,16 @@ def rollout(
     sequences: ListOf[Sequence],
     corrector: Corrector | None = None,
     progress: Callable[[int], None] = lambda done: None,
+    touch: Array | None = None,
 ) -> Array:
     """Step a batch, one simulation per sequence, from the recorded start under the recorded commands.
+
+    Args:
+        sim: One simulation per sequence.
+        sequences: Recordings.
+        corrector: Alters targets on the way.
+        progress: Called now and then with the control steps done.
+        touch: Rows after which a simulation goes on from the recording, (T, k).
 
     Returns:
         qpos, qvel, torque and target by row, (4, T, k, n of all joints): rad, rad/s, N·m, rad; joints that are locked
@@ -171,6 +179,8 @@ def rollout(
         for channel, now in enumerate((sim.qpos, sim.qvel, sim.torque)):
             out[channel, t + 1][:, free] = now
         out[3, t] = target
+        for i in ids[touch[t + 1, ids]].tolist() if touch is not None else ():
+            sim.qpos[i], sim.qvel[i] = sequences[i].qpos[t + 1, free], sequences[i].qvel[t + 1, free]
         finished += len(ids)
         if t % 200 == 0 or t == last:
             progress(finished)

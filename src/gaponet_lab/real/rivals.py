@@ -13,11 +13,11 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.baselines.delay_offset import fit as fit_delay_offset
-from gaponet.model.calibration import fit as fit_unit
 from gaponet.robot import RobotSpec
+from gaponet.sim.free_runs import WINDOW
 from gaponet.sim.identify import Identified, identify
 from gaponet.sim.model import build_model
-from gaponet.sim.refit import WINDOW
+from gaponet.sim.refit import refit
 from gaponet.sim.replay import Corrector, replay
 from gaponet_lab.real.questions import Question, recorded
 
@@ -110,7 +110,7 @@ def calibrated(question: Question) -> Answer:
     start = identified(question) if question.before is None else Answer(question.before())
     few = [start.load(s) for s in question.few]
     seconds = len(few) * WINDOW if few[0].duration < WINDOW else SECONDS  # all windows that are shorter than one
-    return replace(start, robot=fit_unit(start.robot, few, seconds).robot)
+    return replace(start, robot=refit(few, start.robot, seconds).robot)
 
 
 def elsewhere(question: Question) -> Answer:
