@@ -22,7 +22,7 @@ DEAD_TIMES = (
 )  # fmt: skip
 
 
-def lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How long after the command does each joint move?"""
     found = fast_lags(surveys, robot)
     if not found:
@@ -67,7 +67,7 @@ def _servo_lag(robot: RobotSpec) -> dict[str, float]:
     return dict(zip(robot.joint_names, lags.tolist(), strict=True))
 
 
-def sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How far from its command does each joint rest, with the lightest and the heaviest payload?"""
     payloads = sorted({s.entry.meta.payload_mass for s in surveys})
     rests = {
@@ -95,7 +95,7 @@ def sag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("ok", "sag", f"every joint rests within {SAG * 1e3:.0f} mrad of its command")
 
 
-def torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Can the torque signal be trusted?"""
     told = [(s, s.torque) for s in surveys if s.torque is not None]
     if not told:
@@ -159,3 +159,6 @@ def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticEr
 def _mrad(error: StaticError) -> str:
     band = f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
     return f"{error.middle * 1e3:+.0f}{band}"
+
+
+CHECKS = (_lag, _sag, _torque)

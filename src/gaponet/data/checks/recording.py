@@ -16,7 +16,7 @@ HALTED = 1.0  # s
 ENOUGH = 20  # rows of torque cut off flat
 
 
-def rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """At which rate was each sequence recorded?"""
     groups: dict[float, int] = defaultdict(int)
     for s in surveys:
@@ -31,7 +31,7 @@ def rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("note", "rate", f"{len(moved)} sequence(s) were put on a uniform grid: {some(moved)}")
 
 
-def regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """How evenly was it sampled, and what is missing?"""
     share = [s.jitter_ms * s.rate_hz / 1e3 for s in surveys]  # of a period
     worst = surveys[int(np.argmax(share))]
@@ -51,7 +51,7 @@ def regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding("warning", "gaps", text, values={"longest_gap_ms": longest.longest_gap_ms})
 
 
-def jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is the state somewhere that no joint can reach and leave in one period?"""
     found = []
     for i, name in enumerate(robot.joint_names):
@@ -73,7 +73,7 @@ def jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "jumps", "no joint jumps")]
 
 
-def nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Was a channel made up for where it could not be?"""
     told: dict[str, list[Survey]] = defaultdict(list)
     for s in surveys:
@@ -92,7 +92,7 @@ def nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("ok", "nonsense", "no channel holds what no joint does")
 
 
-def blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a joint run into a stop, or were all of them held?"""
     found = []
     held = [s for s in surveys if s.halted_s >= HALTED]
@@ -117,7 +117,7 @@ def blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "blocked", "no joint ran into a stop")]
 
 
-def saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Did a motor reach its torque limit?"""
     told = [(s, s.torque) for s in surveys if s.torque is not None]
     over = [(s, t) for s, t in told if t.over_limit.any()]
@@ -151,7 +151,7 @@ def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Findi
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
 
 
-def resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions told finely enough?"""
     step = np.max([s.step for s in surveys], axis=0)
     coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > COARSE]
@@ -168,7 +168,7 @@ def resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding(level, "resolution", text, tuple(name for _, name in coarse), {"step": worst})
 
 
-def stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does every channel change when it should?"""
     found = []
     for i, name in enumerate(robot.joint_names):
@@ -180,7 +180,7 @@ def stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
                 "not read; leave these out"
             )
             found.append(Finding("error" if len(still) == len(asked) else "warning", "stuck", text, (name,)))
-        # At a stop an encoder's steps repeat one number too: `blocked` says that.
+        # At a stop an encoder's steps repeat one number too: `_blocked` says that.
         steps = any(s.step[i] for s in surveys)
         stopped = [s for s in surveys if s.stopped_s[i] > 0.25 and s not in still and not (steps and s.blocked_s[i])]
         if stopped and not any(s.frozen_s > 0.25 for s in stopped):
@@ -199,3 +199,6 @@ def stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         found.append(Finding("warning", "stuck", text))
     yield from found or [Finding("ok", "stuck", "every channel changes when it should")]
+
+
+CHECKS = (_rate, _regularity, _jumps, _nonsense, _blocked, _saturation, _resolution, _stuck)

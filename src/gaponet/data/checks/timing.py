@@ -26,7 +26,7 @@ NOTCH = 1.5  # depth, natural logarithm of power
 GAP = 2.5  # periods without a sample
 
 
-def timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands and states of one time, and is their clock one clock?"""
     step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
     same = [s for s in surveys if s.response.step == step]
@@ -97,3 +97,6 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
             f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
         )
         yield Finding("error", "clock", text, (), {"drift": drift})
+
+
+CHECKS = (_timing,)

@@ -18,7 +18,7 @@ APART, ALIKE = 0.7, 0.7  # of the state's own spread from its command; correlati
 MOVED = 0.05  # a joint commanded over less says nothing about order, sign and unit, rad
 
 
-def order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each command move its own joint?"""
     guilty: dict[tuple[int, int], list[float]] = defaultdict(list)
     asked = np.zeros(len(robot.joint_names), int)
@@ -61,7 +61,7 @@ def _together(surveys: list[Survey], asked: Array) -> dict[tuple[int, int], list
     return found
 
 
-def command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are the commands positions?"""
     column = lambda field: np.stack([getattr(s, field) for s in surveys])[:, robot.operated_index]  # noqa: E731
     beside = column("beside")
@@ -82,7 +82,7 @@ def command(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding("error", "command", text, (), like)
 
 
-def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Does each joint move the way it is told?"""
     wrong = []
     for i, name in enumerate(robot.joint_names):
@@ -99,7 +99,7 @@ def sign(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         yield Finding("ok", "sign", "no joint moves against its command")
 
 
-def copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are command and state two signals, and does the command come first?"""
     found, copies = [], {}
     for i, name in enumerate(robot.joint_names):
@@ -125,7 +125,7 @@ def copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "copied", "commands come before states")]
 
 
-def unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _unit(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands, positions and velocities in the same unit, and is it the radian?"""
     wrong = []
     for i, name in enumerate(robot.joint_names):
@@ -178,7 +178,7 @@ def _converted(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             yield Finding("note", "unit", text, (name,))
 
 
-def limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Do commands and positions stay in the joint ranges of the MJCF?"""
     found = []
     for i, name in enumerate(robot.joint_names):
@@ -199,7 +199,7 @@ def limits(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "range", "commands and positions stay inside the joint ranges")]
 
 
-def labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
+def _labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Is one recording filed under two payloads or units?"""
     seen: dict[str, list[str]] = defaultdict(list)
     for s in surveys:
@@ -210,3 +210,6 @@ def labels(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if len(ids) > 1
     ]
     yield from found or [Finding("ok", "labels", "no recording is filed twice")]
+
+
+CHECKS = (_command, _order, _sign, _copied, _unit, _limits, _labels)
