@@ -10,7 +10,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.sim.free_runs import TOGETHER
 from gaponet.sim.refit import PRIOR
 from gaponet.training.config import TrainConfig
-from gaponet.training.gain import GAINS
+from gaponet.training.validation import GAINS
 from gaponet_lab.study.options import TRAINING
 
 ROOT = Path(__file__).parents[1]

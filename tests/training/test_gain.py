@@ -3,7 +3,7 @@ import torch
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
-from gaponet.training.gain import choose_gain
+from gaponet.training.validation import choose_gain
 
 
 @pytest.mark.parametrize("kind", ["gaponet", "mlp"])

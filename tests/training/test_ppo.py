@@ -10,7 +10,7 @@ from gaponet.model.deeponet import build_network
 from gaponet.training.config import PPOConfig, RewardConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.ppo import Learner, advantages
-from gaponet.training.warm_start import fit_inputs
+from gaponet.training.sensor_fit import fit_inputs
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
 PPO = PPOConfig(

@@ -9,15 +9,14 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.training.config import RewardConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.sensor_fit import shift_positions
-from gaponet.training.warm_start import fit_inputs
+from gaponet.training.sensor_fit import fit_inputs
 
 
 def test_moving_a_posture_changes_no_relative_feature():
     config = ModelConfig(history=2)
     features = build_network(config, 2).features
     x = torch.randn(5, config.observation_dim(2) + 2)
-    moved = x + torch.from_numpy(shift_positions(np.full((5, 2), 0.7), features.layout)).float()
+    moved = x + torch.from_numpy(features.layout.shifted(np.full((5, 2), 0.7))).float()
     change = (features.relative(moved) - features.relative(x)).abs()
     assert torch.allclose(change[:, :2], torch.tensor(0.7))
     assert change[:, 2:].max() < 1e-5

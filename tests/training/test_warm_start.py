@@ -1,5 +1,7 @@
 """The supervised start: labels of held corrections, the baseline's recipe, the sensor predictor's features."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,13 +11,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.training.config import RewardConfig, TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.warm_start import WarmStart, held_labels, recipe
-
-
-def test_a_held_correction_has_the_mean_label_of_its_rows():
-    labels = np.array([[1.0], [2.0], [6.0], [4.0]], np.float32)
-    assert held_labels(labels, 3).tolist() == [[3.0], [4.0]]
-    np.testing.assert_array_equal(held_labels(labels, 1), labels)
+from gaponet.training.warm_start import WarmStart, recipe
 
 
 def test_the_inverse_baseline_is_one_undisturbed_round():
@@ -44,3 +40,14 @@ def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
     assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
+
+
+def test_a_held_correction_has_the_mean_label_of_its_rows(fitted):
+    held = replace(fitted.net.config, delta_hold=3)
+    env = DeltaEnv(
+        recordings(fitted.env.robot, 1, rows=10), fitted.env.robot, held, 2, 10**9, RewardConfig(), nthread=1
+    )
+    labels = np.zeros((10, 2), np.float32)
+    labels[:4, 0] = [1.0, 2.0, 6.0, 4.0]
+    found = WarmStart(fitted.net, env, labels, WarmStartConfig(num_envs=2, steps=4), seed=0).labels
+    assert found[:2, 0].tolist() == [3.0, 4.0]

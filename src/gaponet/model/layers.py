@@ -87,7 +87,7 @@ class Features(nn.Module):
 class _Bounded(nn.Module):
     """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
 
-    The gain is 1 while training; training/gain.py lowers it where less of a correction does better.
+    The gain is 1 while training; training/validation.py lowers it where less of a correction does better.
     """
 
     gain: Tensor

@@ -29,6 +29,14 @@ class Layout:
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 
+    def shifted(self, shift: Array) -> Array:
+        """What moving every position and target of [o_t | a_t] by shift (k, n) rad adds to x, (k, dim)."""
+        k, n = shift.shape
+        out = np.zeros((k, self.dim))
+        out[:, self.q] = out[:, self.action] = shift
+        out[:, self.past] = np.tile(np.concatenate([shift, np.zeros((k, n)), shift], axis=1), (1, self.history))
+        return out
+
 
 class History:
     """The past frames of num_envs robots, written into x; numpy and torch arrays alike."""

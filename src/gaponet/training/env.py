@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence as ListOf
 from typing import Any
 
 import numpy as np
 import torch
 
-from gaponet.arrays import Array, copy_of, indices, library, rows_of, single, zeros_like
+from gaponet.arrays import Array, copy_of, indices, library, like, rows_of, single, zeros_like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
@@ -20,6 +21,7 @@ from gaponet.sim.free_runs import IMMOVABLE
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
 
+ROWS = ("row", "first", "last", "now", "elapsed")  # of each environment
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
 
@@ -209,3 +211,33 @@ class DeltaEnv:
         mean = float(self.reward_sum) / max(self.reward_count, 1)
         self.reward_sum, self.reward_count = 0.0, 0
         return mean
+
+    # ---- what a checkpoint holds
+
+    @property
+    def rng_state(self) -> str:
+        """State of the random numbers; its integers have 128 bits."""
+        return json.dumps(self.rng.bit_generator.state)
+
+    @rng_state.setter
+    def rng_state(self, text: str) -> None:
+        self.rng.bit_generator.state = json.loads(text)
+
+    def state(self) -> dict[str, Any]:
+        """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
+        arrays = {name: getattr(self, name) for name in ROWS} | {"frames": self.loop.history.frames} | self.sim.state()
+        return {
+            "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
+            "reward": (float(self.reward_sum), self.reward_count),
+            "rng": self.rng_state,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Undo `state` in an environment made alike."""
+        arrays = {name: x.numpy() for name, x in state["arrays"].items()}
+        for name in ROWS:
+            getattr(self, name)[:] = self.sim.array(arrays[name])
+        self.loop.history.frames[:] = like(self.loop.history.frames, arrays["frames"])
+        self.sim.set_state(arrays)
+        self.reward_sum, self.reward_count = state["reward"]
+        self.rng_state = state["rng"]

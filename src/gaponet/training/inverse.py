@@ -13,7 +13,6 @@ is what lets a network be fitted on the states that it visits itself.
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from typing import NamedTuple
 
 import numpy as np
 
@@ -27,65 +26,21 @@ from gaponet.sim.model import build_model
 FRICTION_SPEED = 0.02  # rad/s: below it, recorded motion is as good as rest
 
 
-class _Motion(NamedTuple):
-    """A recorded motion, smoothed, and what it takes of the joints, arrays (T, n): rad, rad/s, rad/s², N·m."""
-
-    qpos: Array
-    qvel: Array
-    qacc: Array
-    links: Array
-    """Inertia, Coriolis and gravity of links and payload."""
-
-
-class _Plant(NamedTuple):
-    """The numbers of a simulator that its inverse takes, each (n)."""
-
-    kp: Array
-    kd: Array
-    damping: Array
-    frictionloss: Array
-    armature: Array
-    offset: Array
-    effort_limit: Array
-
-
-def _plant_of(robot: RobotSpec) -> _Plant:
-    """Of a robot, (n) each."""
-    model = build_model(robot)
-    damping, friction, armature = model.dof_damping, model.dof_frictionloss, model.dof_armature
-    return _Plant(robot.kp, robot.kd, damping, friction, armature, robot.offset, robot.effort_limit)
-
-
-def _motion_of(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> _Motion:
-    """A recording as the robot's inverse dynamics see it."""
-    model = build_model(robot, sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt)
-    qpos = lowpass(sequence.qpos.astype(float), sequence.dt, cutoff)
-    qvel = differentiate(qpos, sequence.dt)
-    qacc = differentiate(qvel, sequence.dt)
-    own = model.dof_armature * qacc + model.dof_damping * qvel
-    return _Motion(qpos, qvel, qacc, inverse_dynamics(model, qpos, qvel, qacc) - own)
-
-
-def _band(motion: _Motion, plant: _Plant) -> tuple[Array, Array]:
-    """The least and the greatest u* of servos that are not late, rad."""
-    tau = motion.links + plant.armature * motion.qacc + plant.damping * motion.qvel
-    moving = np.tanh(np.abs(motion.qvel) / FRICTION_SPEED)  # 0 at rest: friction is anything within ±limit; 1: all
-    tau = tau + moving * np.sign(motion.qvel) * plant.frictionloss
-    free = (1.0 - moving) * plant.frictionloss
-    low, high = (_target(tau + part, motion, plant) for part in (-free, free))
-    return low, high
-
-
-def _target(tau: Array, motion: _Motion, plant: _Plant) -> Array:
-    """Targets with which the servos produce these torques."""
-    tau = np.clip(tau, -plant.effort_limit, plant.effort_limit)
-    return np.asarray(motion.qpos + (tau + plant.kd * motion.qvel) / plant.kp - plant.offset)
-
-
 def inverse_targets(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF) -> tuple[Array, Array]:
     """The least and the greatest u*, (T, n) rad each: held over [t, t+1), they lead the simulator from row t to t+1."""
     robot = robot.with_gains(*sequence.meta.known_gains)
-    low, high = _band(_motion_of(sequence, robot, cutoff), _plant_of(robot))
+    model = build_model(robot, sequence.meta.payload_mass, sequence.meta.payload_side, sequence.dt)
+    qpos = lowpass(sequence.qpos.astype(float), sequence.dt, cutoff)
+    qvel = differentiate(qpos, sequence.dt)
+    tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, sequence.dt))
+    moving = np.tanh(np.abs(qvel) / FRICTION_SPEED)  # 0 at rest: friction is anything within ±limit; 1: all
+    tau, free = tau + moving * np.sign(qvel) * model.dof_frictionloss, (1.0 - moving) * model.dof_frictionloss
+    low, high = (
+        qpos
+        + (np.clip(tau + band, -robot.effort_limit, robot.effort_limit) + robot.kd * qvel) / robot.kp
+        - robot.offset
+        for band in (-free, free)
+    )
     t = np.arange(len(sequence)) * sequence.dt
     for j in np.flatnonzero(robot.delay):
         for target in (low, high):
@@ -93,13 +48,11 @@ def inverse_targets(sequence: Sequence, robot: RobotSpec, cutoff: float = CUTOFF
     return low.astype(np.float32), high.astype(np.float32)
 
 
-def inverse_labels(sequence: Sequence, robot: RobotSpec, limit: float) -> Array:
-    """The Δa* nearest to 0 with a + Δa* between these targets, operated joints, within ±limit rad, (T, n_operated)."""
-    low, high = inverse_targets(sequence, robot)
-    delta = np.clip(sequence.ctrl, low, high) - sequence.ctrl
-    return np.clip(delta[:, robot.operated_index], -limit, limit).astype(np.float32)
-
-
-def labels_of(sequences: ListOf[Sequence], robot: RobotSpec, limit: float) -> Array:
-    """Of every row of recordings, one behind the other."""
-    return np.concatenate([inverse_labels(s, robot, limit) for s in sequences])
+def inverse_labels(sequences: ListOf[Sequence], robot: RobotSpec, limit: float) -> Array:
+    """The Δa* nearest to 0 with a + Δa* between these targets, operated joints, within ±limit rad, (rows of all
+    recordings, n_operated)."""
+    labels = []
+    for s in sequences:
+        low, high = inverse_targets(s, robot)
+        labels.append((np.clip(s.ctrl, low, high) - s.ctrl)[:, robot.operated_index])
+    return np.clip(np.concatenate(labels), -limit, limit).astype(np.float32)

@@ -1,7 +1,8 @@
-"""What a run remembers: with the network and the random numbers, its checkpoint."""
+"""What a run must remember to go on as if it had never stopped, bit for bit: tensors, numbers, text, no code."""
 
 from __future__ import annotations
 
+import io
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,13 +11,15 @@ from typing import Any
 import torch
 
 from gaponet.errors import ModelError, UsageError
-from gaponet.files import write_text
+from gaponet.files import whole, write_text
 from gaponet.model.layers import DeltaNet
 from gaponet.training import ranks
-from gaponet.training.checkpoint import StateDict, own, with_own, write_state
 from gaponet.training.sensor_fit import Report
 
+StateDict = dict[str, Any]
+
 CHECKPOINT, PROGRESS = "checkpoint.pt", "progress.jsonl"
+SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all ranks
 
 
 @dataclass
@@ -51,9 +54,12 @@ class Kept:
         """Write the checkpoint, and progress.jsonl beside it; of all ranks, whose networks must be equal, the first."""
         ranks.require_equal(net.state_dict(), self.learner["critic"] if self.learner else {})
         state = vars(self) | {"net": net.state_dict(), "rng": torch.get_rng_state()}
-        others = ranks.gathered(own({name: state[name] for name in ("rng", "env", "learner", "warm")}))[1:]
+        others = ranks.gathered(_own({name: state[name] for name in ("rng", "env", "learner", "warm")}))[1:]
         if not ranks.rank():
-            write_state(out / CHECKPOINT, state | {"others": others})
+            content = io.BytesIO()  # torch does not say which error it met on a disk
+            torch.save(state | {"others": others}, content)
+            with whole(out / CHECKPOINT) as temporary:
+                temporary.write_bytes(content.getbuffer())
             self.write_progress(out)
 
     def write_progress(self, out: Path) -> None:
@@ -76,7 +82,7 @@ class Kept:
             net.load_state_dict(state.pop("net"))
             others = state.pop("others", [])
             if 0 < ranks.rank() <= len(others):
-                state = with_own(state, others[ranks.rank() - 1])
+                state = _with_own(state, others[ranks.rank() - 1])
             rng = state.pop("rng")
             kept = cls(**state)
             torch.set_rng_state(rng)
@@ -89,3 +95,21 @@ class Kept:
         if kept.dataset not in ("", dataset):
             raise UsageError(f"{out}: was trained on other recordings than this dataset holds; train anew")
         return kept, rng
+
+
+def _own(state: Any) -> Any:
+    """What of a state is a rank's own, on the CPU: all but networks and their optimisers."""
+    if isinstance(state, dict):
+        return {name: _own(x) for name, x in state.items() if name not in SHARED}
+    if isinstance(state, list):
+        return [_own(x) for x in state]
+    return state.cpu() if isinstance(state, torch.Tensor) else state
+
+
+def _with_own(state: Any, mine: Any) -> Any:
+    """The first rank's state with another one's `_own` in the place of its own."""
+    if isinstance(mine, dict):
+        return (state or {}) | {name: _with_own((state or {}).get(name), x) for name, x in mine.items()}
+    if isinstance(mine, list):
+        return [_with_own(x, y) for x, y in zip(state, mine, strict=True)]
+    return mine

@@ -42,16 +42,15 @@ from gaponet.sim.model import model_hash
 from gaponet.structure import validated
 from gaponet.training import ranks
 from gaponet.training.budget import Budget, Status
-from gaponet.training.checkpoint import StateDict, env_state, restore_env, restore_warm, round_state, warm_state
 from gaponet.training.config import TrainConfig, command
 from gaponet.training.env import DeltaEnv
-from gaponet.training.gain import choose_gain
-from gaponet.training.inverse import labels_of
-from gaponet.training.kept import Kept
+from gaponet.training.inverse import inverse_labels
+from gaponet.training.kept import Kept, StateDict
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import Learner, Update
-from gaponet.training.validation import mean_error
-from gaponet.training.warm_start import WarmStart, fit_inputs, recipe
+from gaponet.training.sensor_fit import fit_inputs
+from gaponet.training.validation import choose_gain, mean_error
+from gaponet.training.warm_start import WarmStart, recipe
 
 VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
 
@@ -157,27 +156,23 @@ class Trainer:
         config = recipe(self.own)
         env = self._env(config.num_envs, 10**9, self.config.seed)
         limit = 0.99 * self.config.model.delta_max
-        labels = labels_of(self.train_set, self.robot, limit)
+        labels = inverse_labels(self.train_set, self.robot, limit)
         warm = WarmStart(self.net, env, labels, config, ranks.seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
-        rounds: list[StateDict] = []
         if self.kept.rounds_done == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
             warm.begin()
         self.stage = "warm start"
         if self.kept.warm is not None and self._spent() < 1:
-            rounds = self.kept.warm["rounds"]
-            restore_warm(warm, self.kept.warm)
+            warm.set_state(self.kept.warm)
             torch.set_rng_state(self.rng)
         while (
             warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
         ):
-            before = round_state(warm)
             fit = warm.round(self._tick)
             self.kept.sensor_r2 = warm.report
-            rounds.append(before)
-            self.kept.rounds_done, self.kept.warm = warm.done, warm_state(warm, rounds)
+            self.kept.rounds_done, self.kept.warm = warm.done, warm.state()
             self.kept.steps += ranks.world() * config.num_envs * config.steps
             self._consider(None, **fit)
 
@@ -204,7 +199,7 @@ class Trainer:
         learner = Learner(env, self.net, ppo)
         if self.kept.learner is not None and self.kept.env is not None:
             learner.load(self.kept.learner)
-            restore_env(env, self.kept.env)
+            env.set_state(self.kept.env)
             torch.set_rng_state(self.rng)
         self.kept.warm = None
         while self._spent() < 1:
@@ -213,9 +208,9 @@ class Trainer:
             self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
             self._tick()
             if self.kept.updates % self.config.validate_every == 0:
-                self.kept.learner, self.kept.env = learner.state(), env_state(env)
+                self.kept.learner, self.kept.env = learner.state(), env.state()
                 self._consider()
-        self.kept.learner, self.kept.env = learner.state(), env_state(env)
+        self.kept.learner, self.kept.env = learner.state(), env.state()
         self._consider()
 
     def _ppo_start(self) -> StateDict:

@@ -1,4 +1,5 @@
-"""Fit the sensor predictor to what the simulator really answers, at visited and at random states, and say how well."""
+"""Before all training: the statistics of the inputs, and the sensor predictor, fitted to what the simulator really
+answers at visited and at random states."""
 
 from __future__ import annotations
 
@@ -9,18 +10,73 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaponet.arrays import Array
+from gaponet.arrays import Array, copy_of, host
+from gaponet.errors import UsageError
 from gaponet.model.layers import DeltaNet
-from gaponet.model.loop import Infer
-from gaponet.model.observation import Layout
 from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import Condition
+from gaponet.training import ranks
+from gaponet.training.env import DeltaEnv
 
 STEPS = 600
 BATCH = 256
 POSITION_NOISE, VELOCITY_NOISE = 0.05, 0.3  # rad, rad/s: a third of the states is moved off the recorded ones by these
 Report = dict[str, Any]  # R² on held-out states {"mean", "by_joint": {name: …}, "by_probe": […]}
+
+
+def fit_inputs(
+    net: DeltaNet, env: DeltaEnv, x: torch.Tensor, states: int, seed: int, nthread: int = 0
+) -> Report | None:
+    """Before all training: statistics of the inputs from samples x, (N, dim), and on them the sensor predictor.
+
+    Args:
+        net: With no statistics yet.
+        env: Whose simulator is asked.
+
+    Returns:
+        Its R² on held-out states; None for a network without one.
+    """
+    net.cpu().fit_inputs(x.cpu())  # the sensors to be predicted are C MuJoCo's answers
+    ranks.pool(net)
+    report = None
+    if net.predictor is not None:
+        report = ranks.once(lambda: _fit_sensors(net, env, states, seed, nthread))
+        net.predictor.requires_grad_(False)
+        ranks.spread(net.predictor)
+    net.to(x.device)
+    return report
+
+
+def _fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
+    """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
+    if states < 8:
+        raise UsageError(f"--warm-start.sensor-states {states}: too few to fit a predictor on; give 8 or more")
+    rng = np.random.default_rng(seed)
+    xs: list[Array] = []
+    qs: list[Array] = []
+    vs: list[Array] = []
+    while sum(map(len, xs)) < states:
+        env.reset()
+        xs.append(host(env.get_observations()["actor"]))
+        qs.append(copy_of(host(env.sim.qpos)))
+        vs.append(copy_of(host(env.sim.qvel)))
+    x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
+    of = np.tile(np.arange(env.num_envs), len(xs))  # environment of each state
+    pick = np.sort(rng.permutation(len(x))[:states])
+    shuffled = rng.permutation(pick)
+    asked = _sensor_labels(
+        net,
+        env.robot,
+        x[shuffled],
+        q[shuffled],
+        v[shuffled],
+        [env.conditions[g] for g in env.group[of[shuffled]]],
+        env.locked,
+        seed,
+        nthread,
+    )
+    return _fit_predictor(net, asked, env.robot.operated, seed)
 
 
 @dataclass(frozen=True)
@@ -39,7 +95,7 @@ class _Answers:
         return _Answers(self.features[rows], self.answers[rows])
 
 
-def sensor_labels(
+def _sensor_labels(
     net: DeltaNet,
     robot: RobotSpec,
     x: Array,
@@ -72,24 +128,14 @@ def sensor_labels(
     low, high = np.clip(robot.qpos_range[robot.operated_index].T, -np.pi, np.pi)
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
     q[np.ix_(far, op)] += shift
-    x[far] += shift_positions(shift, at)
+    x[far] += at.shifted(shift)
     answers = oracle(q, v)
     with torch.inference_mode():
         features = net.features(torch.from_numpy(x.astype(np.float32)))
     return _Answers(features.clone(), torch.from_numpy(answers.reshape(len(q), -1)))
 
 
-def shift_positions(shift: Array, at: Layout) -> Array:
-    """What moving every position and target of [o_t | a_t] by shift (k, n) adds to x, (k, dim)."""
-    k, n = shift.shape
-    out = np.zeros((k, at.dim))
-    out[:, at.q] = out[:, at.action] = shift
-    frame = np.concatenate([shift, np.zeros((k, n)), shift], axis=1)
-    out[:, at.past] = np.tile(frame, (1, at.history))
-    return out
-
-
-def fit_predictor(net: DeltaNet, asked: _Answers, joints: tuple[str, ...], seed: int) -> Report:
+def _fit_predictor(net: DeltaNet, asked: _Answers, joints: tuple[str, ...], seed: int) -> Report:
     """Gaussian likelihood on three quarters of the states; returns R² on the rest.
 
     The predictor is then frozen: PPO must not bend what the simulator would say into what the policy would like.
@@ -127,15 +173,3 @@ def _explained(net: DeltaNet, asked: _Answers, joints: tuple[str, ...]) -> Repor
         r2 = (1 - residual / spread).reshape(-1, 2, len(joints))  # (m, positions and velocities, n)
         by_joint = dict(zip(joints, r2.mean((0, 1)).tolist(), strict=True))
         return {"mean": float(r2.mean()), "by_joint": by_joint, "by_probe": r2.mean((1, 2)).tolist()}
-
-
-def torch_infer(net: torch.nn.Module) -> Infer:
-    """A network as a function of numpy arrays, for validation while training."""
-    net.eval()
-    device = next(net.parameters()).device
-
-    def infer(x: Array) -> Array:
-        with torch.inference_mode():
-            return net(torch.from_numpy(x).to(device)).cpu().numpy()
-
-    return infer

@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.arrays import Array, copy_of, host, indices, library
-from gaponet.errors import UsageError
+from gaponet.arrays import Array, indices, library
 from gaponet.model.layers import DeltaNet
 from gaponet.training import ranks
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.sensor_fit import Report, fit_predictor, sensor_labels
+from gaponet.training.sensor_fit import Report, fit_inputs
 
 
 def recipe(config: TrainConfig) -> WarmStartConfig:
@@ -53,7 +52,7 @@ class WarmStart:
     ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.config = net, env, config
-        self.labels: Any = env.sim.array(held_labels(labels, env.config.delta_hold))
+        self.labels: Any = env.sim.array(_held_labels(labels, env.config.delta_hold))
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -61,6 +60,7 @@ class WarmStart:
         self.trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
         self.optimiser = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.done = 0
+        self.rounds: list[dict[str, Any]] = []  # what the roll-outs of each round so far followed from
 
     def begin(self) -> None:
         """Before the first round: statistics of inputs, and on them the sensor predictor, where labels lead along."""
@@ -119,6 +119,7 @@ class WarmStart:
         tick is called after every gradient step and returns the share of the budget spent: whichever is further, rounds
         or budget, lowers the step size.
         """
+        before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
         self.collect(follow_labels=self.done == 0)
         x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
         config, net = self.config, self.net
@@ -141,70 +142,40 @@ class WarmStart:
         net.sample_sensors = False
         net.eval()
         self.done += 1
+        self.rounds.append(before)
         quarter = max(len(losses) // 4, 1)
-        last, before = losses[-quarter:], losses[-2 * quarter : -quarter]
-        return {"label_rmse": _rms(last), "label_rmse_before": _rms(before)}
+        last, earlier = losses[-quarter:], losses[-2 * quarter : -quarter]
+        return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
+
+    def state(self) -> dict[str, Any]:
+        """A warm start between rounds. Its pool is hundreds of megabytes and follows from the networks that collected
+        it, so those are kept and roll out again."""
+        return {
+            "rounds": list(self.rounds),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "env_rng": self.env.rng_state,
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Roll the past rounds out again, then undo `state`; the network is left as it is."""
+        present = {name: x.clone() for name, x in self.net.state_dict().items()}
+        for i, before in enumerate(state["rounds"]):
+            self.net.load_state_dict(before["net"])
+            self.env.rng_state = before["rng"]
+            self.collect(follow_labels=i == 0)
+        self.net.load_state_dict(present)
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
+        self.env.rng_state = state["env_rng"]
+        self.rounds, self.done = list(state["rounds"]), len(state["rounds"])
 
 
 def _rms(losses: Array) -> float:
     return float(np.sqrt(ranks.mean(losses.mean())[0])) if len(losses) else float("nan")
 
 
-def held_labels(labels: Array, hold: int) -> Array:
+def _held_labels(labels: Array, hold: int) -> Array:
     """Mean of the labels of rows t … t + hold − 1, (N, n) → (N − hold + 1, n); a motion's last rows mean nothing."""
     rows = len(labels) - hold + 1
     return np.mean([labels[i : rows + i] for i in range(hold)], axis=0, dtype=labels.dtype)
-
-
-def fit_inputs(
-    net: DeltaNet, env: DeltaEnv, x: torch.Tensor, states: int, seed: int, nthread: int = 0
-) -> Report | None:
-    """Before all training: statistics of the inputs from samples x, (N, dim), and on them the sensor predictor.
-
-    Args:
-        net: With no statistics yet.
-        env: Whose simulator is asked.
-
-    Returns:
-        Its R² on held-out states; None for a network without one.
-    """
-    net.cpu().fit_inputs(x.cpu())  # the sensors to be predicted are C MuJoCo's answers
-    ranks.pool(net)
-    report = None
-    if net.predictor is not None:
-        report = ranks.once(lambda: _fit_sensors(net, env, states, seed, nthread))
-        net.predictor.requires_grad_(False)
-        ranks.spread(net.predictor)
-    net.to(x.device)
-    return report
-
-
-def _fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: int = 0) -> Report:
-    """Fit the predictor at the environment's recorded start states and around them; returns held-out R²."""
-    if states < 8:
-        raise UsageError(f"--warm-start.sensor-states {states}: too few to fit a predictor on; give 8 or more")
-    rng = np.random.default_rng(seed)
-    xs: list[Array] = []
-    qs: list[Array] = []
-    vs: list[Array] = []
-    while sum(map(len, xs)) < states:
-        env.reset()
-        xs.append(host(env.get_observations()["actor"]))
-        qs.append(copy_of(host(env.sim.qpos)))
-        vs.append(copy_of(host(env.sim.qvel)))
-    x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
-    of = np.tile(np.arange(env.num_envs), len(xs))  # environment of each state
-    pick = np.sort(rng.permutation(len(x))[:states])
-    shuffled = rng.permutation(pick)
-    asked = sensor_labels(
-        net,
-        env.robot,
-        x[shuffled],
-        q[shuffled],
-        v[shuffled],
-        [env.conditions[g] for g in env.group[of[shuffled]]],
-        env.locked,
-        seed,
-        nthread,
-    )
-    return fit_predictor(net, asked, env.robot.operated, seed)
