@@ -25,7 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.eval.whose import label
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
-from gaponet.model.calibration import calibrate, recordings
+from gaponet.model.calibration import Calibration, recordings
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import DEFAULT_TERMS
 from gaponet.sim.refit import refit
@@ -78,7 +78,7 @@ def methods_of(bench: Bench, models: list[GapModel], given: list[Sequence]) -> d
     """Identification, and 30 s of the unit, each without and with the operators."""
     law = bench.identified(DEFAULT_TERMS)
     alone = refit(given, law).robot
-    own = [calibrate(m, law, given).robot(law) for m in models]
+    own = [Calibration.fit(m, law, given).robot(law) for m in models]
     return {
         IDENTIFIED: [(law, None)], OPERATOR: [(law, m.corrector(law)) for m in models], CALIBRATED: [(alone, None)],
         BOTH: [(robot, m.corrector(law)) for robot, m in zip(own, models, strict=True)],
@@ -90,7 +90,7 @@ def untold(bench: Bench, models: list[GapModel], given: list[Sequence]) -> dict[
     law, most = bench.identified(DEFAULT_TERMS), max(s.meta.payload_mass for s in given)
     heavy, given = ([s for s in part if s.meta.payload_mass == most] for part in (bench.test, given))
     alone = refit(given, law, unknown_payload=True)
-    own = [calibrate(m, law, given, unknown_payload=True) for m in models]
+    own = [Calibration.fit(m, law, given, unknown_payload=True) for m in models]
 
     def errors(mass: float | None, simulator: RobotSpec, model: GapModel | None = None) -> Array:
         told = [replace(s, meta=replace(s.meta, payload_mass=mass or 0.0)) for s in heavy]

@@ -351,7 +351,7 @@ def evaluate(
         target, spec = spec, kept.nominal or kept
     with bar("evaluating") as update:
         found = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, update, target)
-    measuring.save(found, folder)
+    found.save(folder)
     return found
 
 
@@ -396,11 +396,11 @@ def calibrate(
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
     with bar("calibrating") as update:
-        found = calibration.calibrate(
+        found = calibration.Calibration.fit(
             model, simulator, data.sequences(entries), seconds, unknown_payload,
             lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
         )  # fmt: skip
-    calibration.save(found, folder)
+    found.save(folder)
     return found
 
 

@@ -8,7 +8,7 @@ from arm import TOML, XML, write_arm
 from logs import arm_sequence, wave
 
 from gaponet.data.holds import Holds
-from gaponet.data.offsets import FILE, fit_offsets, fit_unit, read_offsets, record_offsets
+from gaponet.data.offsets import FILE, UnitOffsets, read_offsets, record_offsets
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.sim.dynamics import static_torque
@@ -39,7 +39,9 @@ def heavy(tmp_path):
 
 
 def test_a_perfect_unit_has_no_offset(heavy):
-    joint = fit_offsets({(0.0, "both", None): rests(heavy, np.zeros(2))}, heavy, gravity_of(heavy)).joints["shoulder"]
+    joint = UnitOffsets.of({(0.0, "both", None): rests(heavy, np.zeros(2))}, heavy, gravity_of(heavy)).joints[
+        "shoulder"
+    ]
     assert joint.tracking_offset == pytest.approx(0, abs=1e-3)
     assert joint.stiction_band == pytest.approx(BAND, abs=1e-3)
     assert joint.nominal_sag > 0.05
@@ -47,13 +49,13 @@ def test_a_perfect_unit_has_no_offset(heavy):
 
 
 def test_a_constant_offset_is_what_gravity_does_not_explain(heavy):
-    found = fit_offsets({(0.0, "both", None): rests(heavy, np.zeros(2), offset=0.02)}, heavy, gravity_of(heavy))
+    found = UnitOffsets.of({(0.0, "both", None): rests(heavy, np.zeros(2), offset=0.02)}, heavy, gravity_of(heavy))
     assert found.joints["elbow"].tracking_offset == pytest.approx(0.02, abs=1e-3)
 
 
 def test_a_turned_encoder_is_found_from_how_sag_changes_with_posture(heavy):
     zero = np.array([0.15, -0.1])
-    found = fit_offsets({(0.0, "both", None): rests(heavy, zero)}, heavy, gravity_of(heavy))
+    found = UnitOffsets.of({(0.0, "both", None): rests(heavy, zero)}, heavy, gravity_of(heavy))
     for name, true in zip(heavy.joint_names, zero, strict=True):
         joint = found.joints[name]
         assert joint.identifiable
@@ -65,7 +67,7 @@ def test_a_turned_encoder_is_found_from_how_sag_changes_with_posture(heavy):
 def test_two_payloads_are_fitted_together(heavy):
     zero = np.array([0.1, 0.05])
     parts = {(mass, "both", None): rests(heavy, zero, mass=mass, seed=i) for i, mass in enumerate((0.0, 0.3))}
-    found = fit_offsets(parts, heavy, gravity_of(heavy))
+    found = UnitOffsets.of(parts, heavy, gravity_of(heavy))
     assert found.joints["shoulder"].zero_offset == pytest.approx(0.1, abs=0.02)
     assert found.joints["shoulder"].rests_up + found.joints["shoulder"].rests_down == 240
 
@@ -73,14 +75,14 @@ def test_two_payloads_are_fitted_together(heavy):
 def test_a_vertical_axis_does_not_see_gravity(tmp_path):
     toml = TOML.replace("kp = 20.0", "kp = 5.0")
     robot = write_arm(tmp_path / "pan", toml=toml, xml=XML.replace('axis="0 1 0"', 'axis="0 0 1"', 1))
-    found = fit_offsets({(0.0, "both", None): rests(robot, np.array([0.2, 0.0]))}, robot, gravity_of(robot))
+    found = UnitOffsets.of({(0.0, "both", None): rests(robot, np.array([0.2, 0.0]))}, robot, gravity_of(robot))
     assert not found.joints["shoulder"].identifiable
     assert found.joints["shoulder"].reason == "gravity hardly loads this joint in these postures"
     assert found.joints["shoulder"].zero_offset == pytest.approx(0, abs=0.01)  # not the true 0.2: nothing shows it
 
 
 def test_softer_motors_in_a_narrow_range_are_not_taken_for_a_turned_encoder(heavy):
-    found = fit_offsets(
+    found = UnitOffsets.of(
         {(0.0, "both", None): rests(heavy, np.zeros(2), stiffness=0.6, reach=0.3)}, heavy, gravity_of(heavy)
     )
     assert found.stiffness == pytest.approx(0.6, abs=0.1)
@@ -88,7 +90,7 @@ def test_softer_motors_in_a_narrow_range_are_not_taken_for_a_turned_encoder(heav
 
 
 def test_a_few_rests_say_nothing_about_zeros(heavy):
-    found = fit_offsets({(0.0, "both", None): rests(heavy, np.zeros(2), count=8)}, heavy, gravity_of(heavy))
+    found = UnitOffsets.of({(0.0, "both", None): rests(heavy, np.zeros(2), count=8)}, heavy, gravity_of(heavy))
     assert found.stiffness is None
     assert found.joints["elbow"].zero_offset is None
     assert "fewer than 20 rests" in found.joints["elbow"].reason
@@ -97,14 +99,14 @@ def test_a_few_rests_say_nothing_about_zeros(heavy):
 def test_motions_without_a_rest_leave_everything_open(heavy, tmp_path):
     dataset = Dataset.create(tmp_path / "data", heavy)
     dataset.append(arm_sequence(heavy, wave(200, 2), wave(200, 2)))
-    found = fit_unit(dataset, heavy, "a", gravity_of(heavy))
+    found = UnitOffsets.of_unit(dataset, heavy, "a", gravity_of(heavy))
     assert found.joints["elbow"].static_error is None
     assert found.joints["elbow"].tracking_offset is None
 
 
 def test_offsets_are_recorded_per_unit_and_marked_as_not_applied(heavy, tmp_path):
     dataset = Dataset.create(tmp_path / "data", heavy)
-    found = fit_offsets({(0.0, "both", None): rests(heavy, np.zeros(2))}, heavy, gravity_of(heavy))
+    found = UnitOffsets.of({(0.0, "both", None): rests(heavy, np.zeros(2))}, heavy, gravity_of(heavy))
     record_offsets(dataset, "a", found, "abc")
     record_offsets(dataset, "b", found, "abc")
     content = json.loads((dataset.path / FILE).read_text())

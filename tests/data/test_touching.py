@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from arm import recordings, write_arm
 
-from gaponet.data.checks.touching import standing, touching
+from gaponet.data.checks.touching import Standing, touching
 
 
 def stands(tmp_path, blocked):
@@ -22,7 +22,7 @@ def stands(tmp_path, blocked):
     tau = np.stack([20 * error, 0 * error], axis=1).astype(np.float32)
     sequence = replace(first, qpos=qpos, qvel=np.zeros_like(qpos), ctrl=ctrl, tau=tau)
     gravity = lambda q, mass, side: np.stack([0.3 * np.cos(q[:, 0]), np.zeros(len(q))], axis=1)  # noqa: E731
-    return standing(sequence, robot, lambda s: -0.2 * np.sin(s.qpos[:, 0]), gravity)
+    return Standing.of(sequence, robot, lambda s: -0.2 * np.sin(s.qpos[:, 0]), gravity)
 
 
 def test_a_motion_that_presses_is_named(tmp_path):

@@ -12,6 +12,7 @@ from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, NoGainError, UsageError
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.calibration import Calibration
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
@@ -39,7 +40,7 @@ def logs(robot):
 
 @pytest.fixture(scope="module")
 def found(model, robot, logs):
-    return calibration.calibrate(model, robot, logs[:2], seconds=16.0)
+    return Calibration.fit(model, robot, logs[:2], seconds=16.0)
 
 
 def test_gain_and_delay_of_the_unit_are_found(found, robot):
@@ -60,32 +61,32 @@ def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs
 
 def test_a_calibration_is_read_as_it_was_written(found, tmp_path):
     odd = replace(found, unit_id="lab/arm 2")
-    assert calibration.save(odd, tmp_path).name == "lab_arm_2.json"
+    assert odd.save(tmp_path).name == "lab_arm_2.json"
     assert calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
     with pytest.raises(ModelError, match="made for another model"):
         calibration.load(tmp_path, "0123456789ab")
 
 
 def test_a_calibration_for_an_earlier_model_is_replaced(found, tmp_path):
-    calibration.save(replace(found, weights="0123456789ab"), tmp_path)
-    calibration.save(found, tmp_path)
+    replace(found, weights="0123456789ab").save(tmp_path)
+    found.save(tmp_path)
     assert calibration.load(tmp_path, found.weights) == {found.unit_id: found}
 
 
 def test_a_payload_that_nobody_weighed_is_found(model, robot):
     logs = [record(robot, commands(450, seed), f"m{seed}", payload=0.2) for seed in range(2)]
     untold = [replace(s, meta=replace(s.meta, payload_mass=0.0)) for s in logs]
-    found = calibration.calibrate(model, robot, untold, seconds=16.0, unknown_payload=True)
+    found = Calibration.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
     assert found.payload_mass == pytest.approx(0.2, abs=0.02)
     assert found.payload_std < 0.02
     with pytest.raises(UsageError, match="one and the same"):
-        calibration.calibrate(model, robot, [untold[0], logs[1]], unknown_payload=True)
+        Calibration.fit(model, robot, [untold[0], logs[1]], unknown_payload=True)
 
 
 def test_recordings_of_two_units_are_refused(model, robot, logs):
     other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
     with pytest.raises(UsageError, match="give those of one unit"):
-        calibration.calibrate(model, robot, [logs[1], other])
+        Calibration.fit(model, robot, [logs[1], other])
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_recordings_of_two_units_are_refused(model, robot, logs):
     ],
 )
 def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, changed, said):
-    file = calibration.save(found, tmp_path)
+    file = found.save(tmp_path)
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
     with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
         calibration.load(tmp_path, found.weights)

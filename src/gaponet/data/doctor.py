@@ -13,10 +13,10 @@ from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.rests import rests
-from gaponet.data.checks.touching import Heights, Standing, standing, touching
+from gaponet.data.checks.touching import Heights, Standing, touching
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
-from gaponet.data.survey import Survey, survey
+from gaponet.data.survey import Survey
 from gaponet.errors import DatasetError
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
@@ -75,9 +75,9 @@ def diagnose(
     stands: list[Standing] = []
     for entry in dataset.entries:
         sequence = dataset.read(entry)
-        surveys.append(survey(entry, sequence, robot))
+        surveys.append(Survey.of(entry, sequence, robot))
         if model is not None and heights is not None:
-            stands.append(standing(sequence, robot, heights, model))
+            stands.append(Standing.of(sequence, robot, heights, model))
         progress(len(surveys), len(dataset), entry.meta.motion)
     findings = [f for check in CHECKS for f in check(surveys, robot)]
     if model is not None:

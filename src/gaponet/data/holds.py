@@ -40,6 +40,45 @@ class Holds:
     def __len__(self) -> int:
         return len(self.qpos)
 
+    @classmethod
+    def of(cls, sequence: Sequence, still: Array) -> Holds:
+        """The ends of all stretches in which the joints `still` (k indices) rest under a constant command."""
+        ends = _hold_ends(sequence, still)
+        n = sequence.qpos.shape[1]
+        qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
+        approach, fresh = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
+        w = _window(sequence)
+        for i, end in enumerate(ends):
+            qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
+            moved = sequence.qpos[: end + 1] - qpos[i]  # (end + 1, n)
+            away = np.abs(moved) > MOVED
+            last = end - away[::-1].argmax(axis=0)  # (n,) last row away from the rest
+            approach[i] = np.where(away.any(axis=0), -np.sign(moved[last, np.arange(n)]), 0)
+            if i:
+                fresh[i] = (np.abs(qpos[i] - qpos[i - 1]) > MOVED) | (np.abs(ctrl[i] - ctrl[i - 1]) > MOVED)
+        return Holds(qpos, ctrl, approach, fresh)
+
+    @classmethod
+    def joined(cls, parts: list[Holds], n: int) -> Holds:
+        """Holds of several sequences as one; n joints, for an empty list."""
+        empty = Holds(np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool))
+        parts = [empty, *parts]
+        return Holds(*(np.concatenate([getattr(p, f) for p in parts]) for f in ("qpos", "ctrl", "approach", "fresh")))
+
+    def static_error(self, joint: int, offset: Array | None = None) -> StaticError:
+        """Static error of a joint over these fresh rests of one unit, both approaches weighed alike.
+
+        Args:
+            offset: (k,) rad, expected error to take off, such as the sag of the nominal model; default none.
+        """
+        error = self.qpos[:, joint] - self.ctrl[:, joint] - (0.0 if offset is None else offset)
+        fresh, side = self.fresh[:, joint], self.approach[:, joint]
+        up, down, both = error[fresh & (side > 0)], error[fresh & (side < 0)], error[fresh]
+        if len(up) < 3 or len(down) < 3:
+            return StaticError(float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down))
+        high, low = float(np.median(down)), float(np.median(up))
+        return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
+
 
 @dataclass(frozen=True)
 class StaticError:
@@ -61,47 +100,6 @@ class StaticError:
     def balanced(self) -> bool:
         """Whether both sides were seen; otherwise stiction and sag cannot be told apart."""
         return np.isfinite(self.half_band)
-
-
-def find_holds(sequence: Sequence, still: Array) -> Holds:
-    """One row for each stretch in which the joints `still` (k indices) rest under a constant command, at its end."""
-    ends = _hold_ends(sequence, still)
-    n = sequence.qpos.shape[1]
-    qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
-    approach, fresh = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
-    w = _window(sequence)
-    for i, end in enumerate(ends):
-        qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
-        moved = sequence.qpos[: end + 1] - qpos[i]  # (end + 1, n)
-        away = np.abs(moved) > MOVED
-        last = end - away[::-1].argmax(axis=0)  # (n,) last row away from the rest
-        approach[i] = np.where(away.any(axis=0), -np.sign(moved[last, np.arange(n)]), 0)
-        if i:
-            fresh[i] = (np.abs(qpos[i] - qpos[i - 1]) > MOVED) | (np.abs(ctrl[i] - ctrl[i - 1]) > MOVED)
-    return Holds(qpos, ctrl, approach, fresh)
-
-
-def join(parts: list[Holds], n: int) -> Holds:
-    """Holds of several sequences as one; n joints, for an empty list."""
-    empty = Holds(np.zeros((0, n)), np.zeros((0, n)), np.zeros((0, n), int), np.zeros((0, n), bool))
-    parts = [empty, *parts]
-    return Holds(*(np.concatenate([getattr(p, f) for p in parts]) for f in ("qpos", "ctrl", "approach", "fresh")))
-
-
-def static_error(holds: Holds, joint: int, offset: Array | None = None) -> StaticError:
-    """Static error of a joint over its fresh rests, both approaches weighed alike.
-
-    Args:
-        holds: Holds of one unit, any number of sequences.
-        offset: (k,) rad, expected error to take off, such as the sag of the nominal model; default none.
-    """
-    error = holds.qpos[:, joint] - holds.ctrl[:, joint] - (0.0 if offset is None else offset)
-    fresh, side = holds.fresh[:, joint], holds.approach[:, joint]
-    up, down, both = error[fresh & (side > 0)], error[fresh & (side < 0)], error[fresh]
-    if len(up) < 3 or len(down) < 3:
-        return StaticError(float(np.median(both)) if len(both) else np.nan, np.nan, len(up), len(down))
-    high, low = float(np.median(down)), float(np.median(up))
-    return StaticError((high + low) / 2, max(high - low, 0.0) / 2, len(up), len(down))
 
 
 def _window(sequence: Sequence) -> int:

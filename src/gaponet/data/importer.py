@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.formats import find_logs, read_logs
-from gaponet.data.holds import Holds, find_holds
+from gaponet.data.holds import Holds
 from gaponet.data.log import Log, skipping
-from gaponet.data.offsets import Gravity, UnitOffsets, fit_unit, read_offsets, record_offsets
+from gaponet.data.offsets import Gravity, UnitOffsets, read_offsets, record_offsets
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
 from gaponet.data.store import KIND, Dataset, Entry
@@ -120,7 +120,7 @@ def import_logs(
         with skipping(skip_bad) as bad:
             dataset, added, present = _import(src, out, robot, given, fmt, progress, options, rests)
         units = dict.fromkeys(e.meta.unit_id for e in (*present, *added))
-        offsets = {unit: fit_unit(dataset, robot, unit, gravity, rests) for unit in units} if gravity else {}
+        offsets = {unit: UnitOffsets.of_unit(dataset, robot, unit, gravity, rests) for unit in units} if gravity else {}
         for unit, fitted in offsets.items():
             record_offsets(dataset, unit, fitted, simulator)
     only = next(iter(offsets.values())) if len(offsets) == 1 else None
@@ -169,7 +169,7 @@ def _import(
     added = []
     for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
         if rests is not None:
-            rests[digest] = find_holds(sequence, robot.operated_index)
+            rests[digest] = Holds.of(sequence, robot.operated_index)
         if dataset.find(digest):
             continue
         slot = sequence.meta.slot

@@ -25,7 +25,7 @@ import numpy as np
 from typing_extensions import TypedDict
 
 from gaponet.arrays import Array
-from gaponet.data.holds import Holds, StaticError, find_holds, join, static_error
+from gaponet.data.holds import Holds, StaticError
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
@@ -79,6 +79,46 @@ class UnitOffsets:
     joints: dict[str, JointOffset]
     stiffness: float | None
 
+    @classmethod
+    def of_unit(
+        cls, dataset: Dataset, robot: RobotSpec, unit_id: str, gravity: Gravity, known: dict[str, Holds] | None = None
+    ) -> UnitOffsets:
+        """Fit those of one unit from all its sequences; those whose rests are known, by hash, are not read again."""
+        known = known or {}
+        found: dict[Load, list[Holds]] = {}
+        for entry in dataset.entries:
+            if entry.meta.unit_id == unit_id:
+                key = (entry.meta.payload_mass, entry.meta.payload_side, entry.meta.known_gains[0])
+                rests = known.get(entry.hash) or Holds.of(dataset.read(entry), robot.operated_index)
+                found.setdefault(key, []).append(rests)
+        n = len(robot.joint_names)
+        return UnitOffsets.of({key: Holds.joined(parts, n) for key, parts in found.items()}, robot, gravity)
+
+    @classmethod
+    def of(cls, holds: dict[Load, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
+        """Fit the offsets of the operated joints.
+
+        Args:
+            robot: Whose gains carry the load.
+        """
+        n = len(robot.joint_names)
+        every = Holds.joined(list(holds.values()), n)
+        sag = np.concatenate(
+            [np.zeros((0, n)), *(_nominal_sag(h.qpos, key, robot, gravity) for key, h in holds.items())]
+        )
+        plain: dict[str, JointOffset] = {}
+        zeros: dict[str, dict[str, Any]] = {}
+        stiffness = None
+        for name, j in zip(robot.operated, robot.operated_index, strict=True):
+            error, beyond = every.static_error(j), every.static_error(j, sag[:, j])
+            plain[name] = _without_zero(error, beyond)
+        rests = {key: _rests(h, robot, max(30, MAX_POSES // len(holds))) for key, h in holds.items()}
+        if sum(int(r.used.sum()) for r in rests.values()) >= MIN_RESTS:
+            zeros, stiffness = _fit_zeros(rests, robot, gravity)
+        few = {"reason": f"fewer than {MIN_RESTS} rests after a motion: let the robot stand still in many postures"}
+        joints = {name: JointOffset(**(asdict(plain[name]) | zeros.get(name, few))) for name in robot.operated}
+        return UnitOffsets(joints, stiffness)
+
 
 class _OffsetsFile(TypedDict):
     """offsets.json: unit → what UnitOffsets holds, and the hash of the simulator whose gravity was used."""
@@ -95,44 +135,6 @@ class _Rests:
     error: Array
     approach: Array
     used: Array
-
-
-def fit_unit(
-    dataset: Dataset, robot: RobotSpec, unit_id: str, gravity: Gravity, known: dict[str, Holds] | None = None
-) -> UnitOffsets:
-    """Fit the offsets of one unit from all its sequences; those whose rests are known, by hash, are not read again."""
-    known = known or {}
-    found: dict[Load, list[Holds]] = {}
-    for entry in dataset.entries:
-        if entry.meta.unit_id == unit_id:
-            key = (entry.meta.payload_mass, entry.meta.payload_side, entry.meta.known_gains[0])
-            rests = known.get(entry.hash) or find_holds(dataset.read(entry), robot.operated_index)
-            found.setdefault(key, []).append(rests)
-    n = len(robot.joint_names)
-    return fit_offsets({key: join(parts, n) for key, parts in found.items()}, robot, gravity)
-
-
-def fit_offsets(holds: dict[Load, Holds], robot: RobotSpec, gravity: Gravity) -> UnitOffsets:
-    """Fit the offsets of the operated joints.
-
-    Args:
-        robot: Whose gains carry the load.
-    """
-    n = len(robot.joint_names)
-    every = join(list(holds.values()), n)
-    sag = np.concatenate([np.zeros((0, n)), *(_nominal_sag(h.qpos, key, robot, gravity) for key, h in holds.items())])
-    plain: dict[str, JointOffset] = {}
-    zeros: dict[str, dict[str, Any]] = {}
-    stiffness = None
-    for name, j in zip(robot.operated, robot.operated_index, strict=True):
-        error, beyond = static_error(every, j), static_error(every, j, sag[:, j])
-        plain[name] = _without_zero(error, beyond)
-    rests = {key: _rests(h, robot, max(30, MAX_POSES // len(holds))) for key, h in holds.items()}
-    if sum(int(r.used.sum()) for r in rests.values()) >= MIN_RESTS:
-        zeros, stiffness = _fit_zeros(rests, robot, gravity)
-    few = {"reason": f"fewer than {MIN_RESTS} rests after a motion: let the robot stand still in many postures"}
-    joints = {name: JointOffset(**(asdict(plain[name]) | zeros.get(name, few))) for name in robot.operated}
-    return UnitOffsets(joints, stiffness)
 
 
 def record_offsets(dataset: Dataset, unit_id: str, offsets: UnitOffsets, simulator: str) -> Path:

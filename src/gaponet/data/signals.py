@@ -153,25 +153,25 @@ class Response:
     power: Array
     duration: float
 
-
-def response(ctrl: Array, qpos: Array, dt: float) -> Response:
-    """Of ctrl and qpos (T, n)."""
-    every = max(1, round(STEP / dt))
-    step = every * dt
-    before, lags = round(BEFORE / step), round(BEFORE / step) + round(AFTER / step) + 1
-    size = len(ctrl[::every]) // PARTS
-    own, cross, power = [], [], []
-    for part in range(PARTS):
-        rows = slice(part * size, (part + 1) * size)
-        u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
-        length = 2 * max(len(u), lags)
-        a, b = np.fft.rfft(u, length, axis=0), np.fft.rfft(v, length, axis=0)
-        own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
-        later = np.fft.irfft(a.conj() * b, length, axis=0)
-        cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
-        power.append((v**2).sum(axis=0))
-    same, other, strength = (np.array(x, np.float32) for x in (own, cross, power))
-    return Response(step, same, other, strength, duration=len(ctrl) * dt)
+    @classmethod
+    def of(cls, ctrl: Array, qpos: Array, dt: float) -> Response:
+        """Of ctrl and qpos (T, n)."""
+        every = max(1, round(STEP / dt))
+        step = every * dt
+        before, lags = round(BEFORE / step), round(BEFORE / step) + round(AFTER / step) + 1
+        size = len(ctrl[::every]) // PARTS
+        own, cross, power = [], [], []
+        for part in range(PARTS):
+            rows = slice(part * size, (part + 1) * size)
+            u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
+            length = 2 * max(len(u), lags)
+            a, b = np.fft.rfft(u, length, axis=0), np.fft.rfft(v, length, axis=0)
+            own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
+            later = np.fft.irfft(a.conj() * b, length, axis=0)
+            cross.append(np.concatenate([later[length - before :], later[: lags - before]]).T)
+            power.append((v**2).sum(axis=0))
+        same, other, strength = (np.array(x, np.float32) for x in (own, cross, power))
+        return Response(step, same, other, strength, duration=len(ctrl) * dt)
 
 
 @dataclass(frozen=True)

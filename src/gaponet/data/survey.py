@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.holds import Holds, find_holds
+from gaponet.data.holds import Holds
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass, response, spectrum
+from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass, spectrum
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
 
@@ -123,44 +123,44 @@ class Survey:
         """(n) rad."""
         return np.ptp(self.qpos_limits, axis=1)
 
-
-def survey(entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
-    """Measure one sequence."""
-    ctrl, qpos, dt, notes = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes
-    blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
-    follows, opposes = _follows(ctrl, qpos, dt)
-    delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
-    return Survey(
-        entry=entry,
-        samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
-        rate_hz=float(notes.get("rate_hz", 1 / dt)),
-        jitter_ms=float(notes.get("jitter_ms", 0.0)),
-        longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
-        ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
-        qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
-        speed=fast_speed(ctrl, dt),
-        delay=delay,
-        follows=follows,
-        opposes=opposes,
-        lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
-        slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
-        copied=(np.ptp(ctrl, axis=0) > 0.05) & (np.abs(ctrl - qpos) < COPIED).all(axis=0),
-        jumps=_jumps(qpos, dt),
-        dropped=_dropped(sequence, notes, robot),
-        qvel_gain=_qvel_gain(sequence),
-        blocked_s=blocked_s,
-        blocked_at=blocked_at,
-        frozen_s=_frozen(sequence),
-        stopped_s=_stopped(ctrl, qpos, dt),
-        step=_step(qpos),
-        torque=_torque(sequence, robot),
-        holds=find_holds(sequence, robot.operated_index),
-        response=response(ctrl, qpos, dt),
-        spectra=np.stack([spectrum(ctrl, dt), spectrum(qpos, dt)]),
-        **_kind(sequence),
-        halted_s=_halted(ctrl, qpos, dt),
-        loads=_loads(sequence),
-    )
+    @classmethod
+    def of(cls, entry: Entry, sequence: Sequence, robot: RobotSpec) -> Survey:
+        """Measure one sequence."""
+        ctrl, qpos, dt, notes = sequence.ctrl, sequence.qpos, sequence.dt, entry.meta.notes
+        blocked_s, blocked_at = _blocked(ctrl, qpos, dt)
+        follows, opposes = _follows(ctrl, qpos, dt)
+        delay, lead = estimate_delay(ctrl, qpos, dt, MAX_LAG_S), estimate_delay(qpos, ctrl, dt, MAX_LAG_S)
+        return Survey(
+            entry=entry,
+            samples=hashlib.sha256(ctrl.tobytes() + qpos.tobytes()).hexdigest(),
+            rate_hz=float(notes.get("rate_hz", 1 / dt)),
+            jitter_ms=float(notes.get("jitter_ms", 0.0)),
+            longest_gap_ms=float(notes.get("longest_gap_ms", dt * 1e3)),
+            ctrl_limits=np.stack([ctrl.min(axis=0), ctrl.max(axis=0)], axis=1),
+            qpos_limits=np.stack([qpos.min(axis=0), qpos.max(axis=0)], axis=1),
+            speed=fast_speed(ctrl, dt),
+            delay=delay,
+            follows=follows,
+            opposes=opposes,
+            lead=np.where((lead > 1.5 * dt) & ~(delay > 0.5 * dt), lead, np.nan),
+            slope=_slope(ctrl, qpos, dt, np.nan_to_num(delay) / dt, fast_speed(ctrl, dt)),
+            copied=(np.ptp(ctrl, axis=0) > 0.05) & (np.abs(ctrl - qpos) < COPIED).all(axis=0),
+            jumps=_jumps(qpos, dt),
+            dropped=_dropped(sequence, notes, robot),
+            qvel_gain=_qvel_gain(sequence),
+            blocked_s=blocked_s,
+            blocked_at=blocked_at,
+            frozen_s=_frozen(sequence),
+            stopped_s=_stopped(ctrl, qpos, dt),
+            step=_step(qpos),
+            torque=_torque(sequence, robot),
+            holds=Holds.of(sequence, robot.operated_index),
+            response=Response.of(ctrl, qpos, dt),
+            spectra=np.stack([spectrum(ctrl, dt), spectrum(qpos, dt)]),
+            **_kind(sequence),
+            halted_s=_halted(ctrl, qpos, dt),
+            loads=_loads(sequence),
+        )
 
 
 def _follows(ctrl: Array, qpos: Array, dt: float) -> tuple[Array, Array]:

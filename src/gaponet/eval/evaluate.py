@@ -64,6 +64,31 @@ class Evaluation:
     ctrl: list[Array]
     deltas: dict[str, list[Array]]
 
+    def save(self, folder: Path) -> None:
+        """Write metrics.json and trajectories.npz, all that the report needs, into a run or robot folder."""
+        reals = self.runs["nominal"]
+        picked = evenly(list(range(len(reals))), SHOWN)
+        shown = [reals[i].meta for i in picked]
+        result = self.result | {
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            "shown": [
+                {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
+                for i, m in zip(picked, shown, strict=True)
+            ],
+        }
+        arrays = {}
+        for row, i in enumerate(picked):
+            arrays[f"{row}/recorded"] = reals[i].qpos_real
+            arrays[f"{row}/command"] = self.ctrl[i]
+            for name, part in self.runs.items():
+                arrays[f"{row}/{name}"] = part[i].qpos_sim
+            for name, delta in self.deltas.items():
+                arrays[f"{row}/delta/{name}"] = delta[i]
+        with writing(folder, "robot" if is_robot(folder) else "run"):
+            with whole(folder / "trajectories.npz") as temporary:
+                np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
+            write_json(folder / "metrics.json", result)
+
 
 def evaluate(
     folders: ListOf[Path],
@@ -147,32 +172,6 @@ def evenly(items: list[T], most: int) -> list[T]:
     if len(items) <= most:
         return items
     return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]
-
-
-def save(evaluation: Evaluation, folder: Path) -> None:
-    """metrics.json and trajectories.npz in a run or robot folder: the newest evaluation, all that the report needs."""
-    reals = evaluation.runs["nominal"]
-    picked = evenly(list(range(len(reals))), SHOWN)
-    shown = [reals[i].meta for i in picked]
-    result = evaluation.result | {
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
-        "shown": [
-            {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
-            for i, m in zip(picked, shown, strict=True)
-        ],
-    }
-    arrays = {}
-    for row, i in enumerate(picked):
-        arrays[f"{row}/recorded"] = reals[i].qpos_real
-        arrays[f"{row}/command"] = evaluation.ctrl[i]
-        for name, part in evaluation.runs.items():
-            arrays[f"{row}/{name}"] = part[i].qpos_sim
-        for name, delta in evaluation.deltas.items():
-            arrays[f"{row}/delta/{name}"] = delta[i]
-    with writing(folder, "robot" if is_robot(folder) else "run"):
-        with whole(folder / "trajectories.npz") as temporary:
-            np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
-        write_json(folder / "metrics.json", result)
 
 
 def _methods(known: dict[str, Candidate], nominal: RobotSpec) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:

@@ -54,6 +54,44 @@ class Calibration:
         """The simulator of this unit."""
         return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
 
+    def save(self, run: Path) -> Path:
+        """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
+        path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
+        with writing(run, "run"):
+            path.parent.mkdir(exist_ok=True)
+            write_json(path, asdict(self))
+        return path
+
+    @classmethod
+    def fit(
+        cls,
+        model: GapModel,
+        simulator: RobotSpec,
+        sequences: ListOf[Sequence],
+        seconds: float = 30.0,
+        unknown_payload: bool = False,
+        progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
+    ) -> Calibration:
+        """Fit a unit's parameters under a trained model.
+
+        Args:
+            model: Its correction is applied while fitting.
+            sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
+            unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
+            progress: As refit's.
+        """
+        unit = _one_unit(sequences)
+        found = refit(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
+        servos = {
+            j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
+            for j in simulator.operated
+        }
+        logs = tuple(s.content_hash() for s in sequences)
+        return Calibration(
+            unit, model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
+            found.payload_std,
+        )  # fmt: skip
+
 
 def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
     """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
@@ -69,50 +107,12 @@ def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ..
     return entries if motions else trained or entries
 
 
-def calibrate(
-    model: GapModel,
-    simulator: RobotSpec,
-    sequences: ListOf[Sequence],
-    seconds: float = 30.0,
-    unknown_payload: bool = False,
-    progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-) -> Calibration:
-    """Fit a unit's parameters under a trained model.
-
-    Args:
-        model: Its correction is applied while fitting.
-        sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
-        unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
-        progress: As refit's.
-    """
-    unit = _one_unit(sequences)
-    found = refit(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)
-    servos = {
-        j: {f: float(getattr(found.robot, f)[simulator.joint_names.index(j)]) for f in FIELDS}
-        for j in simulator.operated
-    }
-    logs = tuple(s.content_hash() for s in sequences)
-    return Calibration(
-        unit, model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
-        found.payload_std,
-    )  # fmt: skip
-
-
 def _one_unit(sequences: ListOf[Sequence]) -> str:
     """The unit whose recordings these are."""
     units = sorted({s.meta.unit_id for s in sequences})
     if len(units) != 1:
         raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
     return units[0]
-
-
-def save(calibration: Calibration, run: Path) -> Path:
-    """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
-    path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', calibration.unit_id)}.json"
-    with writing(run, "run"):
-        path.parent.mkdir(exist_ok=True)
-        write_json(path, asdict(calibration))
-    return path
 
 
 def load(run: Path, weights: str) -> dict[str, Calibration]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays, restated
+from gaponet.data.describe.recording import Recording, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.data.sequence import OPTIONAL
 from gaponet.errors import LogError
@@ -79,4 +79,4 @@ def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:
         meta["stated"] = restated(parse_json(dict[str, Any], motion["stated"], where, LogError), where)
         default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
     motion_name = str(meta["stated"]["motion"]) if meta else name
-    return from_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)
+    return Recording.of_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays, reading
+from gaponet.data.describe.recording import Recording, reading
 from gaponet.data.formats import DESCRIBED, files_under
 from gaponet.errors import LogError
 from gaponet.process.sandbox import inside
@@ -35,7 +35,7 @@ def find(path: Path) -> list[Path]:
 def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
     """Every file."""
     for file in find(path):
-        yield from_arrays(file, _read(file))
+        yield Recording.of_arrays(file, _read(file))
 
 
 @inside(LogError, "scipy.io")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays, reading
+from gaponet.data.describe.recording import Recording, reading
 from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.errors import LogError
 from gaponet.process.sandbox import inside
@@ -51,7 +51,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             if stated is not None and qpos is not None and stated.size in (1, *qpos.shape[1:]):
                 arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
                 gains[name] = name  # type: ignore[literal-required]
-        yield from_arrays(file, arrays, default=gains)
+        yield Recording.of_arrays(file, arrays, default=gains)
 
 
 @inside(LogError, "numpy")

@@ -76,7 +76,7 @@ def write_report(
 def _evaluate(
     run: Path, dataset: Path | None, also: tuple[Path, ...], robot: RobotSpec | None, progress: Progress
 ) -> None:
-    from gaponet.eval.evaluate import evaluate, save
+    from gaponet.eval.evaluate import evaluate
 
     origin = read_origin(run) if is_robot(run) else read_config(run)
     kept = "" if origin is None else origin["dataset"]
@@ -88,7 +88,7 @@ def _evaluate(
     except DatasetError as error:
         raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
     robot = robot or kept_robot(place if keeps_robot(place) else run, data.robot_name)
-    save(evaluate([run, *also], data, robot, progress=progress), run)
+    evaluate([run, *also], data, robot, progress=progress).save(run)
 
 
 def _require_complete(

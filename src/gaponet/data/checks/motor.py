@@ -8,7 +8,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding, names, some
-from gaponet.data.holds import StaticError, join, static_error
+from gaponet.data.holds import Holds, StaticError
 from gaponet.data.signals import FAST, sharp
 from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
@@ -152,8 +152,8 @@ def lag_values(lags: Array) -> dict[str, float]:
 
 def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticError]:
     """Static error of each operated joint over all rests."""
-    holds = join([s.holds for s in surveys], len(robot.joint_names))
-    return {name: static_error(holds, j) for name, j in zip(robot.operated, robot.operated_index, strict=True)}
+    holds = Holds.joined([s.holds for s in surveys], len(robot.joint_names))
+    return {name: holds.static_error(j) for name, j in zip(robot.operated, robot.operated_index, strict=True)}
 
 
 def _mrad(error: StaticError) -> str:

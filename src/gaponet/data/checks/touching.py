@@ -36,15 +36,15 @@ class Standing:
     load: Array
     torque: Array
 
-
-def standing(sequence: Sequence, robot: RobotSpec, heights: Heights, gravity: Gravity) -> Standing:
-    """What a sequence says about it."""
-    op, meta = robot.operated_index, sequence.meta
-    still = np.flatnonzero(np.abs(sequence.qvel[:, op]).max(axis=1) < STANDS)
-    qpos = sequence.qpos[still].astype(float)
-    load = gravity(qpos, meta.payload_mass, meta.payload_side)[:, op]
-    torque = np.zeros(len(still)) if sequence.tau is None else np.abs(sequence.tau)[still][:, op].max(axis=1)
-    return Standing(meta.motion, heights(sequence)[still], (sequence.ctrl[still] - qpos)[:, op], load, torque)
+    @classmethod
+    def of(cls, sequence: Sequence, robot: RobotSpec, heights: Heights, gravity: Gravity) -> Standing:
+        """What a sequence says about it."""
+        op, meta = robot.operated_index, sequence.meta
+        still = np.flatnonzero(np.abs(sequence.qvel[:, op]).max(axis=1) < STANDS)
+        qpos = sequence.qpos[still].astype(float)
+        load = gravity(qpos, meta.payload_mass, meta.payload_side)[:, op]
+        torque = np.zeros(len(still)) if sequence.tau is None else np.abs(sequence.tau)[still][:, op].max(axis=1)
+        return Standing(meta.motion, heights(sequence)[still], (sequence.ctrl[still] - qpos)[:, op], load, torque)
 
 
 def touching(found: list[Standing]) -> Iterator[Finding]:

@@ -95,31 +95,73 @@ class Recording:
             self.name, self.source, signals, load, self.where, files, self.first_line, self.meta, self.default
         )
 
+    @classmethod
+    def of_arrays(
+        cls,
+        file: Path,
+        arrays: dict[str, Any],
+        names: tuple[str, ...] = (),
+        name: str = "",
+        part: str = "",
+        **more: Any,
+    ) -> Recording:
+        """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
 
-def from_arrays(
-    file: Path, arrays: dict[str, Any], names: tuple[str, ...] = (), name: str = "", part: str = "", **more: Any
-) -> Recording:
-    """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
+        Args:
+            names: Of the columns of arrays that have so many.
+            name: Default the file's.
+            part: Which of several in the file.
+            more: meta, default.
+        """
+        kept = {
+            n: a
+            for n, a in arrays.items()
+            if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
+            and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
+        }  # fmt: skip
+        signals = {
+            n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
+            for n, a in kept.items()
+        }
+        source = f"{file}#{part}" if part else str(file)
+        load = lambda wanted: {n: Signal(kept[n].astype(float)) for n in wanted}  # noqa: E731
+        return Recording(name or file.stem, source, signals, load, source, (str(file),), **more)
 
-    Args:
-        names: Of the columns of arrays that have so many.
-        name: Default the file's.
-        part: Which of several in the file.
-        more: meta, default.
-    """
-    kept = {
-        n: a
-        for n, a in arrays.items()
-        if isinstance(a, np.ndarray) and a.dtype.kind in "fiu" and len(a.shape) in (1, 2) and len(a) > 1
-        and (a.ndim == 1 or 0 < a.shape[1] <= WIDEST)
-    }  # fmt: skip
-    signals = {
-        n: () if a.ndim == 1 else names if a.shape[1] == len(names) else tuple(map(str, range(a.shape[1])))
-        for n, a in kept.items()
-    }
-    source = f"{file}#{part}" if part else str(file)
-    load = lambda wanted: {n: Signal(kept[n].astype(float)) for n in wanted}  # noqa: E731
-    return Recording(name or file.stem, source, signals, load, source, (str(file),), **more)
+    def to_log(self, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Log:
+        """The columns that `told` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
+        told = self.default | told
+        chosen = _choose(self, robot, told, joint_map)
+        units = _units(robot, told, list(chosen["ctrl"]), joint_map)
+        clocks = {channel: told.get("clock", {}).get(channel) or told.get("time") for channel in chosen}
+        gains = {name: _gain_columns(self, told, name, chosen["ctrl"]) for name in ("kp", "kd")}
+        names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
+        loaded = self.load([*names, *{c for c in clocks.values() if c in self.signals and c not in names}])
+        times = {channel: _time(self, told, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen}
+        joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
+        in_units = [units[j] for j in joints]
+        channels = {}
+        for channel, columns in chosen.items():
+            values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
+            if channel == "ctrl" and "action_scale" in told:
+                values = robot.qpos_home[robot.index(joints)] + told["action_scale"] * values
+            channels[channel] = Channel(times[channel], to_radians(channel, values, joints, in_units, robot))
+        start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
+        shifted = {id(c.time): c.time - start for c in channels.values()}  # epoch nanoseconds would lose their digits
+        meta = dict(self.meta)
+        for name, columns in gains.items():
+            if columns:
+                meta[name] = [_constant(self, name, _column(loaded, *columns[j])) for j in joints]
+        if "rate" in told:
+            meta["dt"] = 1 / told["rate"]
+        return Log(
+            robot.name, joints, {n: Channel(shifted[id(c.time)], c.values) for n, c in channels.items()}, self.source,
+            meta | {
+                "files": dict.fromkeys(channels, self.files[0] if self.files else self.source),
+                "all_files": self.files,
+                "first_line": self.first_line,
+                "converted_from": {j: u for j, u in zip(joints, in_units, strict=True) if u != "rad"},
+            },
+        )  # fmt: skip
 
 
 def restated(told: Any, where: str) -> dict[str, Any]:
@@ -164,43 +206,6 @@ def _cut_short(file: Path, error: Exception) -> bool:
 
 Columns = dict[str, tuple[str, int | None]]  # joint → (signal, column)
 Chosen = dict[str, Columns]  # by channel
-
-
-def to_log(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Log:
-    """A Log of the columns that `told` calls ctrl, qpos, …, in SI and on one time axis; channels keep their clocks."""
-    told = recording.default | told
-    chosen = _choose(recording, robot, told, joint_map)
-    units = _units(robot, told, list(chosen["ctrl"]), joint_map)
-    clocks = {channel: told.get("clock", {}).get(channel) or told.get("time") for channel in chosen}
-    gains = {name: _gain_columns(recording, told, name, chosen["ctrl"]) for name in ("kp", "kd")}
-    names = {signal for joints in (*chosen.values(), *gains.values()) for signal, _ in joints.values()}
-    loaded = recording.load([*names, *{c for c in clocks.values() if c in recording.signals and c not in names}])
-    times = {channel: _time(recording, told, loaded, clocks[channel], channel, chosen[channel]) for channel in chosen}
-    joints = tuple(name for name in robot.joint_names if name in chosen["ctrl"])
-    in_units = [units[j] for j in joints]
-    channels = {}
-    for channel, columns in chosen.items():
-        values = np.stack([_column(loaded, *columns[j]) for j in joints], axis=1).astype(float)
-        if channel == "ctrl" and "action_scale" in told:
-            values = robot.qpos_home[robot.index(joints)] + told["action_scale"] * values
-        channels[channel] = Channel(times[channel], to_radians(channel, values, joints, in_units, robot))
-    start = min((float(c.time[0]) for c in channels.values() if len(c.time)), default=0.0)
-    shifted = {id(c.time): c.time - start for c in channels.values()}  # epoch nanoseconds would lose their digits
-    meta = dict(recording.meta)
-    for name, columns in gains.items():
-        if columns:
-            meta[name] = [_constant(recording, name, _column(loaded, *columns[j])) for j in joints]
-    if "rate" in told:
-        meta["dt"] = 1 / told["rate"]
-    return Log(
-        robot.name, joints, {n: Channel(shifted[id(c.time)], c.values) for n, c in channels.items()}, recording.source,
-        meta | {
-            "files": dict.fromkeys(channels, recording.files[0] if recording.files else recording.source),
-            "all_files": recording.files,
-            "first_line": recording.first_line,
-            "converted_from": {j: u for j, u in zip(joints, in_units, strict=True) if u != "rad"},
-        },
-    )  # fmt: skip
 
 
 def _choose(recording: Recording, robot: RobotSpec, told: LogsFile, joint_map: dict[str, str] | None) -> Chosen:

@@ -32,7 +32,7 @@ import numpy as np
 
 from gaponet.data.describe.limits import refuse_absurd
 from gaponet.data.describe.logs_file import LogsFile, Naming, find_file, read_logs_file
-from gaponet.data.describe.recording import COMMAND, Recording, to_log
+from gaponet.data.describe.recording import COMMAND, Recording
 from gaponet.data.log import Channel, Log, skipped
 from gaponet.errors import LogError, UsageError
 from gaponet.parts import offered
@@ -197,7 +197,7 @@ def _loaders(
         told = cast("LogsFile", told | {"ctrl": COMMAND + full.get("ctrl", ""), "clock": _beside_clock(full)})
         found = _with_commands(list(found), told["command_file"])
     for recording in found:
-        yield recording.name, partial(to_log, recording, robot, told, names or None)
+        yield recording.name, partial(recording.to_log, robot, told, names or None)
 
 
 def _recordings(reader: ModuleType, path: Path, told: LogsFile) -> Iterator[Recording]:

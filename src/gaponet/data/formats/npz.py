@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
-from gaponet.data.describe.recording import Recording, from_arrays, reading, restated
+from gaponet.data.describe.recording import Recording, reading, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
 from gaponet.errors import LogError
@@ -57,7 +57,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         elif all(k in arrays for k in ("real_dof_positions", "real_dof_positions_cmd")):
             yield from _motions(file, arrays, names)
         else:
-            yield from_arrays(file, arrays, names)
+            yield Recording.of_arrays(file, arrays, names)
 
 
 def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recording:
@@ -67,7 +67,7 @@ def _ours(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Recordi
     default = LogsFile(time_unit="s", position_unit="rad")
     default |= {c: c for c in (*CHANNELS, *DERIVED) if c in arrays}  # type: ignore[typeddict-item]
     meta = {"stated": stated} | ({"dt": told["dt"]} if isinstance(told.get("dt"), float) else {})
-    return from_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
+    return Recording.of_arrays(file, arrays, names, str(stated["motion"]), meta=meta, default=default)
 
 
 def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iterator[Recording]:
@@ -90,7 +90,9 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
         default = {k: v for k, v in GAPONET.items() if v in one or k.endswith("_unit")}
         one = {k: a[:end] for k, a in one.items()}
         joints = names[i : i + 1] if single else names
-        yield from_arrays(file, one, joints, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default)
+        yield Recording.of_arrays(
+            file, one, joints, f"{file.stem}-{i:04d}", str(i), meta={"stated": stated}, default=default
+        )
 
 
 @inside(LogError, "numpy")
