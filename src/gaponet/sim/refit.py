@@ -17,7 +17,7 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
-from gaponet.sim.axes import Axes, Bounds, Values
+from gaponet.sim.axes import MAX_DELAY, SLOW, WIDE_KP, ZERO, Bounds, Values
 from gaponet.sim.free_runs import WINDOW, FreeRuns, cut
 from gaponet.sim.joint_runs import SOFT
 from gaponet.sim.multistart import STEP, Errors, descend
@@ -29,6 +29,7 @@ PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all togethe
 TOGETHER = 0.05  # of it, where all joints leave their values by the same share: a cold day, a slow bus …
 COMMON = ("damping", "frictionloss", "delay")  # … which does not turn zeros, nor soften gains
 ITERATIONS, ENOUGH = 8, 1e-3  # at most, and the share of the cost by which it falls in one that is not the last
+KP = 0.2  # of a logarithm: a large change
 LATE = 0.005  # s: a first delay, since a delay of zero hides what it does
 MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
 MAX_MASS = 20.0  # kg
@@ -81,7 +82,8 @@ def refit(
             "one and the same: give recordings of one mass"
         )
     runs = FreeRuns(cut(sequences, max(1, round(seconds / WINDOW))), robot, corrector=corrector)
-    problem = _Problem(runs, Bounds(robot, sequences), unknown_payload, believed)
+    spare = np.zeros(runs.n) if believed else robot.kd[runs.op]
+    problem = _Problem(runs, Bounds(robot, sequences).first, unknown_payload, spare)
     done = 0
 
     def tell(cost: Array) -> None:
@@ -99,36 +101,45 @@ def refit(
 
 
 class _Problem:
-    """All joints as one problem: x (P,) holds the fields of each of n joints, then the payload mass in kg, if unknown.
+    """All joints as one problem: x (P,) says how far each field of n joints is from the robot's own, joint by joint, in
+    units of SCALE; then the payload mass in kg, if it is unknown.
 
     A servo's parameters act on its own joint first: what they do to the others is weaker by the ratio of the inertias.
     So one simulation moves a field of all joints, and each joint's error is put down to its own parameter: six
     simulations for all slopes, however many joints. A payload loads all of them.
     """
 
-    def __init__(self, runs: FreeRuns, bounds: Bounds, unknown_payload: bool, believed: bool) -> None:
-        bounds.still = np.zeros(runs.n, bool)  # what all joints do together is true of one that stands
-        bounds.spare = bounds.spare * 0 if believed else runs.robot.kd[runs.op]
-        self.runs, self.unknown, self.n = runs, unknown_payload, runs.n
-        self.axes, self.first = Axes(bounds, FIELDS, bounds.first), bounds.first
-        more = [[end] * unknown_payload for end in (0.0, MAX_MASS)]
-        self.low, self.high = np.append(self.axes.low, more[0])[None], np.append(self.axes.high, more[1])[None]
-        self.size = int(runs.rows.sum())
-        kp = self.first["kp"]
+    def __init__(self, runs: FreeRuns, first: Values, unknown_payload: bool, spare: Array) -> None:
+        self.runs, self.unknown, self.first, self.n = runs, unknown_payload, first, runs.n
+        self.size, kp, one = int(runs.rows.sum()), first["kp"], np.ones(runs.n)
         self.scale = {
-            "kp": np.ones(self.n), "damping": np.maximum(self.first["damping"], 0.01 * kp),  # a time constant of 10 ms
-            "frictionloss": np.maximum(self.first["frictionloss"], 0.005 * kp),
-            "offset": np.full(self.n, 0.02), "delay": np.full(self.n, 0.02),
+            "kp": KP * one, "damping": np.maximum(first["damping"], 0.01 * kp),  # a time constant of 10 ms
+            "frictionloss": np.maximum(first["frictionloss"], 0.005 * kp), "offset": 0.02 * one, "delay": 0.02 * one,
         }  # fmt: skip
+        least = {"kp": -WIDE_KP * one, "damping": -first["damping"] - spare, "frictionloss": -first["frictionloss"],
+                 "offset": -ZERO * one, "delay": -first["delay"]}  # fmt: skip
+        most = {"kp": WIDE_KP * one, "damping": SLOW * kp, "frictionloss": kp, "offset": ZERO * one,
+                "delay": MAX_DELAY - first["delay"]}  # fmt: skip
+        self.low, self.high = (
+            np.append(np.stack([ends[f] / self.scale[f] for f in FIELDS], axis=1), [mass] * unknown_payload)[None]
+            for ends, mass in ((least, 0.0), (most, MAX_MASS))
+        )
+        alone, together = PRIOR / SOFT * np.eye(self.n), (1 - TOGETHER) / self.n
+        self.prior = np.zeros((len(FIELDS) * self.n, self.low.size))  # errors of the prior over x
+        for i, f in enumerate(FIELDS):
+            here = np.arange(self.n) * len(FIELDS) + i
+            price = KP if f == "kp" else 1.0
+            self.prior[np.ix_(here, here)] = price * (alone - PRIOR / SOFT * together * (f in COMMON))
 
     def own(self, mass: float) -> Array:
         """The robot as it is."""
-        return np.append(self.axes.of(self.first).ravel(), [mass] * self.unknown)
+        return np.append(np.zeros(self.n * len(FIELDS)), [mass] * self.unknown)
 
     def start(self, mass: float) -> Array:
         """The robot, a little late; an unknown payload at the mass of MASSES that fits best."""
-        late = self.first | {"delay": np.maximum(self.first["delay"], LATE)}
-        x = np.append(self.axes.of(late).ravel(), [mass] * self.unknown)
+        x = self.own(mass)
+        delay = FIELDS.index("delay")
+        x[delay : self.n * len(FIELDS) : len(FIELDS)] = np.maximum(LATE - self.first["delay"], 0) / self.scale["delay"]
         if not self.unknown:
             return x
         xs = np.repeat(x[None], len(MASSES), axis=0)
@@ -137,7 +148,10 @@ class _Problem:
 
     def values(self, x: Array) -> Values:
         """(k, P) → field: (k, n)."""
-        return self.axes.values(x[:, : self.n * len(FIELDS)].reshape(len(x), self.n, len(FIELDS)))
+        parts = np.moveaxis(x[:, : self.n * len(FIELDS)].reshape(len(x), self.n, len(FIELDS)), -1, 0)
+        moved = {f: part * self.scale[f] for f, part in zip(FIELDS, parts, strict=True)}
+        found = {f: np.broadcast_to(v, (len(x), self.n)) for f, v in self.first.items()}
+        return found | {f: self.first[f] * np.exp(v) if f == "kp" else self.first[f] + v for f, v in moved.items()}
 
     def robot_of(self, x: Array) -> RobotSpec:
         """The robot with these parameters; joints that are not operated keep theirs."""
@@ -152,7 +166,7 @@ class _Problem:
     def errors(self, xs: Array) -> Array:
         """(k, 1, P) → (k, 1, rows) in SOFT: of every joint's free runs, then the prior's."""
         own = self._runs(xs[:, 0]).reshape(len(xs), -1)
-        return np.concatenate([own, self._priced(xs[:, 0])], axis=1)[:, None]
+        return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
         """As multistart.slopes, of one start."""
@@ -166,10 +180,8 @@ class _Problem:
         for i in range(len(here)):
             mine = slice(None) if self.unknown and i == len(here) - 1 else i // len(FIELDS)
             jac[mine, :, i] = (found[1 + field[i], mine] - found[0, mine]) / step[i]
-        priced = self._priced(np.concatenate([here[None], here + np.diag(step)]))
-        price = ((priced[1:] - priced[0]) / step[:, None]).T
-        base = np.concatenate([found[0].ravel(), priced[0]])
-        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), price])[None, None]
+        base = np.concatenate([found[0].ravel(), self.prior @ here])
+        return base[None, None], np.concatenate([jac.reshape(-1, len(here)), self.prior])[None, None]
 
     def jackknife(self, x: Array) -> float:
         """Standard error of the payload mass, kg: by how much it moves when a window is left out (one step of Gauss).
@@ -191,11 +203,3 @@ class _Problem:
         if self.unknown:
             parts = [replace(s, meta=replace(s.meta, payload_mass=float(x[-1]))) for x in xs for s in parts]
         return self.runs.run(self.values(xs), parts if self.unknown else None) / np.float32(SOFT)
-
-    def _priced(self, xs: Array) -> Array:
-        """The prior's errors, (k, fields · n) in SOFT."""
-        far = []
-        for f, v in ((f, v) for f, v in self.values(xs).items() if f in FIELDS):
-            away = np.log(v / self.first[f]) if f == "kp" else (v - self.first[f]) / self.scale[f]
-            far.append(away - (1 - TOGETHER) * away.mean(axis=1, keepdims=True) * (f in COMMON))
-        return np.concatenate(far, axis=1) * (PRIOR / SOFT)
