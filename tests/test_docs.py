@@ -7,8 +7,7 @@ import pytest
 
 import gaponet as gp
 from gaponet.model.config import ModelConfig
-from gaponet.sim.free_runs import TOGETHER
-from gaponet.sim.refit import PRIOR
+from gaponet.sim.refit import PRIOR, TOGETHER
 from gaponet.training.config import TrainConfig
 from gaponet.training.validation import GAINS
 from gaponet_lab.study.options import TRAINING
