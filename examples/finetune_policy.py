@@ -171,8 +171,8 @@ class TrackingEnv(VecEnv):
 class Unit:
     """One virtual unit, once per payload and motion, behind the calls of AlignedSim; its sensors are all one sees."""
 
-    def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array) -> None:
-        physics = load_fleet("easy", robot).unit(name)
+    def __init__(self, robot: RobotSpec, task: Task, name: str, payload_mass: Array, fleet: str = "easy") -> None:
+        physics = load_fleet(fleet, robot).unit(name)
         payloads = [(float(mass), "both") for mass in payload_mass]
         self.robots = VirtualRobot(robot, [physics] * len(payloads), payloads, robot.dt, locked=task.locked, nthread=0)
         self.payload_mass, self.free, self.home = payload_mass, robot.index(task.joints), robot.qpos_home

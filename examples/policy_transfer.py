@@ -1,0 +1,207 @@
+"""Will a policy transfer? Trained in the nominal simulator, in the identified one, and in that with ranges: one table.
+
+    pip install "rsl-rl-lib>=5.4.2,<6"
+    python examples/policy_transfer.py WORK        # a VIRTUAL SO-101; minutes on two cores
+
+A VIRTUAL robot plays excitation, `gaponet identify` makes a robot folder of the recordings, and a small network learns
+by PPO to make the arm follow motions: in the simulator as its file says, in the identified one, and in sixteen of those
+that differ by the standard errors of identification (gaponet_interop.engine.rollout.drawn_robots). All are played on
+the VIRTUAL robot, on motions that nothing has learnt from. Last, `gaponet replay` is asked, before the robot is, what
+it will do under the targets of the nominal policy's own rollout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from finetune_policy import Task, TrackingEnv, Unit, follow, make_runner, motions, train
+from tensordict import TensorDict
+
+from gaponet.cli.main import main as gaponet
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.eval.candidate import read_origin
+from gaponet.robot import RobotSpec, load_robot
+from gaponet_interop.engine.rollout import drawn_robots
+
+Array = np.ndarray
+RECORDED_SEED, LEARN_SEED, TRY_SEED = 0, 101, 202  # other numbers make other motions
+DRAWS = 16
+
+
+class Several:
+    """Simulations of several robots behind the calls of one AlignedSim, as many of each."""
+
+    def __init__(self, robots: list[RobotSpec], num_envs: int, locked: tuple[str, ...]) -> None:
+        self.ids = np.array_split(np.arange(num_envs), len(robots))
+        self.sims = [
+            AlignedSim(robot, None, np.zeros(len(ids)), num_envs=len(ids), locked=locked)
+            for robot, ids in zip(robots, self.ids, strict=True)
+        ]
+        self.num_envs, self.dt, self.payload_mass = num_envs, self.sims[0].dt, np.zeros(num_envs)
+
+    def reset(self, qpos: Array, qvel: Array | float = 0.0, ids: Array | None = None) -> None:
+        """Rows of qpos and qvel are those of ids."""
+        ids = np.arange(self.num_envs) if ids is None else ids
+        qvel = np.broadcast_to(qvel, qpos.shape)
+        for sim, mine in zip(self.sims, self.ids, strict=True):
+            at = np.isin(ids, mine)
+            if at.any():
+                sim.reset(qpos[at], qvel[at], ids=ids[at] - mine[0])
+
+    def step(self, target: Array) -> None:
+        """One control period of all."""
+        for sim, mine in zip(self.sims, self.ids, strict=True):
+            sim.step(target[mine])
+
+    @property
+    def qpos(self) -> Array:
+        """(num_envs, n) rad."""
+        return np.concatenate([sim.qpos for sim in self.sims])
+
+    @property
+    def qvel(self) -> Array:
+        """(num_envs, n) rad/s."""
+        return np.concatenate([sim.qvel for sim in self.sims])
+
+
+def identified(work: Path, robot: str, fleet: str, unit: str, quick: bool) -> Path:
+    """Recordings of the VIRTUAL unit, and the robot folder that is identified from them; what is there stays."""
+    recipe, data, known = work / "recipe.toml", work / "data", work / "identified"
+    work.mkdir(parents=True, exist_ok=True)
+    names = ["tour-all-0", "tour-all-1", "limber-all-0", "limber-all-1"] if quick else ["*"]
+    kept = {"motions": names, "payloads": [0.0], "units": [unit], "rates": [50], "repetitions": 1, "variants": 3}
+    recipe.write_text("".join(f"{name} = {json.dumps(value)}\n" for name, value in kept.items()))
+    said = ["--robot", robot, "--fleet", fleet, "--recipe", str(recipe), "--seed", str(RECORDED_SEED), "--nproc", "1"]
+    if gaponet(["collect", "--out", str(data), *said]):
+        raise SystemExit(2)
+    budget = ["--budget", "2s", "--terms", "--windows", "6"] if quick else ["--budget", "5m"]
+    if not (known / "robot.toml").is_file() and gaponet(["identify", str(data), "--out", str(known), *budget]):
+        raise SystemExit(2)
+    return known
+
+
+def rollout(task: Task, robot: RobotSpec, policy: Any, file: Path) -> Array:
+    """The first motion by the policy in a simulator, as a log; its targets, (T, free) rad."""
+    sim, actor = AlignedSim(robot, None, np.zeros(1), num_envs=1, locked=task.locked), policy.get_inference_policy()
+    row, last, action = task.first[:1].copy(), task.last[:1], np.zeros((1, task.n))
+    sim.reset(task.reference[row])
+    states, targets = [], []
+    while row[0] < last[0]:
+        seen = task.observe(sim.qpos[:, task.op], sim.qvel[:, task.op], row, last, np.zeros(1), action)
+        with torch.inference_mode():
+            action = actor(TensorDict({"policy": torch.from_numpy(seen)}, batch_size=[1])).numpy().astype(float)
+        targets.append(task.target(row, last, action)[0])
+        states.append(sim.qpos[0].copy())
+        sim.step(targets[-1][None])
+        row += 1
+    time, names = robot.dt * np.arange(len(targets)), np.array(task.joints)
+    np.savez(file, time=time, target=np.array(targets), q=np.array(states), joint_names=names)
+    file.with_name("logs.toml").write_text(
+        'ctrl = "target"\nqpos = "q"\ntime_unit = "s"\nposition_unit = "rad"\n', encoding="utf-8"
+    )
+    return np.array(targets)
+
+
+def forecast(work: Path, known: Path, task: Task, plant: Unit, targets: Array) -> str:
+    """What gaponet replay says of the rollout in WORK/rollout, and what the VIRTUAL robot does under its targets."""
+    answer = work / "answer.npz"
+    asked = ["replay", str(work / "rollout"), "--robot", str(known), "--out", str(answer), "--json"]
+    with contextlib.redirect_stdout(out := io.StringIO()):
+        if gaponet(asked):
+            raise SystemExit(2)
+    said, held = json.loads(out.getvalue()), np.load(answer)
+    plant.reset(np.tile(task.reference[task.first[0]], (len(plant.payload_mass), 1)))
+    found = []
+    for target in targets:
+        found.append(plant.qpos[0, task.op])
+        plant.step(np.tile(target, (len(plant.payload_mass), 1)))
+    real, low, high = np.array(found), held["low_0"], held["high_0"]
+    rows = min(len(real), len(low))
+    real, error = real[:rows], np.abs(real[:rows] - held["robot_0"][:rows])
+    apart = np.abs(real - held["rollout_0"][:rows])
+    inside = ((real >= low[:rows]) & (real <= high[:rows])).mean()
+    return (
+        f"Under the nominal policy's targets the VIRTUAL robot is {1e3 * apart.mean():.1f} mrad from the rollout; "
+        f"gaponet replay said so to {1e3 * error.mean():.1f} mrad, {inside:.0%} of the time within its band of "
+        f"± {1e3 * np.mean([s['band'] for s in said['joints'].values()]):.1f} mrad; of the simulator it said "
+        f"{'that joints differ: ' + ', '.join(said['differ']) if said['differ'] else 'that no joint differs'}."
+    )
+
+
+def main(
+    work: tyro.conf.Positional[Path],
+    robot: str = "so101",
+    fleet: str = "hard",
+    unit: str = "virtual-1",
+    updates: int = 150,
+    num_envs: int = 128,
+    seeds: tuple[int, ...] = (0, 1, 2),
+    quick: bool = False,
+) -> None:
+    """Record, identify, learn three times, play on the VIRTUAL robot; print mean |error| to the reference in mrad.
+
+    Args:
+        work: Folder for what is made.
+        robot: Name or folder.
+        fleet: Of the VIRTUAL robot.
+        unit: Of the fleet.
+        updates: Of PPO, 16 periods each.
+        num_envs: Simulations side by side.
+        seeds: All is learnt anew with each.
+        quick: Only see that it runs.
+    """
+    torch.set_num_threads(1)
+    updates, num_envs, seeds = (2, 16, (0,)) if quick else (updates, num_envs, seeds)
+    known = identified(work, robot, fleet, unit, quick)
+    spec, found = load_robot(robot), load_robot(known)
+    origin = read_origin(known)
+    assert origin is not None
+    kinds = ("tour", "limber")
+    names = [f"{kind}-all-{v}" for kind in kinds for v in range(1 if quick else 8)]
+    task, unseen = (Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED))
+    tried = np.zeros(len(unseen.first))
+    robots = {
+        "nominal": [spec], "identified": [found], "identified + ranges": drawn_robots(found, origin["std"], DRAWS),
+    }  # fmt: skip
+    errors: dict[str, list[Array]] = {}
+    for seed in seeds:
+        for name, mine in robots.items():
+            torch.manual_seed(seed)
+            env = TrackingEnv(task, Several(mine, num_envs, task.locked), seed)  # type: ignore[arg-type]
+            policy = train(name, make_runner(env), env, updates)
+            own = Several(mine if len(mine) == 1 else [found], len(tried), unseen.locked)
+            plants = [own, Unit(spec, unseen, unit, tried, fleet)]
+            errors.setdefault(name, []).append(1e3 * np.array([follow(unseen, p, policy) for p in plants]))
+            if name == "nominal" and seed == seeds[0]:
+                (work / "rollout").mkdir(exist_ok=True)
+                targets = rollout(unseen, spec, policy, work / "rollout" / "policy.npz")
+    alone = np.array([follow(unseen, p, None) for p in (Several([spec], len(tried), unseen.locked),
+                                                        Unit(spec, unseen, unit, tried, fleet))])  # fmt: skip
+    print(table({"reference as target": [1e3 * alone]} | errors))
+    print(forecast(work, known, unseen, Unit(spec, unseen, unit, tried, fleet), targets))
+
+
+def table(errors: dict[str, list[Array]]) -> str:
+    """Markdown: mean over motions, ± over seeds, and the paired difference to the nominal policy over motions."""
+    head = "| trained in | in its own simulator, mrad | on the VIRTUAL robot, mrad | to nominal, paired over motions |"
+    lines = [head, "| --- | ---: | ---: | ---: |"]
+    for name, runs in errors.items():
+        each = np.array(runs)  # (seeds, 2, motions)
+        cells = [
+            f"{m:.1f} ± {s:.1f}" for m, s in zip(each.mean(axis=(0, 2)), each.mean(axis=2).std(axis=0), strict=True)
+        ]
+        apart = each[:, 1].mean(axis=0) - np.array(errors["nominal"])[:, 1].mean(axis=0)
+        error = apart.std(ddof=1) / np.sqrt(len(apart)) if len(apart) > 1 else np.nan
+        lines.append(f"| {name} | {cells[0]} | {cells[1]} | {apart.mean():+.1f} ± {error:.1f} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
