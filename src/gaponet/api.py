@@ -154,6 +154,7 @@ def gap(
             named(draw)(found, one.folder, one.kind)
         return found
     data, spec = _opened(dataset, spec)
+    _require_commands(data)
     pair(data, spec)
     entries, simulator = data.select(motions), model_hash(spec)
     pairs = (data.pair(e, simulator) for e in entries)
@@ -237,6 +238,7 @@ def identify(
 
     data, spec = _opened(dataset, robot)
     data.require_robot(spec)
+    _require_commands(data)
     held = {e.meta.unit_id for e in data.entries}
     if set(units) - held:
         raise UsageError(f"--units {min(set(units) - held)}: not in {data.path}")
@@ -312,6 +314,7 @@ def train(
         ranks.on_first(bar(f"training {config.model.kind}")) as update,
     ):
         data, spec = _opened(dataset, robot)
+        _require_commands(data)
         show = lambda status: update and update(status.fraction, 1.0, status.note)  # noqa: E731
         return Trainer(data, spec, Path(out), config, Budget.parse(budget), resume, holdout_units, show, log).run()
 
@@ -497,6 +500,16 @@ def _opened(
     from gaponet.data.store import open_dataset
 
     return open_dataset(dataset, robot, run)
+
+
+def _require_commands(data: Dataset) -> None:
+    """Refuse recordings in which no position was commanded: the measured ones stand there again."""
+    first = data.read(data.entries[0]) if data.entries else None
+    if first is not None and np.array_equal(first.ctrl, first.qpos) and np.ptp(first.qpos):
+        raise UsageError(
+            f"{data.path}: no position was commanded, so there is nothing to follow; this robot is driven by torque: "
+            f"gaponet torque {data.path} --out ROBOT fits its friction, inertia and delay, and says how far it is"
+        )
 
 
 def _run(run: GapModel | Place) -> Path:

@@ -8,6 +8,7 @@ COMMANDS = {
     "export": "gaponet_interop.cli.export:export",
     "robot": "gaponet_interop.cli.robot:robot",
     "replay": "gaponet_interop.cli.replay:replay",
+    "torque": "gaponet_interop.cli.torque:torque",
     "push": "gaponet_interop.cli.share:push",
     "pull": "gaponet_interop.cli.share:pull",
 }

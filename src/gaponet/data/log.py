@@ -68,7 +68,8 @@ class Log:
             if name not in self.channels:
                 raise LogError(
                     f"{self.source}: no {name} channel (it has {', '.join(self.channels) or 'none'}); "
-                    "a log needs commanded and measured joint positions"
+                    "a log needs commanded and measured joint positions; of a robot that is driven by torque say the "
+                    "position's name for ctrl too, and see gaponet torque"
                 )
         bad = _bad.get()
         if bad is not None:
