@@ -217,7 +217,7 @@ def identify(
         robot: Where to start, if not from the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
-        terms: Of the servo's law (sim.identify.TERMS); each is kept where validation motions say so.
+        terms: Of the servo's law; each is kept where validation motions say so.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
         shared: Give joints with one type of servo ([[servo]] in robot.toml) one law; what it costs is said.
         threads: 0 for all cores.

@@ -21,6 +21,7 @@ from rich.progress import Progress as Bars
 from gaponet.text import plain
 
 EVERY = 10.0  # s between two lines where there is no terminal
+ALMOST = 0.99  # shown at most before the end: what is called 100 % is over
 
 
 Progress = Callable[[float, float, str], None]  # done, total, what is done now
@@ -61,7 +62,8 @@ def bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
 def _progress(title: str) -> Iterator[_Show]:
     console = Console(stderr=True, force_jupyter=False)  # in a notebook it is text as well
     if not console.is_terminal:
-        yield _lines(title, console)
+        with _lines(title, console) as lines:
+            yield lines
         return
     columns: tuple[ProgressColumn, ...] = (
         TextColumn("{task.description}", style="bold", markup=False), BarColumn(),
@@ -79,26 +81,31 @@ def _progress(title: str) -> Iterator[_Show]:
                 if name not in shown:
                     shown[name] = progress.add_task(f"  {plain(name)}", total=1.0, note="")
                 progress.update(shown[name], completed=share, note=plain(said))
-            progress.update(whole, completed=done, total=total, note=plain(note))
+            progress.update(whole, completed=min(done, ALMOST * total), total=total, note=plain(note))
 
         yield show
+        if (task := progress.tasks[0]).percentage >= 100 * ALMOST:
+            progress.update(whole, completed=task.total)
 
 
-def _lines(title: str, console: Console) -> _Show:
-    """The same as lines, the first when there is something to say, then at most one every EVERY seconds."""
+@contextmanager
+def _lines(title: str, console: Console) -> Iterator[_Show]:
+    """The same as lines: the first when there is something to say, then at most one every EVERY seconds; the end."""
     began = time.monotonic()
-    last, ended = began - EVERY, False
+    last, share, newest = began - EVERY, 0.0, ""
 
     def show(running: Running, done: float, total: float, note: str = "") -> None:
-        nonlocal last, ended
-        now, complete = time.monotonic(), done >= total
-        if now - last < EVERY and (ended or not complete):
-            return
-        last, ended = now, complete
-        parts = [note, *(f"{name} {100 * share:.0f} % {said}".rstrip() for name, (share, said) in running.items())]
-        share = f"{100 * done / total:.0f} %" if total else ""
-        said = "; ".join(part for part in parts if part)
-        line = f"{title}: {share}, {now - began:.0f} s{', ' + said if said else ''}"
+        nonlocal last, share, newest
+        parts = [note, *(f"{name} {100 * part:.0f} % {said}".rstrip() for name, (part, said) in running.items())]
+        share, newest = done / total if total else 0.0, "; ".join(part for part in parts if part)
+        if time.monotonic() - last >= EVERY and (share < 1 or last >= began):
+            last = time.monotonic()
+            tell(min(share, ALMOST))
+
+    def tell(share: float) -> None:
+        line = f"{title}: {100 * share:.0f} %, {time.monotonic() - began:.0f} s{', ' + newest if newest else ''}"
         console.print(plain(line), markup=False, soft_wrap=True)
 
-    return show
+    yield show
+    if share >= 1:
+        tell(1.0)

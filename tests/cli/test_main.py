@@ -14,6 +14,7 @@ def test_help_is_one_screen_with_a_sentence_for_every_command(capsys):
     for name in commands():
         (line,) = [line for line in lines if line.startswith(f"  {name} ")]
         assert len(line.split(maxsplit=1)[1]) > 20
+        assert not line.endswith("…")
 
 
 def test_help_imports_no_command():

@@ -37,7 +37,7 @@ def calibrate(
     mixed_gains: Flag = False,
     json: Json = False,
 ) -> None:
-    """Fit what is particular to one unit (gain, damping, friction, zero offset, delay of each joint) from a short log.
+    """Fit what is particular to one unit (gain, damping, friction, zero, delay) from a short log.
 
     A robot folder in, a robot folder out: gaponet calibrate ./my_robot LOGS --out ./my_robot_today. Of a run the
     trained model stays as it is; gaponet eval then shows the unit without and with its calibration.

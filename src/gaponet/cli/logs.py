@@ -97,7 +97,7 @@ def import_logs(
 def doctor(
     dataset: Source, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
 ) -> None:
-    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque, payload.
+    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, payload.
 
     Args:
         robot: Robot name or folder, if not the one that the dataset keeps.

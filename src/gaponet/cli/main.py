@@ -13,7 +13,6 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 from gaponet.errors import GAPONetError, MissingPartError, UsageError, missing_extra
@@ -124,14 +123,15 @@ def overview() -> str:
 
 
 def _purpose(module: str, function: str) -> str:
-    """The first sentence of a command's docstring."""
+    """The first sentences of a command's docstring that a line has room for."""
     spec = find_spec(module)
     assert spec
     assert spec.origin
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     found = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
     first = " ".join((ast.get_docstring(found) or "").split("\n\n")[0].split())
-    return shorten(first, WIDTH, placeholder=" …")
+    head = first[:WIDTH]
+    return first if head == first else head[: max(map(head.rfind, (". ", "; ", ": ")))]
 
 
 def _say(text: str) -> int:
