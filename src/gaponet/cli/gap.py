@@ -24,7 +24,7 @@ def gap(
     dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
     json: Json = False,
 ) -> None:  # fmt: skip
-    """How far the simulator is from the robot, by joint, payload, …; of an identified robot or a run also by causes.
+    """How far the simulator is from the robot, by joint, payload and horizon; of an identified robot also by causes.
 
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
 
