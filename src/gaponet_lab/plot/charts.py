@@ -1,4 +1,4 @@
-"""What is drawn more than once: bars by group, dots by choice, lines over an amount, motions against a reference."""
+"""What is drawn more than once: bars by group, lines over an amount, motions against a reference."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.methods import colour as colour_of
 from gaponet.spread import Spread
 from gaponet_lab.plot.style import DASHED, DOTTED, figure, legend, styled
 
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
 
 
 Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
-Dot = tuple[str, str, Spread, bool]  # group, name, value, whether it is the default
-GAP = 0.7  # between groups, rows
 LEAST = 0.06  # rad, of an axis of positions
 
 
@@ -142,67 +139,11 @@ def _positions(
 
 
 @styled
-def dots(rows: ListOf[Dot], axis: str, title: str) -> Figure:
-    """One dot per setting, groups apart, the default hollow and as a line through all groups.
-
-    What lies far beyond all others is an arrow at the edge with its number.
-    """
-    y = 0.0
-    where: list[float] = []
-    names: list[str] = []
-    last = rows[0][0]
-    for group, name, _, _ in rows:
-        y += (1 if where else 0) + (GAP if group != last else 0)
-        where.append(y)
-        names.append(name)
-        last = group
-    fig = figure(6.0, 0.19 * (y + 1) + 1.0)
-    ax = fig.subplots()
-    limit = _limit([value.mean for _, _, value, _ in rows])
-    for place, (_, _, value, default) in zip(where, rows, strict=True):
-        if value.mean > limit:
-            ax.annotate(f"{value.mean:.2f} ", (limit, place), (-8, 0), textcoords="offset points", va="center",
-                        ha="right", color=colour_of("gaponet"))  # fmt: skip
-            ax.plot(limit, place, marker=">", ms=5, color=colour_of("gaponet"), clip_on=False)
-            continue
-        error = value.std if value.std == value.std else 0.0
-        ax.errorbar(
-            value.mean, place, xerr=error or None, fmt="o", ms=4.5, color=colour_of("gaponet"), elinewidth=1,
-            mfc="white" if default else colour_of("gaponet"),
-        )  # fmt: skip
-    base = next((value.mean for _, _, value, default in rows if default), None)
-    if base is not None:
-        ax.axvline(base, color=colour_of("gaponet"), lw=0.8, ls=(0, (4, 3)), zorder=0)
-    ax.set_yticks(where, names)
-    ax.tick_params(axis="y", length=0)
-    ax.set_ylim(y + 0.8, -0.8)
-    ax.grid(axis="y", visible=False)
-    for group in dict.fromkeys(r[0] for r in rows):
-        first = next(i for i, r in enumerate(rows) if r[0] == group)
-        # From the left, since a browser's font may be wider than ours and what is left of the figure is cut off.
-        ax.annotate(group, (0, where[first]), (-170, 0), xycoords=("axes fraction", "data"), textcoords="offset points",
-                    va="center", ha="left", fontweight="bold", annotation_clip=False)  # fmt: skip
-    if limit < np.inf:
-        ax.set_xlim(right=limit)
-    ax.set_xlabel(axis)
-    ax.set_title(title)
-    return fig
-
-
-def _limit(values: ListOf[float]) -> float:
-    """Where the axis ends, so that a few outliers do not press all others together; infinite where there are none."""
-    low, high = float(np.min(values)), float(np.quantile(values, 0.8))
-    usual = [v for v in values if v <= high + 3 * (high - low)]
-    return max(usual) + 0.35 * (max(usual) - low) if len(usual) < len(values) else np.inf
-
-
-@styled
 def lines(
     panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
     axes: tuple[str, str],
     ticks: ListOf[tuple[float, str]] = (),
     log: bool = False,
-    marked: ListOf[float | None] = (),
 ) -> Figure:
     """Values over an amount, with error bars, one line per method; those with error bars are drawn a little apart where
     x is not logarithmic, so that equal ones are all seen.
@@ -212,17 +153,10 @@ def lines(
         axes: Labels of x and y.
         ticks: Where x is labelled, and how; default matplotlib's.
         log: Whether x is logarithmic.
-        marked: An x of each panel to be shaded: what training left out.
     """
     fig = figure(3.6 * len(panels) + 0.6, 3.2)
-    for i, (ax, (title, methods)) in enumerate(zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels,
-                                                   strict=True)):  # fmt: skip
+    for ax, (title, methods) in zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True):
         spacing = np.diff(sorted({v for _, x, _ in methods.values() for v in x}))
-        if i < len(marked) and (place := marked[i]) is not None:
-            half = 0.3 * float(spacing.min()) if spacing.size else 0.5
-            ax.axvspan(place - half, place + half, color="#000000", alpha=0.06, lw=0)
-            ax.annotate("not in training", (place, 0.0), xycoords=("data", "axes fraction"), xytext=(0, 3),
-                        textcoords="offset points", ha="center", va="bottom", fontsize=8, color="#555555")  # fmt: skip
         apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
         drawn = 0  # of those with error bars
         spreading = sum(spreads(values) is not None for _, _, values in methods.values())
