@@ -232,8 +232,9 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.files import writing
     from gaponet.robot_folder import ORIGIN, save_robot
-    from gaponet.sim.identify import BETTER, no_gain, whole_errors
+    from gaponet.sim.identify import BETTER, no_gain
     from gaponet.sim.identify import identify as fit
+    from gaponet.sim.replay import whole_errors
     from gaponet.training.budget import Budget
 
     data, spec = _opened(dataset, robot)
@@ -457,8 +458,9 @@ def calibrate_robot(
 
     from gaponet.files import write_text, writing
     from gaponet.robot_folder import ORIGIN, save_robot
-    from gaponet.sim.identify import BETTER, whole_errors
+    from gaponet.sim.identify import BETTER
     from gaponet.sim.refit import refit
+    from gaponet.sim.replay import whole_errors
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
     with tempfile.TemporaryDirectory() as place, writing(Path(out), "robot"):

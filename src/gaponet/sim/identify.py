@@ -25,7 +25,6 @@ from gaponet.sim.free_runs import FreeRuns, cut
 from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import better_half, descend, slopes
-from gaponet.sim.replay import replay
 from gaponet.sim.shared import far_from_published, same_servos, share
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 from gaponet.text import measured
@@ -128,10 +127,12 @@ class Identified:
 class Clock:
     """How far a fit is, told with what is fitted; and, where its time is limited, when a search has had its part."""
 
-    def __init__(self, seconds: float | None, steps: list[int], progress: Progress) -> None:
-        """steps: Iterations until the end of each search."""
-        self.began, self.seconds, self.steps, self.progress = time.monotonic(), seconds, steps, progress
-        self.iterations, self.done, self.end = steps[-1], 0, np.inf
+    def __init__(self, seconds: float | None, terms: int, progress: Progress) -> None:
+        each = [sum(SEARCH), sum(TOGETHER) + LIMBS, *[sum(SEARCH) + POLISH] * terms]
+        self.began, self.seconds, self.progress = time.monotonic(), seconds, progress
+        self.steps = np.cumsum(each).tolist()  # iterations until the end of each search
+        self.iterations, self.done, self.end = self.steps[-1], 0, np.inf
+        progress(0, self.iterations, "inertias along the recordings")
 
     def share(self, part: float, search: int) -> None:
         """The search of this number may take this part of the time that is left."""
@@ -142,6 +143,10 @@ class Clock:
     def over(self) -> bool:
         """Whether the present search has had its time."""
         return time.monotonic() - self.began > self.end
+
+    def table(self, error: float) -> None:
+        """The table's search, which no budget counts; error in rad."""
+        self.progress(self.iterations, self.iterations, f"table {error * 1e3:.2f} mrad")
 
     def tell(self, what: str, joints: tuple[str, ...], rows: Array) -> Callable[[Array], None]:
         """To be called in each iteration with every joint's cost, (n,)."""
@@ -180,53 +185,41 @@ def identify(
         shared: In the end give joints with one type of servo (robot.servos) one law.
         nthread: Threads, 0 for all cores.
         progress: Called in each iteration.
-        budget: s that the searches may take (not the table's); without one all iterations are made, and the result
-            is the same on every machine.
+        budget: s that the searches may take, the table's apart; without one results are the same on every machine.
         stops: Give joints that stayed behind several commands a stop there.
     """
-    steps = np.cumsum([sum(SEARCH), sum(TOGETHER) + LIMBS, *[sum(SEARCH) + POLISH] * len(terms)]).tolist()
-    clock = Clock(budget, steps, progress)
-    progress(0, clock.iterations, "inertias along the recordings")
+    clock = Clock(budget, len(terms), progress)
     given, robot = robot, with_stops(robot, sequences)  # for the fit; what nobody confirmed is taken back in the end
     heights = tip_heights(sequences, robot)
     below, parts = touching_below(robot, heights), cut(sequences, windows)
-    bounds = Bounds(robot, sequences)
-    fit = Fit(JointRuns(parts, robot, below, nthread), robot, bounds)
-    judge = _Judge(list(validation) or parts, robot, below, nthread)
+    fit = Fit(JointRuns(parts, robot, below, nthread), robot, Bounds(robot, sequences))
+    judge, first = _Judge(list(validation) or parts, robot, below, nthread), fit.bounds.first
     whole, candidates = _classic(fit, clock, nthread)
     chosen, values = judge.best(candidates)
     base = values if chosen != "given" else candidates["limbs"]
-    tried, richer = _with_terms(fit, whole, judge, terms, values, base, clock)
-    if richer is not values:
-        chosen, values = "whole" if chosen == "given" else chosen, richer
+    tried, values = _with_terms(fit, whole, judge, terms, values, base, clock)
+    chosen = "whole" if chosen == "given" and any(t.kept for t in tried) else chosen
     std, over_kp = whole.uncertainty(values)
     common = []
     for servo, places in (same_servos(robot) if shared else {}).items():
-        armature = float(bounds.start["armature"][places].mean())
-        mine = share(fit.runs, values, places, armature, lambda error: None)
+        mine = share(fit.runs, values, places, fit.bounds.start["armature"][places].mean(), lambda error: None)
         common.append(Tried(servo, judge.errors(values), judge.errors(mine)))
         values, std, chosen = mine, std | {robot.operated[i]: {} for i in places}, "whole"
 
     found, touch = fit.robot(values) if chosen != "given" else robot, None
     if table and robot.tips:
         low, lowest = low_windows(sequences, heights, below), min(h.min() for h in heights)
-        note = lambda error: progress(clock.iterations, clock.iterations, f"table {error * 1e3:.2f} mrad")  # noqa: E731
-        score = lambda one: float(whole_errors(validation, one, nthread).mean())  # noqa: E731
-        touch = fit_table(low, found, lowest, nthread, note, score if validation else None)
+        touch = fit_table(low, found, lowest, nthread, clock.table, validation)
         found = touch.robot
     if not stops:
         found = replace(found, stop_low=given.stop_low, stop_high=given.stop_high)
         found = given if chosen == "given" and not (touch and touch.kept) else found
-    doubts = (
-        *fit.bounds_met(values),
-        *_asked_stops(given, robot),
-        *far_from_published(found),
-        *fit.undetermined(values, std, over_kp),
-    )
-    before, after = (judge.by_joint(v) for v in (bounds.first, values))
-    by_joint = {j: (float(a), float(b)) for j, a, b in zip(robot.operated, before, after, strict=True)}
-    began, ended = (float(judge.errors(v).mean()) for v in (bounds.first, values))
-    return Identified(found, began, ended, chosen, doubts, std, tuple(tried), touch, tuple(common), by_joint)
+    doubts = (*fit.bounds_met(values), *_asked_stops(given, robot), *far_from_published(found),
+              *fit.undetermined(values, std, over_kp))  # fmt: skip
+    began, ended = (float(judge.errors(v).mean()) for v in (first, values))
+    each = zip(*(judge.by_joint(v).tolist() for v in (first, values)), strict=True)
+    by_joint = dict(zip(robot.operated, each, strict=True))
+    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint)
 
 
 def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Values]]:
@@ -244,7 +237,7 @@ def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Value
 
 def _with_terms(
     fit: Fit, whole: Fit, judge: _Judge, terms: tuple[str, ...], values: Values, base: Values, clock: Clock
-) -> tuple[list[Tried], Values]:
+) -> tuple[tuple[Tried, ...], Values]:
     """Terms of the law, each fitted from the base and kept in it where it does better than the values."""
     tried: list[Tried] = []
     for i, term in enumerate(terms):
@@ -258,7 +251,7 @@ def _with_terms(
         tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
         if tried[-1].kept:
             values = base = richer
-    return tried, values
+    return tuple(tried), values
 
 
 class _Judge:
@@ -563,13 +556,6 @@ def _asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
                     "identify with --stops; if something was in its way, leave those motions out"
                 )
     return found
-
-
-def whole_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
-    """Mean |error| of each whole motion in free run, operated joints, (motions,) rad."""
-    twins, op = replay(sequences, robot, nthread=nthread, lock_idle=True), robot.operated_index
-    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]
-    return np.nan_to_num(np.array(errors), nan=np.pi)
 
 
 def no_gain(found: Identified, robot: RobotSpec, given: Array, left: Array) -> str:

@@ -80,6 +80,13 @@ def replay(
     return [twins[i] for i in range(len(sequences))]
 
 
+def whole_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
+    """Mean |error| of each whole motion in free run, operated joints, (motions,) rad."""
+    twins, op = replay(sequences, robot, nthread=nthread, lock_idle=True), robot.operated_index
+    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]
+    return np.nan_to_num(np.array(errors), nan=np.pi)
+
+
 def idle_limbs(sequences: ListOf[Sequence], robot: RobotSpec) -> tuple[str, ...]:
     """Joints of limbs that no command of these sequences moves away from home and that have no operated joint."""
     return tuple(sorted(set.intersection(*map(set, _idle_limbs(sequences, robot))), key=robot.joint_names.index))

@@ -21,7 +21,7 @@ from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.joint_runs import SETTLE, SOFT
 from gaponet.sim.model import build_model
 from gaponet.sim.multistart import soft
-from gaponet.sim.replay import idle_limbs, rollout
+from gaponet.sim.replay import idle_limbs, rollout, whole_errors
 from gaponet.sim.table import write_table
 
 Array = np.ndarray
@@ -108,7 +108,7 @@ def fit_table(
     lowest: float,
     nthread: int,
     progress: Callable[[float], None],
-    judge: Callable[[RobotSpec], float] | None = None,
+    validation: ListOf[Sequence] = (),
 ) -> Touch:
     """Fit height, friction and stiffness of the table, and the zeros, from several starts.
 
@@ -118,8 +118,7 @@ def fit_table(
         lowest: Tip height in them, m.
         nthread: Threads, 0 for all cores.
         progress: Called in each iteration with the root mean square error, rad.
-        judge: Error of a robot, rad, on recordings that are not fitted: says which start's table is taken; without
-            it the windows do.
+        validation: Recordings, whole, that say which start's table is taken; without them the windows do.
     """
     if not parts:
         return Touch(robot, False, np.zeros(0), np.zeros(0), ())
@@ -137,7 +136,7 @@ def fit_table(
     starts = guesses.reshape(*costs.shape, -1)[np.arange(len(STARTS)), costs.argmin(axis=1)]
     found = [_searched(scene, start, measured is not None, progress) for start in starts]
     tables = [_with_table(robot, x) for x, _ in found]
-    errors = [cost for _, cost in found] if judge is None else [judge(one) for one in tables]
+    errors = [whole_errors(validation, one, nthread).mean() for one in tables] if validation else [x[1] for x in found]
     best = int(np.argmin(errors))
     without, within = (scene.mean(e)[0] for e in (before, scene.errors(found[best][0][None])))
     kept = bool((without - within).mean() > np.nan_to_num(standard_error(without - within)))
