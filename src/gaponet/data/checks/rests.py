@@ -32,7 +32,6 @@ EVIDENCE = 10.0  # of other labels: rests times the logarithm by which their sca
 UNITS, CLEAR = 0.006, 6.0  # rad between two groups of recordings, and times the scatter inside them
 PLAIN = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
 USUAL = np.array([0.5, 0.5, 1.0, 0.1])  # how far they may be from it, where rests do not say
-ALONE = 3  # joints that must say so of one recording among others
 ODD = 10  # sequences that are told apart
 
 
@@ -77,7 +76,7 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
     while len(wrong) < ODD and (odd := _odd_one(surveys, robot, found, judged)) is not None:
         wrong.append(odd[1])
         found = found.only(found.sequence != odd[0])
-    wrong = wrong or _two_units(surveys, robot, found, judged, 1, ALONE)
+    wrong = wrong or _two_units(surveys, robot, found, judged, 1, 3)
     judged = [j for j in judged if (found.joint == j).sum() >= FEW]
     soft = {}
     for j in judged:
