@@ -19,7 +19,7 @@ import numpy as np
 from strangers import Recording, Stranger, draw
 
 from gaponet.data.checks.finding import Finding
-from gaponet.data.doctor import diagnose
+from gaponet.data.doctor import Diagnosis
 from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.data.store import Dataset
@@ -150,7 +150,7 @@ def examine(robot: Stranger, spec: RobotSpec, logs: Logs, folder: Path) -> list[
         names = {c: v for c in ("ctrl", "qpos", "qvel", "tau") if (v := getattr(log, c)) is not None}
         raw = Log(spec.name, robot.joints, {c: Channel(log.time, v) for c, v in names.items()}, log.motion)
         data.append(to_sequence(raw, spec, SequenceMeta(spec.name, "a", log.motion, log.payload)))
-    found = diagnose(data, spec, model=gravity_of(spec)).findings
+    found = Diagnosis.of(data, spec, model=gravity_of(spec)).findings
     return [f for f in found if f.level in ("warning", "error")]
 
 

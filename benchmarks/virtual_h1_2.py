@@ -109,7 +109,7 @@ class Bench:
         """The steps without a network; of the easy fleet without delay + offset and the servo's law."""
         hard, steps = self.fleet == "hard", {"nominal": [self.errors(self.nominal)]}
         if hard:
-            late = delay_offset.fit(self.train, self.nominal)
+            late = delay_offset.DelayOffset.fit(self.train, self.nominal)
             steps["delay + offset"] = [self.errors(self.nominal, late.corrector(self.nominal))]
         four = self.kept("four", lambda: four_scalars(self.train, self.nominal))
         steps |= {"four scalars": [self.errors(four)], "identification, classic": [self.errors(self.identified(()))]}
@@ -177,9 +177,9 @@ class Ladder:
 
     def calibrated(self, cell: Cell, model: GapModel, simulator: RobotSpec) -> Array:
         """After 30 s of the unit."""
-        if UNIT not in calibration.load(cell.folder, model.weights_hash()):
+        if UNIT not in calibration.Calibration.load(cell.folder, model.weights_hash()):
             run("calibrate", cell.folder, self.hard.data.path, "--unit", UNIT)
-        own = calibration.load(cell.folder, model.weights_hash())[UNIT]
+        own = calibration.Calibration.load(cell.folder, model.weights_hash())[UNIT]
         return self.hard.errors(own.robot(simulator), model.corrector(simulator))
 
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from logs import write_sage
 
-from gaponet.data.doctor import Diagnosis, diagnose
+from gaponet.data.doctor import Diagnosis
 from gaponet.data.importer import import_logs
 from gaponet.errors import GAPONetError
 from gaponet.robot import RobotSpec
@@ -106,7 +106,7 @@ def examine(robot: RobotSpec, logs: list[Recording], folder: Path, damage: Calla
                 else tuple(f"{n}={gain * k}" for n, k in zip(robot.joint_names, robot.kp, strict=True))
             )
             report = import_logs(folder / f"{mass:g}", robot, "a", mass, folder / "data", kp=kp)
-        return diagnose(report.dataset, robot, model=gravity_of(robot))
+        return Diagnosis.of(report.dataset, robot, model=gravity_of(robot))
     except GAPONetError as error:
         return error
 

@@ -86,14 +86,14 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
     Raises:
         DatasetError: The folder is no dataset, or damaged.
     """
-    from gaponet.data.doctor import diagnose
+    from gaponet.data.doctor import Diagnosis
     from gaponet.sim.dynamics import gravity_of
     from gaponet.sim.touching import tip_heights
 
     data, spec = _opened(dataset, robot)
     with bar("examining") as update:
         heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
-        return diagnose(data, spec, update, gravity_of(spec), heights)
+        return Diagnosis.of(data, spec, update, gravity_of(spec), heights)
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, executor: str | Executor = "local") -> int:

@@ -33,18 +33,6 @@ def copy_of(x: Any) -> Any:
     return x.copy() if isinstance(x, np.ndarray) else x.clone()
 
 
-def rows_of(x: Any, rows: Any, out: Any = None) -> Any:
-    """x[rows], or the same written into out for rows (k,)."""
-    if isinstance(x, np.ndarray):
-        return x.take(rows, axis=0, out=out)  # quicker than an index
-    return x[rows] if out is None else library(x).index_select(x, 0, rows, out=out)
-
-
-def single(x: Any) -> Any:
-    """As float32."""
-    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()
-
-
 def host(x: Any) -> Array:
     """As numpy; of a tensor on a GPU a copy."""
     return x if isinstance(x, np.ndarray) else x.cpu().numpy()

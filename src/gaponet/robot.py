@@ -163,6 +163,11 @@ class RobotSpec:
         """Whether a servo does more than MuJoCo's position actuator (sim/servo.py)."""
         return any(getattr(self, name).any() for name in LAW)
 
+    @property
+    def before_identification(self) -> RobotSpec:
+        """The nominal robot: this one, or what it was identified from."""
+        return self.nominal or self
+
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
         """The same robot with identified values: joint → any of SERVO. A damping below zero is taken from kd."""
         changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO}

@@ -107,31 +107,3 @@ def text(cell: Any, digits: int = 2) -> str:
     if isinstance(cell, (int, np.integer)):
         return f"{cell:,}"
     return f"{cell:.{digits}f}" if math.isfinite(cell) else ""
-
-
-def compared(name: str, value: Spread, base: Spread, to: str, unit: str = "") -> str:
-    """Whether a value differs from another by more than seeds do, in words."""
-    change, margin = value.mean - base.mean, _noise(value, base)
-    known = "" if margin == margin else " (one seed)"
-    if abs(change) <= margin:
-        return f"{name} {value.mean:.2f}{unit}, no different from {to} within the spread of seeds"
-    way = "more" if change > 0 else "less"
-    return f"{name} {value.mean:.2f}{unit}, {100 * abs(change) / abs(base.mean):.0f} % {way} than {to}{known}"
-
-
-def compared_by_seed(name: str, ratio: Spread, to: str) -> str:
-    """Whether a ratio of two values, seed by seed, differs from one by more than two standard errors, in words."""
-    change = ratio.mean - 1
-    if abs(change) <= 2 * ratio.error:
-        return f"{name} no different from {to} ({100 * change:+.0f} %, seeds ± {100 * ratio.std:.0f} %)"
-    known = f"seeds ± {100 * ratio.std:.0f} %" if ratio.count > 1 else "one seed"
-    return f"{name} {100 * abs(change):.0f} % {'more' if change > 0 else 'less'} than {to} ({known})"
-
-
-def _noise(a: Spread, b: Spread) -> float:
-    """Two standard errors of a difference of means; where one has a single value, with the other's std; else NaN."""
-    std = [s for s in (a.std, b.std) if s == s]
-    if not std:
-        return math.nan
-    first, second = (s if s == s else std[0] for s in (a.std, b.std))
-    return 2 * math.sqrt(first**2 / max(a.count, 1) + second**2 / max(b.count, 1))

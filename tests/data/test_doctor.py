@@ -8,7 +8,7 @@ import pytest
 from logs import arm_sequence, late, wave
 
 from gaponet.data.checks.finding import Finding
-from gaponet.data.doctor import Diagnosis, diagnose, inventory
+from gaponet.data.doctor import Diagnosis, inventory
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import lowpass
 from gaponet.data.store import Dataset
@@ -30,7 +30,7 @@ def examine(arm, tmp_path, *sequences) -> Diagnosis:
     dataset = Dataset.create(tmp_path / "data", arm)
     for sequence in sequences:
         dataset.append(sequence)
-    return diagnose(dataset, arm)
+    return Diagnosis.of(dataset, arm)
 
 
 def found(diagnosis: Diagnosis, check: str, level: str) -> Finding:
@@ -179,7 +179,7 @@ def weigh(arm, tmp_path, *sequences) -> Diagnosis:
     dataset = Dataset.create(tmp_path / "data", arm)
     for sequence in sequences:
         dataset.append(sequence)
-    return diagnose(dataset, arm, model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos))
+    return Diagnosis.of(dataset, arm, model=lambda qpos, mass, side: static_torque(build_model(arm, mass, side), qpos))
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.2])
@@ -319,9 +319,9 @@ def test_one_recording_under_two_payloads_is_an_error(arm, tmp_path):
 def test_an_empty_dataset_and_another_robot_are_refused(arm, so101, tmp_path):
     dataset = Dataset.create(tmp_path / "data", arm)
     with pytest.raises(DatasetError, match="holds no sequences yet; import or collect some"):
-        diagnose(dataset, arm)
+        Diagnosis.of(dataset, arm)
     with pytest.raises(DatasetError, match="holds robot 'arm'"):
-        diagnose(dataset, so101)
+        Diagnosis.of(dataset, so101)
 
 
 def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
@@ -333,7 +333,7 @@ def test_the_inventory_counts_units_payloads_and_minutes(arm, tmp_path):
 
 def test_real_so101_logs_show_their_lag_sag_torque_gripper_and_rate(real_dataset, so101):
     model = build_model(so101)
-    diagnosis = diagnose(real_dataset, so101, model=lambda qpos, mass, side: static_torque(model, qpos))
+    diagnosis = Diagnosis.of(real_dataset, so101, model=lambda qpos, mass, side: static_torque(model, qpos))
     assert diagnosis.verdict == "Usable. Read the 4 warning(s) first."
     lags = found(diagnosis, "lag", "note").values
     for joint in so101.operated:

@@ -155,7 +155,7 @@ def _use_model(source: Path, out: Path) -> None:
             delta = loop.delta(np.zeros(n), np.zeros(n), np.full(n, 0.1), 0.2)
             if not np.isfinite(delta).all() or np.abs(delta).max() > 20:
                 raise AbsurdError(f"{backend}: a correction of {delta}")
-        calibration.load(source, model.weights_hash())
+        calibration.Calibration.load(source, model.weights_hash())
 
 
 def _use_run(source: Path, out: Path) -> None:

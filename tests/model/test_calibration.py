@@ -62,15 +62,15 @@ def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs
 def test_a_calibration_is_read_as_it_was_written(found, tmp_path):
     odd = replace(found, unit_id="lab/arm 2")
     assert odd.save(tmp_path).name == "lab_arm_2.json"
-    assert calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
+    assert calibration.Calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
     with pytest.raises(ModelError, match="made for another model"):
-        calibration.load(tmp_path, "0123456789ab")
+        calibration.Calibration.load(tmp_path, "0123456789ab")
 
 
 def test_a_calibration_for_an_earlier_model_is_replaced(found, tmp_path):
     replace(found, weights="0123456789ab").save(tmp_path)
     found.save(tmp_path)
-    assert calibration.load(tmp_path, found.weights) == {found.unit_id: found}
+    assert calibration.Calibration.load(tmp_path, found.weights) == {found.unit_id: found}
 
 
 def test_a_payload_that_nobody_weighed_is_found(model, robot):
@@ -103,7 +103,7 @@ def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, c
     file = found.save(tmp_path)
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
     with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
-        calibration.load(tmp_path, found.weights)
+        calibration.Calibration.load(tmp_path, found.weights)
 
 
 def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs, tmp_path):

@@ -53,38 +53,39 @@ class Diagnosis:
         """The diagnosis as a dictionary that JSON can hold."""
         return {"verdict": self.verdict} | asdict(self)
 
+    @classmethod
+    def of(
+        cls,
+        dataset: Dataset,
+        robot: RobotSpec,
+        progress: Progress = silent,
+        model: Gravity | None = None,
+        heights: Heights | None = None,
+    ) -> Diagnosis:
+        """Survey every sequence, one in memory at a time, and judge them together.
 
-def diagnose(
-    dataset: Dataset,
-    robot: RobotSpec,
-    progress: Progress = silent,
-    model: Gravity | None = None,
-    heights: Heights | None = None,
-) -> Diagnosis:
-    """Survey every sequence, one in memory at a time, and judge them together.
-
-    Args:
-        robot: The dataset's robot.
-        model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
-        heights: Lowest tip of a sequence in every row, m, to tell motions that press on something; needs `model`.
-    """
-    dataset.require_robot(robot)
-    if not dataset.entries:
-        raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-    surveys: list[Survey] = []
-    stands: list[Standing] = []
-    for entry in dataset.entries:
-        sequence = dataset.read(entry)
-        surveys.append(Survey.of(entry, sequence, robot))
-        if model is not None and heights is not None:
-            stands.append(Standing.of(sequence, robot, heights, model))
-        progress(len(surveys), len(dataset), entry.meta.motion)
-    findings = [f for check in CHECKS for f in check(surveys, robot)]
-    if model is not None:
-        findings += _weighed(findings, surveys, robot, model)
-    findings += touching(stands)
-    findings.sort(key=lambda f: -LEVELS.index(f.level))
-    return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
+        Args:
+            robot: The dataset's robot.
+            model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
+            heights: Lowest tip of a sequence in every row, m, to tell motions that press on something; needs `model`.
+        """
+        dataset.require_robot(robot)
+        if not dataset.entries:
+            raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
+        surveys: list[Survey] = []
+        stands: list[Standing] = []
+        for entry in dataset.entries:
+            sequence = dataset.read(entry)
+            surveys.append(Survey.of(entry, sequence, robot))
+            if model is not None and heights is not None:
+                stands.append(Standing.of(sequence, robot, heights, model))
+            progress(len(surveys), len(dataset), entry.meta.motion)
+        findings = [f for check in CHECKS for f in check(surveys, robot)]
+        if model is not None:
+            findings += _weighed(findings, surveys, robot, model)
+        findings += touching(stands)
+        findings.sort(key=lambda f: -LEVELS.index(f.level))
+        return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 
 
 def _weighed(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:

@@ -21,8 +21,6 @@ SHIFTS = np.arange(-0.12, 0.1201, 0.002)  # s by which a part may follow later
 RIDGE = 1e-3
 SHARP = 0.8  # of the command's power: its correlation 20 ms later
 FOLLOWS = 0.7  # of the state's power is left where a joint does not follow
-HERTZ = np.arange(0.5, 60, 0.1)
-WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 
 
 def resample_linear(time: Array, values: Array, grid: Array) -> Array:
@@ -239,32 +237,3 @@ def _peaks(fits: Array) -> Array:
     """Shift of the best fit, (…, S) → (…) s; NaN at an end, and where nothing says."""
     found = SHIFTS[fits.argmax(axis=-1)]
     return np.where((np.abs(found) > SHIFTS[-2]) | (np.ptp(fits, axis=-1) == 0), np.nan, found)
-
-
-def spectrum(qpos: Array, dt: float) -> Array:
-    """Mean logarithm of the power of the velocities that are not zero, at HERTZ, (H); NaN above half the rate."""
-    moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
-    if not moved.size or len(moved) < 100:
-        return np.full(len(HERTZ), np.nan)
-    v = np.diff(moved, axis=0)
-    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
-    smooth = np.convolve(power, np.ones(3) / 3, "same")
-    return np.where(0.48 / dt > HERTZ, np.interp(HERTZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan)
-
-
-def averaged(levels: Array, widths: Array = WIDTHS) -> tuple[float, float]:
-    """Width in s of the average that best explains notches at its multiples in `levels` (H), and how deep they are."""
-    best = (0.0, 0.0)
-    known = HERTZ[np.isfinite(levels)]
-    if not len(known):
-        return best
-    for width in widths:
-        depth = []
-        for k in range(1, 5):
-            if (k + 0.4) / width > known[-1]:
-                break
-            near = levels[np.abs(HERTZ - k / width) < max(0.11, 0.012 * k / width)].min()
-            depth.append(np.interp([(k - 0.35) / width, (k + 0.35) / width], HERTZ, levels).mean() - near)
-        if depth and min(depth) > best[1]:
-            best = (float(width), float(min(depth)))
-    return best

@@ -319,6 +319,18 @@ class Dataset:
                 raise DatasetError(f"{where}: '{listed[entry.hash]}' is listed already; delete this line")
             yield entry
 
+    @classmethod
+    def opened(cls, place: str | Path) -> Dataset:
+        """A dataset folder, or one behind an address.
+
+        Raises:
+            DatasetError, RemoteError: As open_dataset.
+        """
+        if "://" not in str(place):
+            return Dataset(place)
+        streamed = take("PROVIDES", "dataset behind an address", "reading datasets where they were pushed")
+        return cast("Dataset", streamed(str(place)))
+
 
 def entry_id(meta: SequenceMeta, digest: str) -> str:
     """A sequence's name in its dataset: what it is, as letters that any disk takes, and how its content hash begins."""
@@ -391,7 +403,7 @@ def open_dataset(
     A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
     is said on stderr.
     """
-    data = dataset if isinstance(dataset, Dataset) else opened(dataset)
+    data = dataset if isinstance(dataset, Dataset) else Dataset.opened(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
@@ -401,16 +413,3 @@ def open_dataset(
         note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
         print(note, file=sys.stderr)
     return data, spec
-
-
-def opened(place: str | Path) -> Dataset:
-    """A dataset folder, or one behind an address.
-
-    Raises:
-        DatasetError, RemoteError: As open_dataset.
-    """
-    if "://" not in str(place):
-        return Dataset(place)
-    return cast(
-        "Dataset", take("PROVIDES", "dataset behind an address", "reading datasets where they were pushed")(str(place))
-    )

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.holds import Holds
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass, spectrum
+from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
 
@@ -29,6 +29,7 @@ JUMP, JUMP_ACCELERATION = 0.1, 1000.0  # off the line between its neighbours by 
 DROPPED = 0.05  # a row of zeros so far from the next row was not measured, rad
 FLAT = 0.02  # rad that a joint moves while its torque says one number
 STEPPED = 0.05  # rad by which a command jumps, and a torque with it
+HERTZ = np.arange(0.5, 60, 0.1)  # of spectra
 SPIKE_WINDOW_S, SPIKE_SHARE = 0.3, 0.3  # above the running median by this share of the torque limit
 
 
@@ -156,7 +157,7 @@ class Survey:
             torque=_torque(sequence, robot),
             holds=Holds.of(sequence, robot.operated_index),
             response=Response.of(ctrl, qpos, dt),
-            spectra=np.stack([spectrum(ctrl, dt), spectrum(qpos, dt)]),
+            spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]),
             **_kind(sequence),
             halted_s=_halted(ctrl, qpos, dt),
             loads=_loads(sequence),
@@ -341,3 +342,14 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
             ]
         ),
     )
+
+
+def _spectrum(qpos: Array, dt: float) -> Array:
+    """Mean logarithm of the power of the velocities that are not zero, at HERTZ, (H); NaN above half the rate."""
+    moved = qpos[:, np.ptp(qpos, axis=0) > 0.02].astype(float)
+    if not moved.size or len(moved) < 100:
+        return np.full(len(HERTZ), np.nan)
+    v = np.diff(moved, axis=0)
+    power = np.log(np.abs(np.fft.rfft(v * np.hanning(len(v))[:, None], axis=0)) ** 2 + 1e-30).mean(axis=1)
+    smooth = np.convolve(power, np.ones(3) / 3, "same")
+    return np.where(0.48 / dt > HERTZ, np.interp(HERTZ, np.fft.rfftfreq(len(v), dt), smooth), np.nan)

@@ -85,7 +85,7 @@ class Candidate:
 
     def calibrations(self) -> Mapping[str, calibration.Calibration]:
         """Units that the model was calibrated to."""
-        return {} if self.model is None else calibration.load(self.folder, self.model.weights_hash())
+        return {} if self.model is None else calibration.Calibration.load(self.folder, self.model.weights_hash())
 
 
 def is_robot(folder: Path) -> bool:
@@ -144,7 +144,7 @@ class Seen:
             origin = read_origin(folder)
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
         model = GapModel.load(folder)
-        logs = {h for c in calibration.load(folder, model.weights_hash()).values() for h in c.logs}
+        logs = {h for c in calibration.Calibration.load(folder, model.weights_hash()).values() for h in c.logs}
         origin = read_origin(folder / KEPT)  # of the robot under the model
         logs |= set() if origin is None else {h for part in ("train", "val") for h in origin["parts"][part].values()}
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)

@@ -30,7 +30,6 @@ from gaponet.model import calibration
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
-from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
@@ -117,7 +116,7 @@ def evaluate(
         known[one.method] = one
     first = next(iter(known.values()))
     models = {name: c.model for name, c in known.items() if c.model is not None}
-    nominal = nominal_of(first.robot)
+    nominal = first.robot.before_identification
     entries, unseen = choose(list(folders), dataset, motions)
     sequences = dataset.sequences(entries)
     for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):

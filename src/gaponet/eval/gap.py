@@ -23,7 +23,6 @@ from gaponet.metrics import summary as errors_of
 from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
-from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import Corrector, replay
 
@@ -52,7 +51,7 @@ def gap_by_step(
     """
     robot = one.robot
     dataset.require_robot(robot)
-    nominal = nominal_of(robot)
+    nominal = robot.before_identification
     entries, unseen = choose([one.folder], dataset, motions)
     sequences = dataset.sequences(entries)
     steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
@@ -126,7 +125,7 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
     """The simulators between the nominal and the identified one; the last one is the identified one itself."""
     if simulator.nominal is None:
         return []
-    robot, steps = nominal_of(simulator), []
+    robot, steps = simulator.before_identification, []
     for cause, fields in CAUSES.items():
         servos = {
             joint: {f: float(getattr(simulator, f)[i]) for f in fields if np.isfinite(getattr(simulator, f)[i])}

@@ -6,7 +6,6 @@ Needs onnxruntime, or numpy alone; never torch.
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired
@@ -16,7 +15,6 @@ from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
 from gaponet.arrays import Array
-from gaponet.data.sequence import SequenceMeta
 from gaponet.errors import ModelError, UsageError
 from gaponet.model import fused
 from gaponet.model.backends import Backend, Network, NumpyNetwork, OnnxNetwork
@@ -63,18 +61,6 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
     } | facts
 
 
-def recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, list[float] | None]:
-    """kp, kd of the operated joints while the training data were recorded; None where unknown or not one and the same.
-
-    They are the real robot's; "kp" and "kd" of the card are the simulator's.
-    """
-    found: dict[str, list[float] | None] = {}
-    for name in ("kp", "kd"):
-        gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
-        found[name] = list(gains.pop()) if len(gains) == 1 else None
-    return found
-
-
 def how_trained(card: dict[str, Any]) -> str:
     """What the budget bought, in words; a model that saw no update of PPO is a supervised start and is called so."""
     if "stages" not in card:
@@ -86,13 +72,6 @@ def how_trained(card: dict[str, Any]) -> str:
     if card["stages"].get("ppo_anew"):
         return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
     return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
-
-
-def write_card(path: Path, card: dict[str, Any]) -> None:
-    """JSON at full precision, written whole or not at all."""
-    from gaponet.files import write_text
-
-    write_text(path, json.dumps(card, indent=1, ensure_ascii=False) + "\n")
 
 
 class _SensorR2(TypedDict):

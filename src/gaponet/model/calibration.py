@@ -92,6 +92,19 @@ class Calibration:
             found.payload_std,
         )  # fmt: skip
 
+    @classmethod
+    def load(cls, run: Path, weights: str) -> dict[str, Calibration]:
+        """Unit → calibration of this model; those of an earlier model in the same folder are refused."""
+        found = {}
+        for path in sorted((run / "calibration").glob("*.json")):
+            one = read_json(Calibration, path, ModelError, "run gaponet calibrate again")
+            if one.weights != weights:
+                raise ModelError(
+                    f"{path}: made for another model ({one.weights}); delete it or run gaponet calibrate again"
+                )
+            found[one.unit_id] = one
+        return found
+
 
 def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
     """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
@@ -113,16 +126,3 @@ def _one_unit(sequences: ListOf[Sequence]) -> str:
     if len(units) != 1:
         raise UsageError(f"these recordings are of units {', '.join(units) or '(none)'}; give those of one unit")
     return units[0]
-
-
-def load(run: Path, weights: str) -> dict[str, Calibration]:
-    """Unit → calibration of this model; those of an earlier model in the same folder are refused."""
-    found = {}
-    for path in sorted((run / "calibration").glob("*.json")):
-        one = read_json(Calibration, path, ModelError, "run gaponet calibrate again")
-        if one.weights != weights:
-            raise ModelError(
-                f"{path}: made for another model ({one.weights}); delete it or run gaponet calibrate again"
-            )
-        found[one.unit_id] = one
-    return found

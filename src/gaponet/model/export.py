@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ from torch import nn
 
 from gaponet.arrays import Array
 from gaponet.errors import ModelError
-from gaponet.files import whole, writing
+from gaponet.files import whole, write_text, writing
 from gaponet.model import fused
-from gaponet.model.artifact import CARD, WEIGHTS, sha256, write_card
+from gaponet.model.artifact import CARD, WEIGHTS, sha256
 from gaponet.model.backends import TRUSTED, OnnxNetwork
 from gaponet.model.deeponet import build_network
 from gaponet.model.fuse import FusedNet, fuse
@@ -54,7 +55,8 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
             else:
                 (folder / fused.FILE).unlink(missing_ok=True)
         files = {name: sha256(folder / name) for name in (WEIGHTS, fused.FILE) if (folder / name).is_file()}
-        write_card(folder / CARD, card | {"parity_rad": difference, "sha256": files})
+        text = json.dumps(card | {"parity_rad": difference, "sha256": files}, indent=1, ensure_ascii=False)
+        write_text(folder / CARD, text + "\n")
         return difference
 
 

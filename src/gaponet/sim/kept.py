@@ -10,11 +10,6 @@ from gaponet.robot_folder import KEPT, keeps_robot, kept_robot
 from gaponet.sim.model import model_hash
 
 
-def nominal_of(robot: RobotSpec) -> RobotSpec:
-    """Before identification."""
-    return robot.nominal or robot
-
-
 def require_kept(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str) -> RobotSpec:
     """Refuse a robot whose nominal simulator is not that of the robot kept, whatever their names.
 
@@ -38,7 +33,7 @@ def require_kept(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint
 
 def require_same(own: RobotSpec, robot: RobotSpec, folder: Path, error: type[GAPONetError], use: str) -> RobotSpec:
     """Own, the robot in a folder; refused where it and the other one differ before identification."""
-    ours, theirs = model_hash(nominal_of(own)), model_hash(nominal_of(robot))
+    ours, theirs = model_hash(own.before_identification), model_hash(robot.before_identification)
     if ours != theirs:
         raise error(
             f"{folder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "

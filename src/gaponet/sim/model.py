@@ -16,7 +16,7 @@ from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.table import add_table, soften_table
 
 if TYPE_CHECKING:
-    from mujoco.batch import Batch
+    pass
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
@@ -77,12 +77,6 @@ def build_model(
 def stiffen_friction(model: mujoco.MjModel) -> None:
     """Make friction hold; once after each compilation or mj_setConst, which undo it."""
     model.dof_invweight0 *= STIFF_MOBILITY
-
-
-def loosen_friction(batch: Batch) -> None:
-    """Undo it in a batch's simulations: friction creeps with MuJoCo's own mobility and impedance."""
-    batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
-    batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
 
 
 def build_spec(

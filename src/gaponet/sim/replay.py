@@ -17,8 +17,8 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.executor import LOCAL, opened
 from gaponet.robot import RobotSpec
-from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.model import idle_joints, loosen_friction, model_hash
+from gaponet.sim.batch import Batch, BatchSim, Condition
+from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 
 Array = np.ndarray
 CHUNK = 256  # simulations side by side
@@ -140,9 +140,15 @@ def _free_run(
     robot = replace(robot, qpos_home=home)
     sim = BatchSim(robot, [Condition.of(s, robot) for s in sequences], nthread, locked)
     if creeps:
-        loosen_friction(sim.batch)
+        _loosen_friction(sim.batch)
     out = rollout(sim, sequences, corrector, progress)
     return [Twin(digest, *out[:, : len(s), i].astype(np.float32)) for i, s in enumerate(sequences)]
+
+
+def _loosen_friction(batch: Batch) -> None:
+    """Undo it in a batch's simulations: friction creeps with MuJoCo's own mobility and impedance."""
+    batch.expand("dof_invweight0")[:] /= STIFF_MOBILITY
+    batch.expand("dof_solimp")[:, :, :2] = LOOSE_IMPEDANCE
 
 
 def rollout(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.arrays import Array, copy_of, indices, library, like, rows_of, single, zeros_like
+from gaponet.arrays import Array, copy_of, indices, library, like, zeros_like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
@@ -155,11 +155,11 @@ class DeltaEnv:
         q, v = sim.qpos[:, self.at], sim.qvel[:, self.at]
         actor = copy_of(self.loop.observe(q, v, self.now[:, 2 * n :], self.payload))
         rows = library(self.row).minimum(self.row[:, None] + self.ahead, self.last[:, None])
-        ahead = rows_of(self.track, rows)  # (num_envs, rows ahead, 3n)
+        ahead = _rows_of(self.track, rows)  # (num_envs, rows ahead, 3n)
         # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
         seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
                 (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
-        critic = single(library(ahead).concatenate(seen, 1))
+        critic = _single(library(ahead).concatenate(seen, 1))
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
 
     def step(self, delta: Any) -> tuple[Any, Any]:
@@ -190,12 +190,12 @@ class DeltaEnv:
     def advance(self, delta: Any) -> None:
         """Step all simulations by one control period, without reward or reset; delta (num_envs, n_operated)."""
         at, n, target = self.at, self.sim, self.target
-        target[:] = rows_of(self.ctrl, self.row)
+        target[:] = _rows_of(self.ctrl, self.row)
         target[:, at] = (target[:, at] + n.array(delta)).clip(self.low, self.high)
         self.loop.push(n.qpos[:, at], n.qvel[:, at], target[:, at])
         n.step(target)
         self.row += 1
-        rows_of(self.track, self.row, out=self.now)
+        _rows_of(self.track, self.row, out=self.now)
         self.elapsed += 1
 
     def _reward(self) -> Any:
@@ -204,7 +204,7 @@ class DeltaEnv:
         cost = library(cost).nan_to_num(cost + self.unsaid)
         self.reward_sum = self.reward_sum - cost.mean()
         self.reward_count += 1
-        return -single(cost)
+        return -_single(cost)
 
     def mean_reward(self) -> float:
         """Per step, environment and joint since last asked."""
@@ -241,3 +241,15 @@ class DeltaEnv:
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]
         self.rng_state = state["rng"]
+
+
+def _rows_of(x: Any, rows: Any, out: Any = None) -> Any:
+    """x[rows], or the same written into out for rows (k,)."""
+    if isinstance(x, np.ndarray):
+        return x.take(rows, axis=0, out=out)  # quicker than an index
+    return x[rows] if out is None else library(x).index_select(x, 0, rows, out=out)
+
+
+def _single(x: Any) -> Any:
+    """As float32."""
+    return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()

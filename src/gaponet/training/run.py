@@ -25,12 +25,12 @@ import numpy as np
 import torch
 
 from gaponet.data.pair import require_disjoint
-from gaponet.data.sequence import require_same_gains
+from gaponet.data.sequence import SequenceMeta, require_same_gains
 from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
 from gaponet.files import write_text, writing
-from gaponet.model.artifact import GapModel, make_card, recorded_gains
+from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.baselines import delay_offset
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
@@ -149,7 +149,8 @@ class Trainer:
 
     def _fit_baseline(self) -> None:
         if self.baseline is None:
-            self.baseline = delay_offset.fit(self.train_set, self.robot.nominal or self.robot, self.own.threads)
+            robot = self.robot.before_identification
+            self.baseline = delay_offset.DelayOffset.fit(self.train_set, robot, self.own.threads)
         write_text(self.out / "delay_offset.json", json.dumps(self.baseline.to_json(), indent=1) + "\n")
 
     def _warm_start(self) -> None:
@@ -330,7 +331,7 @@ class Trainer:
             dt=sorted({s.dt for s in seen}),
             payload_seen=sorted({s.meta.payload_mass for s in seen}),
             units=sorted({s.meta.unit_id for s in seen}),
-            recorded=recorded_gains([s.meta for s in seen], self.robot),
+            recorded=_recorded_gains([s.meta for s in seen], self.robot),
             virtual=any(s.meta.virtual for s in seen),
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),
@@ -351,3 +352,15 @@ class Trainer:
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},
         )
+
+
+def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, list[float] | None]:
+    """kp, kd of the operated joints while the training data were recorded; None where unknown or not one and the same.
+
+    They are the real robot's; "kp" and "kd" of the card are the simulator's.
+    """
+    found: dict[str, list[float] | None] = {}
+    for name in ("kp", "kd"):
+        gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
+        found[name] = list(gains.pop()) if len(gains) == 1 else None
+    return found

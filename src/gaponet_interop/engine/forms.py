@@ -12,7 +12,7 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
-from gaponet.data.store import opened
+from gaponet.data.store import Dataset
 from gaponet.eval.candidate import read_origin
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.batch import Condition
@@ -33,7 +33,7 @@ def recordings_of(folder: Path, data: str | None, robot: RobotSpec) -> tuple[lis
         data = data if "://" in there or Path(data).is_dir() else None  # it may have moved away
     if data is None:
         return None
-    dataset = opened(data)
+    dataset = Dataset.opened(data)
     dataset.require_robot(robot)
     parts = split_entries(dataset, ())
     if origin is not None:

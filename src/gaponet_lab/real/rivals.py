@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
-from gaponet.model.baselines.delay_offset import fit as fit_delay_offset
+from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.robot import RobotSpec
 from gaponet.sim.free_runs import WINDOW
 from gaponet.sim.identify import Identified, identify
@@ -58,7 +58,7 @@ def nominal(question: Question) -> Answer:
 
 def delay_offset(question: Question) -> Answer:
     """A delay and an offset of each joint."""
-    return Answer(question.robot, fit_delay_offset(question.known, question.robot).corrector(question.robot))
+    return Answer(question.robot, DelayOffset.fit(question.known, question.robot).corrector(question.robot))
 
 
 def constant(question: Question) -> Answer:

@@ -12,7 +12,7 @@ from typing import Any
 
 from gaponet.data.json_file import write_json
 from gaponet.data.sequence import Sequence
-from gaponet.data.store import Dataset, opened
+from gaponet.data.store import Dataset
 from gaponet.eval.candidate import choose
 from gaponet.metrics import Run, runs, summary
 from gaponet.model.artifact import GapModel
@@ -28,7 +28,7 @@ def train_and_evaluate(cell: Cell, tell: Tell) -> None:
     """Train a cell and write its cell.json."""
     told = train_cell(cell, tell)
     tell(1.0, "evaluation")
-    found = evaluate_model(cell.folder, opened(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
+    found = evaluate_model(cell.folder, Dataset.opened(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
     start = "identified" if cell.robot.nominal is not None else "nominal"
     told |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
     write_json(cell.folder / RESULT, told | found)

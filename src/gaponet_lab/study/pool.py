@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.data.json_file import read_kept
-from gaponet.data.store import Dataset, dataset_hash, opened
+from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.executor import BEAT, Pool
 from gaponet.files import MARK, write_text, writing
@@ -135,7 +135,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)
     card = _card(cell.folder)
     if not card or card["interrupted"]:
-        data = opened(cell.dataset)
+        data = Dataset.opened(cell.dataset)
 
         def show(s: Status) -> None:
             tell(s.fraction, s.note)

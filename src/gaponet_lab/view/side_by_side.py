@@ -17,7 +17,6 @@ from gaponet.eval.candidate import Candidate, Seen
 from gaponet.methods import colour, title
 from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
-from gaponet.sim.kept import nominal_of
 from gaponet.sim.replay import Corrector, replay
 
 
@@ -126,7 +125,7 @@ def side_by_side(
     """
     dataset.require_robot(robot)
     real = dataset.read(entry)
-    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (nominal_of(robot), None)}
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (robot.before_identification, None)}
     if robot.nominal is not None:
         simulators["identified"] = (robot, None)
     for run in runs:

@@ -353,7 +353,8 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
     from gaponet.model.artifact import GapModel
 
     model = GapModel.load(asked.model)
-    known = calibration.load(model.path.parent if model.path.name == "model" else model.path, model.weights_hash())
+    folder = model.path.parent if model.path.name == "model" else model.path
+    known = calibration.Calibration.load(folder, model.weights_hash())
     if unit in known:
         screen.say(f"commands are found with the calibration of unit {unit}")
     elif known:

@@ -8,9 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding
-from gaponet.data.signals import averaged, following
-from gaponet.data.survey import Survey
+from gaponet.data.signals import following
+from gaponet.data.survey import HERTZ, Survey
 from gaponet.robot import RobotSpec
 
 FEW = 4  # recordings that say nothing of one among them
@@ -23,6 +24,7 @@ DEAD_TIMES = (
 )  # fmt: skip
 DRIFT, SURE = 3e-4, 5.0  # s a second, and standard errors
 NOTCH = 1.5  # depth, natural logarithm of power
+WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 GAP = 2.5  # periods without a sample
 
 
@@ -59,8 +61,8 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             found.append(Finding("warning", "lag", text, (name,), {"extra_s": float(late)}))
     found += _drift(same, told.shifts)
     asked, moved = np.mean([s.spectra for s in same], axis=0)
-    width, depth = averaged(moved)
-    if depth > NOTCH and averaged(asked, np.array([width]))[1] < depth / 3:  # steps at a regular pace have notches too
+    width, depth = _averaged(moved)
+    if depth > NOTCH and _averaged(asked, np.array([width]))[1] < depth / 3:  # steps at a regular pace have notches too
         text = (
             f"states never move at the multiples of {1 / width:.1f} Hz, as averages over {width * 1e3:.0f} ms: log the "
             "encoder itself; what is averaged is late, and fast motions are lost"
@@ -97,6 +99,24 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
             f"({abs(drift) * 1e6:.0f} ± {error * 1e6:.0f} ppm): the clocks of both drift apart; log them with one"
         )
         yield Finding("error", "clock", text, (), {"drift": drift})
+
+
+def _averaged(levels: Array, widths: Array = WIDTHS) -> tuple[float, float]:
+    """Width in s of the average that best explains notches at its multiples in `levels` (H), and how deep they are."""
+    best = (0.0, 0.0)
+    known = HERTZ[np.isfinite(levels)]
+    if not len(known):
+        return best
+    for width in widths:
+        depth = []
+        for k in range(1, 5):
+            if (k + 0.4) / width > known[-1]:
+                break
+            near = levels[np.abs(HERTZ - k / width) < max(0.11, 0.012 * k / width)].min()
+            depth.append(np.interp([(k - 0.35) / width, (k + 0.35) / width], HERTZ, levels).mean() - near)
+        if depth and min(depth) > best[1]:
+            best = (float(width), float(min(depth)))
+    return best
 
 
 CHECKS = (_timing,)

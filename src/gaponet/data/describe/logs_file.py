@@ -95,15 +95,13 @@ class LogsFile(TypedDict, total=False):
     clock: dict[str, str]
 
 
-def find_file(src: Path) -> Path | None:
-    """logs.toml in the folder of the logs, or beside the file."""
-    place = (src if src.is_dir() else src.parent) / NAME
-    return place if place.is_file() else None
-
-
-def read_logs_file(file: Path) -> LogsFile:
-    """What a logs.toml says."""
-    return read_toml(LogsFile, file, UsageError, f"docs/data-format.md lists the fields; {HINT}")
+def read_logs_file(src: Path, given: str | Path | None = None) -> tuple[LogsFile, Path | None]:
+    """What logs.toml says, the given one or that in the folder of the logs or beside the file; and where it lies."""
+    beside = (src if src.is_dir() else src.parent) / NAME
+    file = Path(given) if given is not None else beside if beside.is_file() else None
+    if file is None:
+        return LogsFile(), None
+    return read_toml(LogsFile, file, UsageError, f"docs/data-format.md lists the fields; {HINT}"), file
 
 
 class Naming:

@@ -31,7 +31,7 @@ from typing import Any, cast
 import numpy as np
 
 from gaponet.data.describe.limits import refuse_absurd
-from gaponet.data.describe.logs_file import LogsFile, Naming, find_file, read_logs_file
+from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.recording import COMMAND, Recording
 from gaponet.data.log import Channel, Log, skipped
 from gaponet.errors import LogError, UsageError
@@ -87,7 +87,7 @@ def detect(path: Path) -> str:
 
 def find_logs(path: Path, fmt: str | None = None) -> list[Path]:
     """The recordings under a path, without reading them."""
-    return cast("list[Path]", _reader(path, fmt or _described(path, None)[0].get("format")).find(path))
+    return cast("list[Path]", _reader(path, fmt or read_logs_file(path)[0].get("format")).find(path))
 
 
 def read_logs(
@@ -120,7 +120,7 @@ def read_logs(
     Raises:
         LogError, JointMismatchError, UsageError: What, where and what to do.
     """
-    told, file = _described(path, logs)
+    told, file = read_logs_file(path, logs)
     reader = _reader(path, fmt or told.get("format"))
     by_hand = {"position_unit": position_unit, "time_unit": time_unit, "rate": rate}
     told = told | {k: v for k, v in by_hand.items() if v is not None}  # type: ignore[assignment]
@@ -153,7 +153,7 @@ def look(
     path: Path, fmt: str | None = None, logs: str | Path | None = None, allow_pickle: bool = False
 ) -> tuple[str, LogsFile, list[Recording]]:
     """The format, what is said of it already, and the first recordings as they lie there; arguments as of read_logs."""
-    told, _ = _described(path, logs)
+    told, _ = read_logs_file(path, logs)
     reader = _reader(path, fmt or told.get("format"))
     kind = _require_allowed(reader, path, allow_pickle)
     if not hasattr(reader, "recordings"):
@@ -170,11 +170,6 @@ def _require_allowed(reader: ModuleType, path: Path, allow_pickle: bool) -> str:
             "an unpickler that makes arrays, numbers and text only"
         )
     return kind
-
-
-def _described(path: Path, logs: str | Path | None) -> tuple[LogsFile, Path | None]:
-    file = Path(logs) if logs is not None else find_file(path)
-    return (read_logs_file(file) if file else LogsFile()), file
 
 
 def _reader(path: Path, fmt: str | None) -> ModuleType:

@@ -45,6 +45,37 @@ class DelayOffset:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    @classmethod
+    def fit(
+        cls, sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None
+    ) -> DelayOffset:
+        """Try every whole-step delay on all joints at once; keep each joint's with the least error after its offset.
+
+        Joints are fitted as if alone; their coupling is small beside delay and sag.
+        """
+        part = pieces(sequences)
+        op, names = robot.operated_index, robot.operated
+        dt = float(np.median([s.dt for s in part]))
+        delays = dt * np.arange(int(MAX_DELAY / dt) + 1)
+        error, offset = np.empty((len(delays), len(op))), np.empty((len(delays), len(op)))
+        zero = dict.fromkeys(names, 0.0)
+        for i, delay in enumerate(delays):
+            candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
+            twins = replay(part, robot, candidate.corrector(robot), nthread, lock_idle=True)
+            for k, (j, name) in enumerate(zip(op, names, strict=True)):
+                both = zip(part, twins, strict=True)
+                mine = [(s.qpos - t.qpos)[1:, j] for s, t in both if name not in s.meta.unrecorded]
+                e = np.concatenate(mine or [np.zeros(1)])
+                offset[i, k] = np.median(e)
+                error[i, k] = np.abs(e - offset[i, k]).mean()
+            if progress:
+                progress(i + 1, len(delays))
+        best = error.argmin(axis=0)
+        return DelayOffset(
+            {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},
+            {j: round(float(offset[best[k], k]), 6) for k, j in enumerate(names)},
+        )
+
 
 class _DelayOffsetCorrector:
     """Delays targets and adds the offset; before the first command, the first command."""
@@ -84,33 +115,3 @@ def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FR
         for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
             cut.append(s.rows(slice(start, start + rows)))
     return cut[:: max(1, round(sum(map(len, cut)) / frames))]
-
-
-def fit(
-    sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0, progress: Progress | None = None
-) -> DelayOffset:
-    """Try every whole-step delay on all joints at once; per joint keep the one with the least error after its offset.
-
-    Joints are fitted as if alone; their coupling is small beside delay and sag.
-    """
-    part = pieces(sequences)
-    op, names = robot.operated_index, robot.operated
-    dt = float(np.median([s.dt for s in part]))
-    delays = dt * np.arange(int(MAX_DELAY / dt) + 1)
-    error, offset = np.empty((len(delays), len(op))), np.empty((len(delays), len(op)))
-    zero = dict.fromkeys(names, 0.0)
-    for i, delay in enumerate(delays):
-        candidate = DelayOffset(dict.fromkeys(names, float(delay)), zero)
-        twins = replay(part, robot, candidate.corrector(robot), nthread, lock_idle=True)
-        for k, (j, name) in enumerate(zip(op, names, strict=True)):
-            mine = [(s.qpos - t.qpos)[1:, j] for s, t in zip(part, twins, strict=True) if name not in s.meta.unrecorded]
-            e = np.concatenate(mine or [np.zeros(1)])
-            offset[i, k] = np.median(e)
-            error[i, k] = np.abs(e - offset[i, k]).mean()
-        if progress:
-            progress(i + 1, len(delays))
-    best = error.argmin(axis=0)
-    return DelayOffset(
-        {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},
-        {j: round(float(offset[best[k], k]), 6) for k, j in enumerate(names)},
-    )

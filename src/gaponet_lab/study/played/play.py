@@ -13,7 +13,6 @@ from gaponet.arrays import Array
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
-from gaponet.sim.kept import nominal_of
 from gaponet.sim.model import idle_joints, model_hash
 from gaponet_lab.study.played.trained import Trained
 from gaponet_robots.virtual.physics import Physics
@@ -75,7 +74,7 @@ class Played:
 def compensations(robot: RobotSpec, trained: ListOf[Trained]) -> Iterable[tuple[str, int | None, Driven | None]]:
     """Ways to drive the robot: raw; by what is known of it alone, nominal and identified; and through each model."""
     yield "raw", None, None
-    yield "feedforward", None, Driven(None, nominal_of(robot), PLANNED)
+    yield "feedforward", None, Driven(None, robot.before_identification, PLANNED)
     for fitted in [t.robot for t in trained if t.robot.nominal is not None][:1]:
         yield "identified feedforward", None, Driven(None, fitted, PLANNED)
     for t in trained:
