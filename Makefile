@@ -103,7 +103,7 @@ check: setup
 
 # What is promised on Windows: from logs to a report.
 windows: setup
-	$(BIN)/python -m pytest tests/test_api.py tests/test_files.py tests/test_windows.py tests/data tests/sim tests/model tests/training tests/eval
+	$(BIN)/python -m pytest tests/test_api.py tests/test_files.py tests/whole/test_windows.py tests/data tests/sim tests/model tests/training tests/eval
 
 # These three need the package index, and uv from it in .tools.
 .tools/.done:

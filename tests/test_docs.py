@@ -87,7 +87,7 @@ def test_the_api_page_describes_every_public_name_where_it_lives():
     )
     homes = {path.rpartition(".")[2]: path.rpartition(".")[0] for path in described}
     assert len(homes) == len(described)
-    assert {name: getattr(gp, name).__module__ for name in set(gp.__all__) - {"__version__"}} == {
+    assert {name: getattr(gp, name).__module__ for name in set(dir(gp)) - {"__version__"}} == {
         name: home for name, home in homes.items() if name != "TrainConfig"
     }
 

@@ -35,18 +35,27 @@ _HOMES = {  # name → module
     "AlignedSim": "gaponet.deploy.aligned_sim",
     "MujocoAligner": "gaponet.deploy.mujoco_loop",
     "Compensator": "gaponet.deploy.compensator",
-    "Controller": "gaponet_robots.control.controller",
-    "RemoteRobot": "gaponet_robots.targets.client",
 }
 __all__ = ["GAPONetError", "__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for (PEP 562)."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_HOMES)}")
-    return getattr(import_module(_HOMES[name]), name)
+    """A public name, imported when it is first asked for (PEP 562); parts bring more (NAMES, gaponet.parts)."""
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    if not name.startswith("_") and name in (more := _of_parts()):
+        from gaponet.parts import named
+
+        return named(more[name])
+    offers = ", ".join([*_HOMES, *_of_parts()])
+    raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {offers}")
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, *_of_parts()]
+
+
+def _of_parts() -> dict[str, str]:
+    from gaponet.parts import offered
+
+    return offered("NAMES")

@@ -5,6 +5,7 @@ imports nothing and holds tables of text, name → "module:attribute"; a module 
 
     COMMANDS   gaponet NAME                              FORMATS   readers of logs (gaponet.data.formats)
     PROVIDES   what core's commands use if it is there   WRITERS   datasets in others' formats (gaponet.data.writers)
+    NAMES      names of `import gaponet as gp`
 
 The four parts of this repository are one distribution; somebody else's package takes part in the same way.
 """

@@ -8,3 +8,7 @@ PROVIDES = {
     "listening to a robot": "gaponet_robots.cli.link:listen",
     "motions": "gaponet_robots.motion.library:Library",
 }
+NAMES = {
+    "Controller": "gaponet_robots.control.controller:Controller",
+    "RemoteRobot": "gaponet_robots.targets.client:RemoteRobot",
+}
