@@ -18,7 +18,7 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 
 def export(
     robot: Holder,
-    to: Literal["onnx", "torch", "mjcf", "mjlab", "isaaclab", "newton", "json"] = "onnx",
+    to: Literal["onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "json"] = "onnx",
     out: Path | None = None,
     data: str | None = None,
     into: Path | None = None,
@@ -30,13 +30,15 @@ def export(
 
     Args:
         to: Of a robot or of a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
-            no gaponet; isaaclab; json (the numbers). Of a run: onnx (model.onnx, weights.npz and card.json) and torch
-            (delta.pt2 with simulator and action term for mjlab and Isaac Lab).
+            no gaponet; isaaclab; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a run: onnx
+            (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for mjlab and
+            Isaac Lab).
         out: Folder; default one with that name in the robot or run, for onnx the run's model folder.
         data: Dataset on which a servo law's nearest plain servos are fitted, and every form is judged; default the one
             that the robot was identified from, and without any what the robot itself answers.
-        into: For mjcf: an MJCF of your own; a copy of it is edited in place of names (default the robot's).
-        prefix: What that MJCF has before each joint's name.
+        into: For mjcf and urdf: a file of your own; a copy of it is edited in place of names (mjcf: default the
+            robot's).
+        prefix: What that file has before each joint's name.
         payload_mass: kg in each hand.
     """
     screen = Out(json)

@@ -121,7 +121,8 @@ class Source:
             f"  <{name}>\n{text}  </{name}>\n" if text else f"  <{name}/>\n" for name, text in self.last.items()
         )
         edits = [*self.edits, (self.main, place, place, ends.encode())]
-        for _, (file, start, end, new) in sorted(enumerate(edits), key=lambda e: (-e[1][1], -e[0])):
+        # From the back; where something is put right before an element that changes, the element comes first.
+        for _, (file, start, end, new) in sorted(enumerate(edits), key=lambda e: (-e[1][1], e[1][1] == e[1][2], -e[0])):
             out[file] = out[file][:start] + new + out[file][end:]
         return out
 
@@ -174,25 +175,25 @@ def edit_mjcf(
         drives = source.one(f"servos of '{full}'", partial(_drives, joint=full))
         if drives is not None and name not in robot.operated:
             continue
-        changed = {f: _text(servo[f]) for f in PLAIN_FIELDS}
+        changed = {f: text_of(servo[f]) for f in PLAIN_FIELDS}
         if servo["zero"]:
             ref = before.qpos0[before.joint(full).qposadr[0]] - servo["zero"]
-            changed["ref"] = _text(math.degrees(ref) if spec.compiler.degree else ref)
-        changed |= {"solreffriction": _text(*STIFF_SOLREF), "solimpfriction": _text(*STIFF_SOLIMP)}
+            changed["ref"] = text_of(math.degrees(ref) if spec.compiler.degree else ref)
+        changed |= {"solreffriction": text_of(*STIFF_SOLREF), "solimpfriction": text_of(*STIFF_SOLIMP)}
         source.set(tag, **changed)
         samples = math.ceil(longest[name] / before.opt.timestep - 1e-9) + 2 if longest[name] else 0
         if drives is not None:
             source.replace(drives, _servo(servo, samples, _kept(drives, before, full)))
         else:
             source.append("actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n")
-            added.append(_text(servo["home"]))
+            added.append(text_of(servo["home"]))
     for key in source.tags if added else ():
         if key.name == "key" and "ctrl" in key.attributes:
             source.set(key, ctrl=" ".join([key.attributes["ctrl"], *added]))
     _surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
     _require(compiled(read_mjcf(target), target), before, joints, robot, prefix, target)
-    return target, _difference(source)
+    return target, difference(source)
 
 
 def _is_joint(tag: Tag, name: str) -> bool:
@@ -208,11 +209,11 @@ def _servo(servo: dict[str, float], samples: int, kept: dict[str, str]) -> str:
     kp, kd, limit = servo["kp"], servo["kd"], servo["effort_limit"]
     bias = kp * servo["offset"]
     attributes = kept | {
-        "gear": "1", "dyntype": "none", "gaintype": "fixed", "gainprm": _text(kp), "biastype": "affine",
-        "biasprm": _text(bias, -kp, -kd), "forcelimited": "true", "forcerange": _text(-limit, limit),
+        "gear": "1", "dyntype": "none", "gaintype": "fixed", "gainprm": text_of(kp), "biastype": "affine",
+        "biasprm": text_of(bias, -kp, -kd), "forcelimited": "true", "forcerange": text_of(-limit, limit),
     }  # fmt: skip
     if samples:
-        attributes |= {"delay": _text(servo["delay"]), "nsample": str(samples), "interp": "linear"}
+        attributes |= {"delay": text_of(servo["delay"]), "nsample": str(samples), "interp": "linear"}
     return "<general " + " ".join(f'{k}="{v}"' for k, v in attributes.items()) + "/>"
 
 
@@ -221,13 +222,13 @@ def _kept(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
     kept = {k: tag.attributes[k] for k in KEPT_OF_SERVO if k in tag.attributes} | {"joint": joint}
     i = int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
     if model.actuator_ctrllimited[i] and model.actuator_biasprm[i, 1]:
-        return kept | {"ctrllimited": "true", "ctrlrange": _text(*model.actuator_ctrlrange[i])}
+        return kept | {"ctrllimited": "true", "ctrlrange": text_of(*model.actuator_ctrlrange[i])}
     return kept | {"ctrllimited": "false"}
 
 
 def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel) -> None:
     """The solver's tolerance, the table and the payload."""
-    option = {"tolerance": _text(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
+    option = {"tolerance": text_of(TOLERANCE)} if model.opt.tolerance > TOLERANCE else {}
 
     def body(name: str, what: str) -> Tag:
         found = source.one(f"bodies '{name}'", lambda t: t.name == "body" and t.attributes.get("name") == name)
@@ -242,20 +243,20 @@ def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: f
         if off:  # nothing in the file would touch anything but for the pairs below
             source.append("option", '    <flag contact="enable"/>\n')
         source.append("worldbody", f'    <geom name="{table}" type="plane" size="2 2 0.1" contype="0" conaffinity="0" '
-                      f'pos="0 0 {_text(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>\n')  # fmt: skip
+                      f'pos="0 0 {text_of(robot.table.height)}" rgba="0.55 0.5 0.45 1"/>\n')  # fmt: skip
         for i, tip in enumerate(robot.tips):
-            name, size = f"{table}_tip_{i}", _text(tip.radius)
+            name, size = f"{table}_tip_{i}", text_of(tip.radius)
             source.insert(body(prefix + tip.body, "tip"), f'<geom name="{name}" type="sphere" size="{size}"'
-                          f' pos="{_text(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
-            figures = {f: _text(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")}
+                          f' pos="{text_of(*tip.pos)}" mass="0" contype="0" conaffinity="0" group="3"/>')  # fmt: skip
+            figures = {f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")}
             words = " ".join(f'{k}="{v}"' for k, v in figures.items())
             source.append("contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n')
     if payload_mass:
         radius = (3 * payload_mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
         for mount in robot.payload_mounts:
+            ball = f'<geom type="sphere" size="{text_of(radius)}" mass="{payload_mass}" contype="0" conaffinity="0"/>'
             source.insert(body(prefix + mount.body, "payload_mount"), f'<body name="{prefix}payload_{mount.side}" '
-                          f'pos="{_text(*mount.pos)}"><geom type="sphere" size="{_text(radius)}" mass="{payload_mass}" '
-                          'contype="0" conaffinity="0"/></body>')  # fmt: skip
+                          f'pos="{text_of(*mount.pos)}">{ball}</body>')  # fmt: skip
     if option:
         words = " ".join(f'{k}="{v}"' for k, v in option.items())
         source.append(f"option {words}", "")
@@ -295,7 +296,7 @@ def _require(
         raise RobotError(f"{path}: the edited copy is not what was wanted: {'; '.join(wrong[:3])}")
 
 
-def _difference(source: Source) -> str:
+def difference(source: Source) -> str:
     edited, lines = source.edited(), list[str]()
     for file, old in source.text.items():
         a, b = (text.decode("utf-8").splitlines(keepends=True) for text in (old, edited[file]))
@@ -303,5 +304,5 @@ def _difference(source: Source) -> str:
     return "".join(lines)
 
 
-def _text(*figures: float) -> str:
+def text_of(*figures: float) -> str:
     return " ".join(f"{float(x):.9g}" for x in figures)

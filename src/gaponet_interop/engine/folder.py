@@ -24,12 +24,13 @@ from gaponet.sim import servo
 from gaponet_interop.engine import mujoco_servos
 from gaponet_interop.engine.configs import CONFIGS
 from gaponet_interop.engine.edit import edit_mjcf
+from gaponet_interop.engine.edit_urdf import LOST, edit_urdf, tags_alone
 from gaponet_interop.engine.facts import mjcf_text, simulator_facts
 from gaponet_interop.engine.forms import check_motions, comparable, left, mean_error, own_motions, plain_form
 
 KIND = "engine"
 FACTS, ROBOT, TERM, CHECK = "facts.json", "robot.xml", "gaponet_action.py", "check.npz"
-ENGINES = ("mjcf", "mjlab", "isaaclab", "newton", "json")
+ENGINES = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
 CHECKS = {
     "mjcf": {"check.py": "mjcf.py", "check_mjx.py": "mjx.py"},
     "mjlab": {"check.py": "mjlab.py"},
@@ -84,7 +85,7 @@ def export_robot(
         to: Engine.
         out: Folder.
         recordings: Training and validation motions; default: what the robot itself answers to motions of the library.
-        source: For mjcf, a file of the user's own that is edited in a copy; default the robot's.
+        source: For mjcf and urdf, a file of the user's own that is edited in a copy; for mjcf by default the robot's.
         prefix: What that file has before each joint's name.
         payload_mass: In each hand, kg.
         progress: Of the fit without a law, as in identification.
@@ -117,6 +118,13 @@ def export_robot(
             for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
                 if form == "plain" or robot.has_law:
                     prices[f"{file.name} {what}"] = _played(file, facts, judging, robot, form)
+        elif to == "urdf":
+            if source is None:
+                raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf, or .sdf")
+            file, changes = edit_urdf(source, out, facts["plain"], robot.operated, prefix)
+            facts["file"] = file.name
+            write_text(out / "changes.diff", changes)
+            prices[f"{file.name} alone, all else as before"] = left(judging, tags_alone(plain))
         elif to != "json":
             file = out / ROBOT
             _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
@@ -142,7 +150,13 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:
                  "mjcf": ["delays need MuJoCo 3.5; MJX and Newton drop them without a word: check_mjx.py has a buffer"],
                  "isaaclab": ["robot_cfg.py rounds delays to physics steps; the action term does not"],
                  "mjlab": ["robot_cfg.py rounds delays to physics steps; robot.xml does not"]}.get(to, [])  # fmt: skip
-    if facts["law"] and to in ("isaaclab", "newton"):
+    if to == "urdf":
+        lost = [f for f in LOST if any(s[f] for s in facts["plain"].values())]
+        told.append(
+            f"{facts['file']} has no place for {', '.join(lost)}: they stand in facts.json (plain), kp and kd for your "
+            "controller; files that it names stay where they were"
+        )
+    if facts["law"] and to in ("isaaclab", "newton", "urdf"):
         told.append(f"the servos' law ({', '.join(facts['law'])}) is not in {to}: the numbers were fitted without it")
     return tuple(told)
 

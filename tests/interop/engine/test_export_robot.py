@@ -1,6 +1,7 @@
 """A robot leaves: a user's own MJCF with identified servos, the law beside it, and a check that needs no gaponet."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,6 +14,7 @@ from arm import write_arm
 from gaponet.cli.main import main
 from gaponet.errors import RobotError
 from gaponet.robot import LAW
+from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet_interop.engine import folder as exporting
 from gaponet_interop.engine.facts import simulator_facts
@@ -162,6 +164,36 @@ def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_name
     assert model.actuator_gainprm[:, 0].tolist() == [16.0, 24.0, 16.0, 24.0]
     with pytest.raises(RobotError, match=r"no joint 'shoulder' in its text \(--prefix"):
         export_robot(robot, "mjcf", tmp_path / "none", source=scene)
+
+
+def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path):
+    text = re.sub(r">\s+<", "><", robot.mjcf.read_text().strip())
+    scene = tmp_path / "scene.xml"
+    scene.write_text(text.replace("<option ", '<option timestep="0.005" '))
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=scene, payload_mass=0.2)
+    assert '"/></body><joint' in made.file.read_text().replace("\n", "")
+    model, own = mujoco.MjModel.from_xml_path(str(made.file)), build_model(robot, 0.2)
+    assert model.body_mass.sum() == pytest.approx(own.body_mass.sum())
+    assert model.dof_armature.tolist() == own.dof_armature.tolist()
+    assert made.left["scene.xml alone"] < 2e-5
+
+
+def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path, quick):
+    free = 'type="capsule" size=".1 .1" mass=".3" contype="0" conaffinity="0"'
+    other = f'<body name="other"><joint name="elbow_of_another" axis="0 1 0"/><geom {free}/></body>'
+    servos = [("a", "elbow", 3), ("z", "elbow_of_another", 7), ("b", "shoulder", 5)]
+    drives = "".join(f'<position name="{name}" joint="{joint}" kp="{kp}"/>' for name, joint, kp in servos)
+    text = lawful.mjcf.read_text().replace("<option ", '<option timestep="0.005" ')
+    text = text.replace("<worldbody>", f"<worldbody>{other}").replace(
+        "</mujoco>", f"<actuator>{drives}</actuator></mujoco>"
+    )
+    scene = tmp_path / "scene.xml"
+    scene.write_text(text)
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=scene)
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert [model.actuator(i).name for i in range(3)] == ["a", "z", "b"]
+    assert model.actuator_gainprm[:, 0].tolist() == [24.0, 7.0, 16.0]
+    assert made.left["scene.xml with servo_law.py"] < 2e-5
 
 
 def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):
