@@ -22,7 +22,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.metrics import horizon, runs, standard_error
+from gaponet.metrics import runs, standard_error, summary
 from gaponet.robot import RobotSpec, Table, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import Identified, identify
@@ -86,7 +86,7 @@ def rows(simulators: dict[str, RobotSpec], sequences: list[Sequence]) -> list[di
             "low": float(np.concatenate([x[m] for x, m in zip(size, low, strict=True)]).mean()),
             "free": float(np.concatenate([x[~m] for x, m in zip(size, low, strict=True)]).mean()),
             "joints": dict(zip(robot.operated, np.mean([x.mean(axis=0) for x in size], axis=0).tolist(), strict=True)),
-            "horizon": {k: 1e3 * v["mpjae"] for k, v in horizon(done).items()},
+            "horizon": {k: 1e3 * v["mpjae"] for k, v in summary(done, robot)["by_horizon"].items()},
             "motions": dict(zip((s.meta.motion for s in sequences), motions.tolist(), strict=True)),
         })  # fmt: skip
         print(json.dumps(out[-1]), flush=True)

@@ -24,16 +24,18 @@ import numpy as np
 from publish import publish, say
 from virtual_h1_2 import CONFIG, PPO, RECIPE, UNIT, WORD, Bench, run
 
-from gaponet.data.json_file import read_kept, write_json
+from gaponet.data.json_file import write_json
 from gaponet.data.store import Dataset
-from gaponet.methods import METHODS, colour
+from gaponet.methods import METHODS
 from gaponet.metrics import standard_error
 from gaponet.robot import load_robot
 from gaponet.sim.identify import DEFAULT_TERMS
 from gaponet.spread import Spread, Table
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.kept import PROGRESS
+from gaponet_lab.kept import read_kept
 from gaponet_lab.plot.charts import lines
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.study.compare import identified
 from gaponet_lab.study.found import Found, train_all
 from gaponet_lab.study.pool import RESULT, SETUP, Cell

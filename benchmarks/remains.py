@@ -22,7 +22,6 @@ from virtual_h1_2 import RECIPE, UNIT, Bench, by_motion
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.eval.whose import label
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
 from gaponet.model.calibration import Calibration, recordings
@@ -32,6 +31,7 @@ from gaponet.sim.refit import refit
 from gaponet.sim.replay import Corrector
 from gaponet.spread import Table
 from gaponet_lab.study.result import Result, facts
+from gaponet_lab.whose import label
 from gaponet_robots.motion.recipe import Take, load_recipe
 from gaponet_robots.virtual.fleet import Fleet, load_fleet
 from gaponet_robots.virtual.physics import Physics

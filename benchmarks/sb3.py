@@ -30,7 +30,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.layers import dense, size
 from gaponet.model.loop import DeltaLoop
-from gaponet.model.observation import frames_before
+from gaponet.model.observation import History
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
@@ -242,7 +242,7 @@ class SingleEnv(gymnasium.Env):
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = self.motion.qpos[self.row, self.free]
         self.data.qvel[:] = self.motion.qvel[self.row, self.free]
-        before, op = frames_before(np.array([self.row]), self.loop.history.depth), self.robot.operated_index
+        before, op = History.rows_before(np.array([self.row]), self.loop.history.depth), self.robot.operated_index
         self.loop.begin(
             slice(None), *(x[before][..., op] for x in (self.motion.qpos, self.motion.qvel, self.motion.ctrl))
         )

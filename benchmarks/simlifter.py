@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.data.json_file import read_kept, write_json
+from gaponet.data.json_file import write_json
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.model.config import ModelConfig
@@ -34,6 +34,7 @@ from gaponet.robot import load_robot
 from gaponet.sim.model import model_hash
 from gaponet.training.config import RewardConfig
 from gaponet.training.env import DeltaEnv
+from gaponet_lab.kept import read_kept
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"
 FIGURES = ("composition", "joint_ranges", "torque_temperature", "real_and_twin", "gap_by_payload")

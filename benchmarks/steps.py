@@ -23,15 +23,16 @@ import numpy as np
 from ppo import real
 from publish import publish, say
 
-from gaponet.data.json_file import read_kept
 from gaponet.data.split import split_entries, spread
-from gaponet.methods import METHODS, colour, shade
+from gaponet.methods import METHODS
 from gaponet.metrics import metrics, runs, standard_error
 from gaponet.sim.replay import replay
 from gaponet.spread import Spread, Table
 from gaponet.training.kept import PROGRESS
 from gaponet.training.run import VALIDATION_RUNS
+from gaponet_lab.kept import read_kept
 from gaponet_lab.plot.charts import lines
+from gaponet_lab.plot.colours import colour, shade
 from gaponet_lab.study.found import baselines, train_all
 from gaponet_lab.study.pool import RESULT, Cell
 from gaponet_lab.study.result import Result, facts

@@ -30,7 +30,6 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.methods import shade
 from gaponet.metrics import metrics, runs, standard_error
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
@@ -46,6 +45,7 @@ from gaponet.sim.replay import Corrector, replay
 from gaponet.spread import Spread, Table
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 from gaponet_lab.plot.charts import bars
+from gaponet_lab.plot.colours import shade
 from gaponet_lab.study.found import Found, answer
 from gaponet_lab.study.pool import Cell
 from gaponet_lab.study.result import Result

@@ -5,7 +5,6 @@ A method is a key of METHODS, or a word of study.variant: [identified+]KIND[:FIE
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -40,7 +39,6 @@ METHODS = {  # name, colour
     "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
     "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),
 }
-OTHER = "#777777"
 SAID = {"mlp_match=on": "as many weights", "payload_input=off": "mass not told"}
 IDENTIFIED = "identified+"  # in front of the kind of a model that corrects an identified simulator
 
@@ -57,26 +55,3 @@ def title(method: str) -> str:
     name = ", ".join([start + METHODS.get(kind, (kind,))[0], *(SAID[c] for c in changes if c in SAID)])
     others = ", ".join(c.replace("=", " ") for c in changes if c not in SAID)
     return f"{name} ({others})" if others else name
-
-
-def colour(method: str) -> str:
-    """The colour of the method's kind, #rrggbb, darker where it corrects an identified simulator."""
-    base = METHODS.get(method.removeprefix(IDENTIFIED).split(":")[0], ("", OTHER))[1]
-    return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
-
-
-def palette(methods: Iterable[str]) -> dict[str, str]:
-    """A colour for each method; several models of one kind are shades of its colour."""
-    out: dict[str, str] = {}
-    for method in methods:
-        base = colour(method)
-        before = sum(colour(other) == base for other in out)
-        out[method] = shade(base, 1 - 0.62**before)
-    return out
-
-
-def shade(base: str, light: float) -> str:
-    """A colour, #rrggbb, brought nearer to white by this share, or nearer to black where it is negative."""
-    end = 255 if light > 0 else 0
-    parts = (int(base[i : i + 2], 16) for i in (1, 3, 5))
-    return "#" + "".join(f"{round(p + (end - p) * abs(light)):02x}" for p in parts)

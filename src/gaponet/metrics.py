@@ -67,7 +67,7 @@ def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
         "by_motion": by(lambda r: r.meta.motion),
         "by_payload": by(lambda r: f"{r.meta.payload_mass:g}"),
         "by_unit": by(lambda r: r.meta.unit_id),
-        "by_horizon": horizon(part),
+        "by_horizon": _horizon(part),
     }
 
 
@@ -126,7 +126,7 @@ def _mean_correlation(real: Array, sim: Array) -> float:
     return float(np.mean(values)) if values else 1.0
 
 
-def horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
+def _horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
     """mpjae at a time after the common start, averaged over sequences that last so long; and over the whole motion.
 
     The error at a horizon is that of the steps in its last half, so that one frame does not decide.

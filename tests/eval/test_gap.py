@@ -8,7 +8,7 @@ import pytest
 from arm import recordings, write_arm
 from runs import untrained
 
-from gaponet.data.repeatability import periods
+from gaponet.data.repeatability import Repetitions
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
 from gaponet.eval.candidate import Candidate
@@ -104,11 +104,11 @@ def test_a_motion_that_repeats_itself_tells_repeatability(tmp_path):
     qpos = np.concatenate([np.tile(once.qpos, (5, 1))[:270] + noise, once.qpos[:1]])
     thrice = replace(once, ctrl=np.tile(once.ctrl, (5, 1))[:270], qpos=qpos[:270].astype(np.float32),
                      qvel=np.zeros((270, 2), np.float32))  # fmt: skip
-    assert [len(p) for p in periods(thrice)] == [60, 60, 60]  # without the first, and the last is not whole
+    assert [len(p) for p in Repetitions.periods(thrice)] == [60, 60, 60]  # without the first, and the last is not whole
     for joint in floor([thrice], robot).values():
         assert joint["repeatability"] == pytest.approx(0.002 * np.sqrt(2 / np.pi), rel=0.1)
-    assert not periods(once)
-    assert not periods(replace(thrice, ctrl=np.concatenate([thrice.ctrl[:-1], start])))
+    assert not Repetitions.periods(once)
+    assert not Repetitions.periods(replace(thrice, ctrl=np.concatenate([thrice.ctrl[:-1], start])))
 
 
 def test_friction_creeps_where_it_is_asked_to(tmp_path):

@@ -6,7 +6,7 @@ import torch
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.loop import DeltaLoop
-from gaponet.model.observation import History, Layout, frames_before
+from gaponet.model.observation import History, Layout
 from gaponet.robot import load_robot
 
 
@@ -78,4 +78,4 @@ def test_history_is_what_a_list_of_past_frames_says_whatever_is_pushed_and_reset
 
 
 def test_history_at_the_start_is_the_first_frame_repeated():
-    assert frames_before(np.array([0, 2]), 3).tolist() == [[0, 0, 0], [1, 0, 0]]
+    assert History.rows_before(np.array([0, 2]), 3).tolist() == [[0, 0, 0], [1, 0, 0]]

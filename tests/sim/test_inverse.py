@@ -5,7 +5,7 @@ import pytest
 from arm import TOML, XML, commands, record, write_arm
 
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Inertia, Period, within
+from gaponet.sim.inverse import ClosedForm, Inertia, Period
 from gaponet.sim.model import build_model
 from gaponet.training.inverse import inverse_targets
 
@@ -52,7 +52,7 @@ def test_positions_and_speeds_within_a_period_of_parabolic_speeds(count):
     speed = 0.3 + 0.2 * i - 0.03 * i**2
     position = np.concatenate([[0.0], np.cumsum(h * speed[1:])])
     known = np.array([h * speed[0], h * speed[-1], position[-1]])
-    before, speeds = (weights @ known for weights in within(count, 12))
+    before, speeds = (weights @ known for weights in ClosedForm.within(count, 12))
     np.testing.assert_allclose(before[:count], position[:-1], atol=1e-12)
     np.testing.assert_allclose(speeds[: count + 1] / h, speed, atol=1e-12)
 

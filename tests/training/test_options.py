@@ -1,7 +1,7 @@
 """A run's command says its configuration, and a shell that types it trains the same."""
 
 import shlex
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import pytest
 
@@ -9,7 +9,7 @@ from gaponet import api
 from gaponet.cli.main import main
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig, fast, options
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
@@ -18,7 +18,7 @@ CHANGED = TrainConfig(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("config", [TrainConfig(), CHANGED, fast(replace(TrainConfig(), seed=9))])
+@pytest.mark.parametrize("config", [TrainConfig(), CHANGED, replace(TrainConfig(), seed=9).fast()])
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []
 
@@ -27,6 +27,6 @@ def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
         raise UsageError("heard")
 
     monkeypatch.setattr(api, "train", train)
-    words = shlex.split(shlex.join(["train", "data", "--out", "run", *options(asdict(config))]))
+    words = shlex.split(shlex.join(["train", "data", "--out", "run", *config.options()]))
     assert main(words) == 2
     assert heard == [config]

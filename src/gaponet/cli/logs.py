@@ -10,7 +10,7 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.options import Flag, Folder, Json, Source, like
-from gaponet.cli.out import Out, show_findings
+from gaponet.cli.out import Out
 from gaponet.data.checks.finding import some
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
@@ -259,7 +259,7 @@ def show_diagnosis(out: Out, diagnosis: Diagnosis) -> None:
          _signed_mrad(r["static_error_rad"], r["stiction_band_rad"]), str(r["rests"])]
         for r in diagnosis.joints
     ])  # fmt: skip
-    show_findings(out, diagnosis.findings)
+    out.findings(diagnosis.findings)
     out.say("", diagnosis.verdict)
 
 

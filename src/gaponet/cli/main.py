@@ -79,7 +79,7 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(f"gaponet {__version__}")
         return
     if not argv or argv[0] in ("-h", "--help"):
-        print(overview())
+        print(_overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
     known = commands()
@@ -110,7 +110,7 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
     )
 
 
-def overview() -> str:
+def _overview() -> str:
     """All commands by task, a line each, on one screen; nothing is imported for it."""
     lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", ABOUT]
     known = commands()

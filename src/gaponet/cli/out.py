@@ -68,17 +68,16 @@ class Out:
         """A table of numbers, as `table`."""
         self.table(title, list(table.columns), table.texts())
 
+    def findings(self, findings: Iterable[Finding]) -> None:
+        """A line each."""
+        for finding in findings:
+            self.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
+
     def result(self, value: dict[str, Any]) -> None:
         """The command's result as one JSON object; nothing without --json."""
         if self.as_json:
             json.dump(finite(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
-
-
-def show_findings(out: Out, findings: Iterable[Finding]) -> None:
-    """A line each."""
-    for finding in findings:
-        out.say(f"  {finding.check}: {finding.message}", f"{finding.level:>7}", COLOURS[finding.level])
 
 
 def writes(kind: str) -> Callable[[Command], Command]:

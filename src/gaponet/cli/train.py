@@ -15,7 +15,6 @@ from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 from gaponet.model.config import Kind
 from gaponet.training.config import TrainConfig
-from gaponet.training.config import fast as fast_preset
 
 
 @like(api.train)
@@ -45,7 +44,7 @@ def train(
     from gaponet.training.ranks import started
 
     screen = Out(json)
-    config = fast_preset(config) if fast else config
+    config = config.fast() if fast else config
     trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
     if started():  # the first rank says it for all
         return

@@ -12,7 +12,7 @@ import numpy as np
 from gaponet import __version__
 from gaponet.arrays import Array
 from gaponet.data.log import UNITS
-from gaponet.data.repeatability import Repetitions, summary
+from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.errors import DatasetError
@@ -60,7 +60,7 @@ def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
             for name, r in ranges.items()
             if r.sequences
         },
-        "repeatability": summary(repeated, dataset.joint_names),
+        "repeatability": Repetitions.summary(repeated, dataset.joint_names),
     }
 
 

@@ -8,9 +8,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
-from gaponet.errors import DatasetError
 from gaponet.files import write_text
-from gaponet.structure import read_json
 
 
 def finite(value: Any) -> Any:
@@ -28,15 +26,6 @@ def finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def read_kept(path: Path) -> dict[str, Any]:
-    """A JSON object that gaponet kept for itself.
-
-    Raises:
-        DatasetError: Missing or damaged.
-    """
-    return read_json(dict[str, Any], path, DatasetError, "delete it and run the same command again")
 
 
 def write_json(path: Path, value: Any) -> None:

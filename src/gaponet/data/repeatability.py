@@ -67,45 +67,45 @@ class Repetitions:
         variance = {c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()}
         return _Repeated(self.count, self.others, np.ptp(self._ctrl, axis=0) > MOVED, variance)
 
+    @staticmethod
+    def periods(sequence: Sequence) -> list[Sequence]:
+        """The periods of a motion after the first, in which the robot came from elsewhere; none where none repeats."""
+        ctrl = sequence.ctrl
+        rows = len(ctrl)
+        for period in range(max(1, round(SHORTEST / sequence.dt)), rows // 3 + 1):
+            later, sparse = np.arange(rows - period), slice(None, None, 97)  # most are ruled out by a few rows
+            if all(np.abs(ctrl[period:][k] - ctrl[later][k]).max() <= SAME_COMMAND for k in (sparse, slice(None))):
+                break
+        else:
+            return []
+        starts = range(period, rows - period + 1, period) if np.ptp(ctrl, axis=0).max() > MOVED else ()
+        return [sequence.rows(slice(a, a + period)) for a in starts]
 
-def periods(sequence: Sequence) -> list[Sequence]:
-    """A motion's periods after the first one, in which the robot came from elsewhere; none where it does not repeat."""
-    ctrl = sequence.ctrl
-    rows = len(ctrl)
-    for period in range(max(1, round(SHORTEST / sequence.dt)), rows // 3 + 1):
-        later, sparse = np.arange(rows - period), slice(None, None, 97)  # most are ruled out by a few rows
-        if all(np.abs(ctrl[period:][k] - ctrl[later][k]).max() <= SAME_COMMAND for k in (sparse, slice(None))):
-            break
-    else:
-        return []
-    starts = range(period, rows - period + 1, period) if np.ptp(ctrl, axis=0).max() > MOVED else ()
-    return [sequence.rows(slice(a, a + period)) for a in starts]
+    @staticmethod
+    def summary(groups: list[_Repeated], joint_names: tuple[str, ...]) -> dict[str, Any]:
+        """Root-mean-square standard deviation over repetitions, by channel and joint.
 
+        Args:
+            groups: A motion's each.
+            joint_names: (n).
 
-def summary(groups: list[_Repeated], joint_names: tuple[str, ...]) -> dict[str, Any]:
-    """Root-mean-square standard deviation over repetitions, by channel and joint.
-
-    Args:
-        groups: A motion's each.
-        joint_names: (n).
-
-    Returns:
-        groups, sequences, and channels {name: {unit, mean over joints that moved, joints {name: value}}}; a joint that
-        no group moved is left out.
-    """
-    channels = {}
-    for name in REPEATED:
-        found = [np.where(g.moved, g.variance[name], np.nan) for g in groups if name in g.variance]
-        values = {}
-        for j, joint in enumerate(joint_names):
-            column = np.array([v[j] for v in found])
-            if np.isfinite(column).any():
-                values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
-        if values:
-            channels[name] = {"unit": UNITS[name], "mean": float(np.mean(list(values.values()))), "joints": values}
-    return {
-        "groups": len(groups),
-        "sequences": sum(g.count for g in groups),
-        "left_out_other_command": sum(g.others for g in groups),
-        "channels": channels,
-    }
+        Returns:
+            groups, sequences, and channels {name: {unit, mean over joints that moved, joints {name: value}}}; a joint
+            that no group moved is left out.
+        """
+        channels = {}
+        for name in REPEATED:
+            found = [np.where(g.moved, g.variance[name], np.nan) for g in groups if name in g.variance]
+            values = {}
+            for j, joint in enumerate(joint_names):
+                column = np.array([v[j] for v in found])
+                if np.isfinite(column).any():
+                    values[joint] = float(f"{np.sqrt(np.nanmean(column)):.6g}")
+            if values:
+                channels[name] = {"unit": UNITS[name], "mean": float(np.mean(list(values.values()))), "joints": values}
+        return {
+            "groups": len(groups),
+            "sequences": sum(g.count for g in groups),
+            "left_out_other_command": sum(g.others for g in groups),
+            "channels": channels,
+        }

@@ -15,7 +15,7 @@ from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.robot_folder import keeper, keeps_robot
 from gaponet.sim.batch import Batch, BatchSim, Condition
-from gaponet.sim.inverse import ClosedForm, Probed, alike
+from gaponet.sim.inverse import ClosedForm, Probed
 
 STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 GAIN_TOLERANCE = 1e-3  # of kp and kd
@@ -117,7 +117,7 @@ class MujocoAligner:
         if how == "closed":
             inverse = _of_scene(scene, joints, told.dt)
             as_is = periods_of(model, told.dt) == 1 if isinstance(model, GapModel) else not robot.has_law
-            if as_is and alike(inverse, ClosedForm.of(reference), reference.range):
+            if as_is and inverse.alike(ClosedForm.of(reference), reference.range):
                 return
             self._stand = inverse.stand
         else:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.repeatability import Repetitions, periods, summary
+from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
@@ -160,10 +160,10 @@ def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str
         angles.append(s.qpos[:, robot.operated_index])
         same = (*s.meta.slot, round(s.dt * 1e6))
         groups[same].add(s)
-        for period in periods(s):
+        for period in Repetitions.periods(s):
             groups[*same, "period"].add(period)
     repeated = [g.result() for g in groups.values() if g.count > 1]
-    spread = summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    spread = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
     found: dict[str, dict[str, float | None]] = {}
     for i, joint in enumerate(robot.operated):
         encoder = encoder_step([a[:, i] for a in angles]) / 4 or None

@@ -147,11 +147,11 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         return DeltaFNO(config, n)
     if not config.mlp_match:
         return DeltaMLP(config, n)
-    weights = operator_size(config, n)
+    weights = _operator_size(config, n)
     return DeltaMLP(config, n, matched_hidden(config.mlp_hidden, weights, lambda widths: DeltaMLP(config, n, widths)))
 
 
-def operator_size(config: ModelConfig, n: int) -> int:
+def _operator_size(config: ModelConfig, n: int) -> int:
     """Parameters that the operator with these fields has, sensor predictor included."""
     with torch.device("meta"):  # shapes only
         return size(OperatorNet(replace(config, kind="gaponet"), n))

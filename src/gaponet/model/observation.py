@@ -82,7 +82,7 @@ class History:
         if not self.inside:
             self.place[:] = self.frames[:, self.picked].reshape(len(self.place), -1)
 
-
-def frames_before(t: Array, depth: int) -> Array:
-    """Row indices of the `depth` frames before rows t, newest first, the first row repeated; (k,) → (k, depth)."""
-    return np.maximum(np.asarray(t)[:, None] - 1 - np.arange(depth), 0)
+    @staticmethod
+    def rows_before(t: Array, depth: int) -> Array:
+        """Row indices of the `depth` frames before rows t, newest first, the first row repeated; (k,) → (k, depth)."""
+        return np.maximum(np.asarray(t)[:, None] - 1 - np.arange(depth), 0)

@@ -16,17 +16,6 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 
 
-def probe_offsets(config: ModelConfig, n: int) -> Array:
-    """e_k, (m, n) rad: one joint at a time, signs and amplitudes alternating so that each joint meets both."""
-    offsets = np.zeros((config.num_probes, n))
-    for k in range(config.num_probes):
-        lap, joint = divmod(k, n)
-        sign = 1.0 if (lap + joint) % 2 == 0 else -1.0
-        small = (lap // 2 + lap + joint) % 2 == 0
-        offsets[k, joint] = sign * (config.probe_small if small else config.probe_large)
-    return offsets
-
-
 class ProbeOracle:
     """Forks the simulator m times per state. For labels and tests; never used on a robot."""
 
@@ -39,7 +28,7 @@ class ProbeOracle:
         locked: tuple[str, ...] = (),
     ) -> None:
         """One state slot per entry of `conditions`; states are of the joints that are not locked."""
-        self.offsets = probe_offsets(config, len(robot.operated))
+        self.offsets = self.offsets_of(config, len(robot.operated))
         self.dt = np.array([c[2] for c in conditions])
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
@@ -47,6 +36,17 @@ class ProbeOracle:
         self.absolute = config.sensor_target == "absolute"
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.target = np.zeros(sim.qpos.shape)
+
+    @staticmethod
+    def offsets_of(config: ModelConfig, n: int) -> Array:
+        """e_k, (m, n) rad: one joint at a time, signs and amplitudes alternating so that each joint meets both."""
+        offsets = np.zeros((config.num_probes, n))
+        for k in range(config.num_probes):
+            lap, joint = divmod(k, n)
+            sign = 1.0 if (lap + joint) % 2 == 0 else -1.0
+            small = (lap // 2 + lap + joint) % 2 == 0
+            offsets[k, joint] = sign * (config.probe_small if small else config.probe_large)
+        return offsets
 
     def __call__(self, qpos: Array, qvel: Array) -> Array:
         """Sensor values.

@@ -108,7 +108,7 @@ class ClosedForm:
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))
-        before, speeds = zip(*(within(int(n), int(nstep.max())) for n in nstep), strict=True)
+        before, speeds = zip(*(self.within(int(n), int(nstep.max())) for n in nstep), strict=True)
         self.before, self.speeds = (np.array(x).transpose(1, 2, 0)[..., None] for x in (before, speeds))
         self.share = (np.arange(nstep.max())[:, None] < nstep) / nstep  # of each physics step, (steps, num)
         self.qpos, self.qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -169,22 +169,39 @@ class ClosedForm:
         torque = load - self.passive[:, self.dof] + np.einsum("kij,kj->ki", self.inertia.matrix(self.num), qacc)
         return torque + friction * friction_limit(self.law, self.frictionloss, qvel, torque, load)
 
-
-def alike(one: ClosedForm, other: ClosedForm, limits: Array) -> bool:
-    """Whether two simulators of the same joints, with limits (n, 2) rad, are one: by their inverses of any motion."""
-    if one.ahead != other.ahead or not np.allclose(one.dt, other.dt):
-        return False
-    rng, n = np.random.default_rng(0), len(limits)
-    for _ in range(TRIED):
-        low, high = np.clip(limits, -np.pi, np.pi).T
-        q = low + (high - low) * rng.random((1, n))
-        v, a, friction = (rng.uniform(-top, top, (1, n)) for top in (1.0, 5.0, 1.0))
-        ends = q + one.dt * (v + 0.5 * one.dt * a), v + one.dt * a
-        period = Period(q, v, *ends, friction)
-        told = [inverse([period] * (1 + inverse.ahead), q) for inverse in (one, other)]
-        if np.abs(told[0] - told[1]).max() > ALIKE:
+    def alike(self, other: ClosedForm, limits: Array) -> bool:
+        """Whether two simulators of the same joints, limits (n, 2) rad, are one, by their inverses of any motion."""
+        if self.ahead != other.ahead or not np.allclose(self.dt, other.dt):
             return False
-    return True
+        rng, n = np.random.default_rng(0), len(limits)
+        for _ in range(TRIED):
+            low, high = np.clip(limits, -np.pi, np.pi).T
+            q = low + (high - low) * rng.random((1, n))
+            v, a, friction = (rng.uniform(-top, top, (1, n)) for top in (1.0, 5.0, 1.0))
+            ends = q + self.dt * (v + 0.5 * self.dt * a), v + self.dt * a
+            period = Period(q, v, *ends, friction)
+            told = [inverse([period] * (1 + inverse.ahead), q) for inverse in (self, other)]
+            if np.abs(told[0] - told[1]).max() > ALIKE:
+                return False
+        return True
+
+    @staticmethod
+    def within(count: int, rows: int) -> tuple[Array, Array]:
+        """Positions before each of `count` physics steps of h, and speeds, from what is known at a period's ends.
+
+        Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
+
+        Returns:
+            Weights of h·q̇ at the start, of h·q̇ at the end, and the way: of positions beyond the first, (rows, 3), and
+            of h·speeds from the first to that after the last step, (rows + 1, 3). Rows beyond the period are zero.
+        """
+        i = np.arange(count + 1.0)
+        shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])  # α, β of v = v_0 + α i + β i²
+        known = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
+        speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
+        speeds[: count + 1] = np.stack([i, i**2], axis=1) @ known + [1.0, 0.0, 0.0]
+        before[1:count] = speeds[1:count].cumsum(axis=0)
+        return before, speeds
 
 
 class Probed:
@@ -277,24 +294,6 @@ def _crossing(missed: Array) -> tuple[Array, Array]:
     passed = (low < -SAME) & (high > SAME)
     least = (np.abs(missed) + FLAT * np.abs(PROBES)[:, None, None]).argmin(axis=0)
     return np.where(passed, PROBES[above - 1] - low / rise * wide, PROBES[least]), rise / wide
-
-
-def within(count: int, rows: int) -> tuple[Array, Array]:
-    """Positions before each of `count` physics steps of h, and speeds, from what is known at a period's ends.
-
-    Speeds follow a parabola; MuJoCo's positions follow from the speeds after each step.
-
-    Returns:
-        Weights of h·q̇ at the start, of h·q̇ at the end, and of the way: of positions beyond the first, (rows, 3), and of
-        h·speeds from the first to that after the last step, (rows + 1, 3). Rows beyond the period are zero.
-    """
-    i = np.arange(count + 1.0)
-    shape = np.linalg.pinv([[count, count**2], [i.sum(), (i**2).sum()]])  # α, β of v = v_0 + α i + β i²
-    known = shape @ [[-1.0, 1.0, 0.0], [-count, 0.0, 1.0]]
-    speeds, before = np.zeros((rows + 1, 3)), np.zeros((rows, 3))
-    speeds[: count + 1] = np.stack([i, i**2], axis=1) @ known + [1.0, 0.0, 0.0]
-    before[1:count] = speeds[1:count].cumsum(axis=0)
-    return before, speeds
 
 
 def _most_torque(model: mujoco.MjModel, joints: tuple[str, ...], actuators: Array) -> Array:

@@ -14,7 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.model.loop import DeltaLoop
-from gaponet.model.observation import frames_before
+from gaponet.model.observation import History
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.free_runs import IMMOVABLE
@@ -141,7 +141,7 @@ class DeltaEnv:
             seq[mine] = self.rng.choice(self.members[g], size=mine.sum(), p=self.weights[g])
         first, last = self.seq_first[seq], self.seq_last[seq]
         t = self.rng.integers(first, last - self.config.delta_hold + 1)
-        before = first[:, None] + frames_before(t - first, self.depth)
+        before = first[:, None] + History.rows_before(t - first, self.depth)
         first, last, t, before = (self.sim.array(x) for x in (first, last, t, before))
         self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from gaponet.cli.options import Flag, Folder, Json
-from gaponet.cli.out import Out, show_findings
+from gaponet.cli.out import Out
 from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
 from gaponet.files import whole
@@ -173,7 +173,7 @@ def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple
         f"control period {spec.dt * 1e3:g} ms, physics step {spec.timestep * 1e3:g} ms ({spec.decimation} a period); "
         f"payload mounts: {mounts}; contacts {'on' if spec.contacts else 'off'}; simulator {model_hash(spec)}"
     )
-    show_findings(out, findings)
+    out.findings(findings)
     bad = {level: sum(f.level == level for f in findings) for level in ("error", "warning")}
     if bad["error"]:
         out.say(f": {spec.name} is no simulator of it yet; mend the {bad['error']} error(s)", "not ok", "bold red")

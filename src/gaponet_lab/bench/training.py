@@ -22,7 +22,7 @@ from gaponet.model.layers import size
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs, replay
-from gaponet.training.config import RewardConfig, TrainConfig, fast
+from gaponet.training.config import RewardConfig, TrainConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.ppo import Learner
 from gaponet_lab.bench.turns import Turn, take_turns
@@ -75,7 +75,7 @@ def bench_train(
     """
     torch.set_num_threads(config.learner_threads)
     config = _for_envs(config, num_envs)
-    quick = fast(config)
+    quick = config.fast()
     steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
     env = _environment(robot, config.model, num_envs, config.threads)
     net = build_network(config.model, env.num_actions)

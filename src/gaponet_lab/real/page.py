@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.files import write_text
-from gaponet.methods import colour, shade
+from gaponet_lab.plot.colours import colour, shade
 from gaponet_lab.plot.style import figure, legend, save, styled
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from matplotlib.ticker import MultipleLocator
 from gaponet.arrays import Array
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
-from gaponet.methods import colour
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import figure, joint_label, legend, styled
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}

@@ -15,7 +15,6 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.eval.evaluate import evenly
-from gaponet.eval.whose import who
 from gaponet.files import writing
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
@@ -23,6 +22,7 @@ from gaponet.sim.model import model_hash
 from gaponet.sim.replay import pair_dataset
 from gaponet_lab.plot.style import save
 from gaponet_lab.report import dataset_figures as draw
+from gaponet_lab.whose import who
 
 RANGE_SEQUENCES, RANGE_ROWS = 400, 40_000  # most read for joint ranges, and rows kept of each joint
 GAP_SEQUENCES = 240  # most paired for the gap against payload

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from gaponet.arrays import Array
 from gaponet.data.repeatability import MOVED
 from gaponet.data.signals import busiest
-from gaponet.methods import colour, title
+from gaponet.methods import title
 from gaponet.spread import Spread
 from gaponet_lab.plot.charts import Course, against, bars, lines
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import figure, joint_label, legend, styled
 
 WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing

@@ -9,7 +9,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from gaponet.files import write_text, writing
-from gaponet.methods import colour, shade, title
+from gaponet.methods import title
+from gaponet_lab.plot.colours import colour, shade
 from gaponet_lab.plot.style import figure, joint_label, save, styled
 
 COLUMNS = 4  # at most

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gaponet.methods import colour
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import figure, joint_label, legend, save, styled
 
 

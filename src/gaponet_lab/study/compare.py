@@ -13,12 +13,13 @@ import tyro
 
 from gaponet.data.split import split_entries
 from gaponet.eval.candidate import choose
-from gaponet.methods import palette, title
+from gaponet.methods import title
 from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.identify import identify
 from gaponet.spread import Spread, Table, text
 from gaponet_lab.plot.charts import bars
+from gaponet_lab.plot.colours import palette
 from gaponet_lab.plot.style import joint_label
 from gaponet_lab.study.found import Found, spread
 from gaponet_lab.study.options import MODELS

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
-from gaponet.methods import palette, title
+from gaponet.methods import title
 from gaponet.spread import Spread, Table
+from gaponet_lab.kept import read_kept
 from gaponet_lab.plot.charts import lines
+from gaponet_lab.plot.colours import palette
 from gaponet_lab.study.found import Found
 from gaponet_lab.study.options import MODELS
 from gaponet_lab.study.pool import Cell

@@ -9,18 +9,19 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Protocol
 
-from gaponet.data.json_file import read_kept, write_json
+from gaponet.data.json_file import write_json
 from gaponet.errors import ModelError
 from gaponet.eval.candidate import split_of_run
-from gaponet.eval.whose import label
 from gaponet.executor import opened
 from gaponet.progress import Running
 from gaponet.sim.model import model_hash
 from gaponet.spread import Spread, Table
+from gaponet_lab.kept import read_kept
 from gaponet_lab.study.measure import Outcome, evaluate_baselines, train_and_evaluate
 from gaponet_lab.study.pool import RESULT, Cell, run_cells
 from gaponet_lab.study.result import Result, facts
 from gaponet_lab.study.study import Study
+from gaponet_lab.whose import label
 
 Key = tuple[str, str]  # a model's word, and the unit left out or ""
 Show = Callable[[Running, int], None]

@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import GAPONetError, UsageError, missing_extra
 from gaponet.executor import BEAT, Pool
@@ -29,6 +28,7 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig
+from gaponet_lab.kept import read_kept
 from gaponet_lab.study.variant import Variant
 
 Tell = Callable[[float, str], None]  # share done, what is going on

@@ -6,15 +6,14 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gaponet.data.json_file import read_kept
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.eval.whose import who
 from gaponet.executor import LOCAL, MOST_WORKERS, cores
 from gaponet.methods import IDENTIFIED
 from gaponet.robot import RobotSpec
 from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig
+from gaponet_lab.kept import read_kept
 from gaponet_lab.study.options import (
     BUDGET,
     QUICK_BUDGET,
@@ -29,6 +28,7 @@ from gaponet_lab.study.options import (
 from gaponet_lab.study.pool import RESULT, Cell, plan
 from gaponet_lab.study.rehearsal import rehearsal, take
 from gaponet_lab.study.variant import Variant, parse_variant
+from gaponet_lab.whose import who
 
 # s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4

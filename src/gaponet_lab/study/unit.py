@@ -8,9 +8,10 @@ from typing import ClassVar
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.methods import palette, shade, title
+from gaponet.methods import title
 from gaponet.spread import Spread, Table, text
 from gaponet_lab.plot.charts import bars
+from gaponet_lab.plot.colours import palette, shade
 from gaponet_lab.study.found import Found, spread
 from gaponet_lab.study.options import MODELS
 from gaponet_lab.study.pool import Cell

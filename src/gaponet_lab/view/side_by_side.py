@@ -14,10 +14,11 @@ from gaponet.data.signals import busiest
 from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError, UsageError
 from gaponet.eval.candidate import Candidate, Seen
-from gaponet.methods import colour, title
+from gaponet.methods import title
 from gaponet.progress import Progress, noted, silent
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import Corrector, replay
+from gaponet_lab.plot.colours import colour
 
 
 @dataclass(frozen=True)

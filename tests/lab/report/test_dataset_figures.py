@@ -8,11 +8,11 @@ from logs import arm_sequence, late, wave
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.eval.evaluate import evenly
-from gaponet.eval.whose import who
 from gaponet.sim.model import model_hash
 from gaponet_lab.plot.style import save
 from gaponet_lab.report import dataset_figures as draw
 from gaponet_lab.report.draw_dataset import PICTURES, draw_all, liveliest, swing
+from gaponet_lab.whose import who
 
 
 @pytest.fixture

@@ -8,11 +8,11 @@ from arm import recordings
 
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError, FolderError
-from gaponet.eval.whose import label
 from gaponet.spread import Spread, Table, text
 from gaponet_lab.plot.style import figure
 from gaponet_lab.study.page import write, write_report
 from gaponet_lab.study.result import Result, command_line, facts
+from gaponet_lab.whose import label
 
 
 def drawing():

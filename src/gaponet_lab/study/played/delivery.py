@@ -16,9 +16,10 @@ import numpy as np
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.methods import colour, title
+from gaponet.methods import title
 from gaponet.spread import Spread, Table
 from gaponet_lab.plot.charts import draw_bars
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import DASHED, figure, legend, styled
 from gaponet_lab.study.paper import TABLE_1, TABLE_1_METHODS
 from gaponet_lab.study.played.deliver import HOLD, LAST, NEAR, Cost, Placed, ShownHand, deliver

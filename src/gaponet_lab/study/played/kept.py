@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gaponet import __version__
-from gaponet.data.json_file import finite, read_kept, write_json
+from gaponet.data.json_file import finite, write_json
+from gaponet_lab.kept import read_kept
 
 T = TypeVar("T")
 

@@ -8,8 +8,9 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from gaponet.methods import colour, title
+from gaponet.methods import title
 from gaponet.spread import Spread
+from gaponet_lab.plot.colours import colour
 
 LEFT_OUT = ("identified feedforward",)  # of figures; it stands in the tables
 RIVALS = ("mlp", "shared_mlp")  # of the operator

@@ -12,13 +12,13 @@ from typing import Any
 
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
-from gaponet.eval.whose import label
 from gaponet.robot import RobotSpec
 from gaponet.spread import Table
 from gaponet_lab.study.options import Options
 from gaponet_lab.study.played.trained import Trained, load_trained
 from gaponet_lab.study.result import Result, facts
 from gaponet_lab.study.study import Study
+from gaponet_lab.whose import label
 from gaponet_robots.virtual.collect import fleet_of
 from gaponet_robots.virtual.fleet import load_fleet
 from gaponet_robots.virtual.physics import Physics

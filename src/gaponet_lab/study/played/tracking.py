@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.eval.candidate import choose
-from gaponet.methods import colour, title
+from gaponet.methods import title
 from gaponet.robot import RobotSpec
 from gaponet.spread import Spread, Table
 from gaponet_lab.plot.charts import Course, against, draw_bars
+from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import figure, joint_label, legend, styled
 from gaponet_lab.study.played.measured import (
     LEFT_OUT,

@@ -6,12 +6,12 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from pathlib import Path
 
-from gaponet.data.json_file import read_kept
 from gaponet.errors import UsageError
 from gaponet.eval.candidate import corrected_robot
 from gaponet.methods import IDENTIFIED, method, title
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
+from gaponet_lab.kept import read_kept
 
 SAME = ("mlp_match=on",)  # changes that make no other method of it
 
