@@ -100,33 +100,6 @@ def test_the_gap_with_a_run_says_what_each_step_removes(place, capsys):
     assert (place / "gaponet" / "gap.png").stat().st_size > 10_000
 
 
-def test_compare_puts_models_and_seeds_into_one_table_and_keeps_what_is_there(place, capsys):
-    words = [
-        "experiment",
-        "compare",
-        str(place / "data"),
-        "--out",
-        str(place / "compared"),
-        "--seeds",
-        "2",
-        "--models",
-        "mlp",
-    ]
-    words += [*TRAIN, "--budget", "900", "--warm-start.rounds", "1", "--identify"]
-    result, err = run(place, capsys, *words)
-    totals = {row[0]: row[2] for row in result["tables"]["totals"]["rows"]}
-    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP, full coupling"]
-    assert totals["MLP, full coupling"]["count"] == 2
-    assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
-    assert result["facts"]["unseen"] is True
-    assert "VIRTUAL" in err
-    again, err = run(place, capsys, *words)
-    assert "2 trainings (1 settings), 2 there already" in err
-    assert again["tables"] == result["tables"]
-    assert main([*words, "--budget", "901", "--robot", str(place / "arm")]) == 2
-    assert "another budget" in capsys.readouterr().err
-
-
 def test_a_calibrated_unit_is_shown_without_and_with(place, capsys):
     shutil.copytree(place / "gaponet", place / "calibrated")
     found, err = run(place, capsys, "calibrate", str(place / "calibrated"), str(place / "data"), "--seconds", "8")

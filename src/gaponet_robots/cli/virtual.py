@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from contextlib import closing, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -16,6 +17,9 @@ from gaponet.errors import UsageError
 from gaponet.files import write_text
 from gaponet_robots.control.stop import SIGNALS
 from gaponet_robots.drivers.unitree_virtual import FaultKind, VirtualH12
+
+if TYPE_CHECKING:
+    from gaponet_robots.drivers.so101_virtual import VirtualSO101
 
 
 def virtual(
@@ -68,30 +72,29 @@ def virtual(
     for number in set(SIGNALS) - {signal.SIGINT}:
         signal.signal(number, signal.default_int_handler)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
-    served: VirtualH12 | VirtualSO101
-    if spec.name != "so101":
-        payload = (payload_mass, payload_side)
-        served = VirtualH12(spec, physics, payload, domain, interface, rate, fault, fault_at)
-        where = f"rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}"
-    else:
+    limit = float("inf") if seconds is None else seconds
+    if spec.name == "so101":
         side = payload_side if payload_side != "both" else "hand"
-        served = VirtualSO101(spec, physics, (payload_mass, side), link, frame)
-        where = f"servo bus on {served.port}"
+        arm = VirtualSO101(spec, physics, (payload_mass, side), link, frame)
         if calibration:
-            rows = {joint: asdict(row) for joint, row in served.calibration.rows.items()}
+            rows = {joint: asdict(row) for joint, row in arm.calibration.rows.items()}
             write_text(calibration, json.dumps(rows, indent=4) + "\n")
-    out.say(f"{label}: {where}; Ctrl-C ends it")
-    sys.stdout.flush()  # whoever started us through a pipe waits for this line
+        with closing(arm):
+            _live(arm, limit, out, f"{label}: servo bus on {arm.port}")
+        return
+    humanoid = VirtualH12(spec, physics, (payload_mass, payload_side), domain, interface, rate, fault, fault_at)
     try:
-        served.run(float("inf") if seconds is None else seconds)
-    except KeyboardInterrupt:
-        pass
+        _live(humanoid, limit, out, f"{label}: rt/lowstate at {rate:g} Hz, DDS domain {domain} on {interface}")
     finally:
-        if isinstance(served, VirtualSO101):
-            served.close()
-        elif heard:
-            served.heard.save(heard)
-    if isinstance(served, VirtualH12):
-        out.say(
-            f"{label}: heard {len(served.heard.time)} commands, refused {served.refused}, late {served.missed} periods"
-        )
+        if heard:
+            humanoid.heard.save(heard)
+    told = f"heard {len(humanoid.heard.time)} commands, refused {humanoid.refused}, late {humanoid.missed} periods"
+    out.say(f"{label}: {told}")
+
+
+def _live(served: VirtualH12 | VirtualSO101, seconds: float, out: Out, where: str) -> None:
+    """Serve until interrupted; what is written afterwards is not interrupted."""
+    out.say(f"{where}; Ctrl-C ends it")
+    sys.stdout.flush()  # whoever started us through a pipe waits for this line
+    with suppress(KeyboardInterrupt):
+        served.run(seconds)

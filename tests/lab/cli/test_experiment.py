@@ -26,25 +26,27 @@ def dataset_robot(folder):
 
 
 def test_an_experiment_trains_writes_everything_and_goes_on_where_it_was(place, capsys):
-    words = ["experiment", "data", str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm"),
-             "--models",
-             "mlp", "--shares", "0.5", "1", *TRAIN, "--json"]  # fmt: skip
+    words = ["experiment", "compare", str(place / "data"), "--out", str(place / "out"), "--robot", str(place / "arm"),
+             "--models", "mlp", *TRAIN, "--seeds", "2", "--identify", "--json"]  # fmt: skip
     assert main(words) == 0
     captured = capsys.readouterr()
     found = json.loads(captured.out)
-    assert "2 trainings (2 settings), 0 there already" in captured.err
-    rows = found["tables"]["data"]["rows"]
-    assert [row[0] for row in rows] == ["2", "5"]  # of eight motions 2 are for test and 1 for validation
-    assert rows[0][1] < rows[1][1]
-    assert rows[1][2]["mean"] > rows[1][4]["mean"] > 0  # nominal, mlp
+    assert "2 trainings (1 settings), 0 there already" in captured.err
+    totals = {row[0]: row[2] for row in found["tables"]["totals"]["rows"]}
+    assert list(totals) == ["nominal simulator", "delay + offset", "identification", "MLP, full coupling"]
+    assert totals["MLP, full coupling"]["count"] == 2
+    assert totals["identification"]["mean"] < totals["nominal simulator"]["mean"]
+    assert found["facts"]["unseen"] is True
     assert found["virtual"].startswith("VIRTUAL arm")
     assert str(place) not in found["facts"]["command"]
-    for name in ("data.md", "data.csv", "data.svg", "data.png", "report.html", "cells/mlp-0/cell.json"):
+    for name in ("compare.md", "compare.csv", "compare.svg", "compare.png", "report.html", "cells/mlp-0/cell.json"):
         assert (place / "out" / name).is_file(), name
     assert main(words) == 0
     captured = capsys.readouterr()
     assert "2 there already" in captured.err
     assert json.loads(captured.out)["tables"] == found["tables"]
+    assert main([*words, "--budget", "641"]) == 2
+    assert "another budget" in capsys.readouterr().err
 
 
 def test_what_cannot_be_asked_of_a_dataset_is_one_line(place, capsys):
