@@ -22,7 +22,7 @@ RANKS = {
     ],
     "gaponet_robots": [{"motion"}, {"control", "drivers", "targets", "virtual"}, {"cli"}],
     "gaponet_interop": [{"formats", "writers", "engine", "setup"}, {"share"}, {"cli"}],
-    "gaponet_lab": [{"plot"}, {"view", "report", "bench", "real"}, {"study"}, {"cli"}],
+    "gaponet_lab": [{"plot"}, {"view", "report", "bench", "real", "known"}, {"study"}, {"cli"}],
 }  # fmt: skip
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {

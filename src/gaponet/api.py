@@ -25,10 +25,12 @@ from gaponet.robot_folder import MOVE_KEPT
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
     from gaponet.data.importer import ImportReport
+    from gaponet.data.sequence import Sequence
     from gaponet.eval.evaluate import Evaluation
+    from gaponet.eval.knowledge import Knowledge
     from gaponet.model.artifact import GapModel
     from gaponet.model.calibration import Calibration
-    from gaponet.sim.identify import Identified
+    from gaponet.sim.identify import Covariance, Identified
     from gaponet.training.config import TrainConfig
 
 Place = str | Path
@@ -265,7 +267,20 @@ def identify(
             "val_mpjae": {name: float(e.mean()) for name, e in val_errors.items()},
             "std": found.std,
         })  # fmt: skip
+        _keep_known(Path(out), data.sequences(parts["train"]), val, found.covariance, None)
     return Identification(found, val_errors, time.monotonic() - began)
+
+
+def _keep_known(
+    folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance, before: Knowledge | None
+) -> None:
+    """Write how sure a robot folder's values are, where a part that can tell is installed."""
+    from gaponet.robot_folder import KNOWN
+
+    known = offered("PROVIDES").get("what is known of a robot")
+    (folder / KNOWN).unlink(missing_ok=True)
+    if known:
+        named(known)(load_robot(folder), sequences, judges, covariance, before).save(folder)
 
 
 def train(
@@ -456,6 +471,7 @@ def calibrate_robot(
     """
     import tempfile
 
+    from gaponet.eval.knowledge import Knowledge
     from gaponet.files import write_text, writing
     from gaponet.robot_folder import ORIGIN, save_robot
     from gaponet.sim.identify import BETTER
@@ -463,6 +479,7 @@ def calibrate_robot(
     from gaponet.sim.replay import whole_errors
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
+    before_known = Knowledge.load(spec)
     with tempfile.TemporaryDirectory() as place, writing(Path(out), "robot"):
         if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
             import_logs(source, spec, Path(place) / "data", unit or None, payload_mass)
@@ -493,6 +510,7 @@ def calibrate_robot(
         save_robot(found.robot, Path(out))
         if (spec.folder / ORIGIN).is_file():  # which motions identification saw is still to be known
             write_text(Path(out) / ORIGIN, (spec.folder / ORIGIN).read_text(encoding="utf-8"))
+        _keep_known(Path(out), sequences, [], {}, before_known)
     return Calibrated(found.robot, unit or units[0], errors, found.payload_mass, found.payload_std)
 
 

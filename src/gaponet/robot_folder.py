@@ -14,7 +14,8 @@ from gaponet.robot import BUILTIN, LAW, SERVO, RobotSpec, available, load_robot
 KEPT = "robot"  # folder of a run or a dataset
 MOVE_KEPT = "move that folder away to keep the other robot from now on"
 ORIGIN = "identified.json"  # what a robot was identified from (eval/candidate.py)
-BESIDE = ("collision.toml", "look.toml", ORIGIN)
+KNOWN = "known.json"  # how sure its values are (eval/knowledge.py)
+BESIDE = ("collision.toml", "look.toml", ORIGIN, KNOWN)
 IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
 IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
 FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")

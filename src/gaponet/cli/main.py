@@ -23,8 +23,8 @@ from gaponet.text import plain
 TASKS = {
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
-    "Closing it": ("identify", "torque", "calibrate", "train", "export"),
-    "Is it closed?": ("eval", "replay", "report", "runs", "experiment"),
+    "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
+    "Is it closed?": ("eval", "check", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual"),
     "Try it, time it, share it": ("start", "demo", "bench", "push", "pull"),
 }

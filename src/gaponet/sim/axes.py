@@ -29,11 +29,19 @@ STILL = 0.01  # rad: commands that differ by less ask nothing of a joint
 STANDING = ("kp", "offset")  # what a joint shows that is never moved: how far it gives way, and where it stands
 
 
+def first_values(robot: RobotSpec) -> Values:
+    """The given robot's own, (n,) each. Damping is the MJCF's: what is below zero is taken from the servo's kd."""
+    model, op = build_model(replace(robot, table=None)), robot.operated_index
+    dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
+    passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
+    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *LAW)}
+
+
 class Bounds:
     """What the parameters of a robot's operated joints may be.
 
     Attributes:
-        first: The given robot's own values. Damping is the MJCF's: what is below zero is taken from the servo's kd.
+        first: The given robot's own values.
         start: Where a search starts: a little late, and with as much armature as the physics step resolves.
         spare: kd that may be lacking, (n,) N·m·s/rad: the servos', where no recording states it.
         still: Joints that no recording moves, (n,).
@@ -46,11 +54,7 @@ class Bounds:
         model = build_model(replace(robot, table=None))
         dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
         kp, kd, limit = robot.kp[op], robot.kd[op], robot.effort_limit[op]
-        self.first: Values = {
-            "kp": kp, "damping": model.dof_damping[dof].copy(), "frictionloss": model.dof_frictionloss[dof].copy(),
-            "armature": model.dof_armature[dof].copy(),
-            **{f: getattr(robot, f)[op] for f in ("offset", "delay", "effort_limit", *LAW)},
-        }  # fmt: skip
+        self.first = first_values(robot)
         stated = all(s.meta.known_gains[1] is not None for s in sequences)
         self.stated = all(s.meta.known_gains[0] is not None for s in sequences)
         self.spare = np.zeros(self.n) if stated else kd.copy()

@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from gaponet.text import measured
 
 Array = np.ndarray
 Std = dict[str, dict[str, float]]  # joint → field → standard error
+Covariance = dict[str, tuple[list[str], Array]]  # joint → fields (P), (P, P)
 
 WINDOWS, WHOLE = 40, 8  # windows of joints on their own, and of the whole robot
 STARTS, SPREAD = 4, 2.0  # of each search, and how far apart in the parameters' scales
@@ -105,6 +106,7 @@ class Identified:
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
         by_joint: Joint → mean |error| before and after, rad.
+        covariance: Joint → of its fields on the axes of eval/knowledge.py; none of a shared law.
     """
 
     robot: RobotSpec
@@ -117,6 +119,7 @@ class Identified:
     touch: Touch | None
     shared: tuple[Tried, ...] = ()
     by_joint: dict[str, tuple[float, float]] | None = None
+    covariance: Covariance = field(default_factory=dict)
 
     @property
     def better(self) -> bool:
@@ -219,7 +222,8 @@ def identify(
     began, ended = (float(judge.errors(v).mean()) for v in (first, values))
     each = zip(*(judge.by_joint(v).tolist() for v in (first, values)), strict=True)
     by_joint = dict(zip(robot.operated, each, strict=True))
-    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint)
+    sure = {j: whole.covariance[j] for j in robot.operated if std[j]}
+    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure)
 
 
 def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Values]]:
@@ -335,6 +339,7 @@ class Fit:
         self.n = len(robot.operated)
         self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
         self.together = _Limbs(robot)
+        self.covariance: Covariance = {}  # where `uncertainty` was asked last
 
     def whole(self, nthread: int) -> Fit:
         """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
@@ -470,7 +475,9 @@ class Fit:
             f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + np.abs(g).max(axis=1) * lost.any(axis=1)
             for f, g in by.items()
         }
-        joints = self.base.operated
+        joints, wide = self.base.operated, cov + (1e3 * np.eye(len(names)) * lost[..., None, :])
+        wide = axes.unit[..., :, None] * wide * axes.unit[..., None, :]
+        self.covariance = {j: (names, wide[i]) for i, j in enumerate(joints)}
         found = {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)}
         return found, {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)}
 

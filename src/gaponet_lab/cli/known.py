@@ -1,0 +1,161 @@
+"""gaponet show and gaponet check: what is known of a robot, and whether logs are still of it."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from gaponet.cli.options import Folder, Json, Motions
+from gaponet.cli.out import Out
+from gaponet.errors import UsageError
+from gaponet.eval.knowledge import Knowledge
+from gaponet.robot import RobotSpec, load_robot
+
+if TYPE_CHECKING:
+    from gaponet_lab.known.drift import Moved
+
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet calibrate.")]
+Logs = Annotated[
+    tyro.conf.Positional[str], tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.")
+]
+WIDE = 4  # columns of a table
+MEND = "identify or calibrate it again with this gaponet, which keeps it"
+
+
+def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
+    """What is known of a robot: values, how sure they are, which are known only together, and from which logs.
+
+    Args:
+        out: Picture to write, .png or .svg.
+    """
+    from gaponet_lab.known.table import SHOWN, certainty, picture, rows, sentences
+
+    screen = Out(json)
+    spec, known = _opened(robot)
+    sure = {j: certainty(known, j) for j in known.joints}
+    fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
+    for start in range(0, len(fields), WIDE):
+        part = fields[start : start + WIDE]
+        title = f"{spec.name}, ± standard error" if start == 0 else "The same"
+        screen.table(title, ["joint", *(SHOWN[f][0] for f in part)], rows(known, part))
+    for line in sentences(known):
+        screen.say(line)
+    if out is not None:
+        from gaponet.files import whole
+
+        if out.suffix not in (".png", ".svg"):
+            raise UsageError(f"--out {out}: a picture is a .png or an .svg")
+        with whole(out) as temporary:
+            picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
+        screen.say(f"picture: {out}")
+    screen.result({
+        "robot": spec.name, "sources": known.sources, "held": known.held,
+        "joints": {
+            j: {
+                "values": c.values, "standard_errors": c.errors, "together": c.sets, "left": known.joints[j].left,
+                "band_90": known.joints[j].band, "predicted": known.joints[j].predicted,
+                "scale": known.joints[j].left / max(known.joints[j].predicted, 1e-12),
+            }
+            for j, c in sure.items()
+        },
+        "picture": None if out is None else str(out),
+    })  # fmt: skip
+
+
+def _opened(folder: Path) -> tuple[RobotSpec, Knowledge]:
+    """A robot folder, and what is known of it."""
+    if not (folder / "robot.toml").is_file():
+        raise UsageError(f"{folder}: is no robot folder (no robot.toml); give what gaponet identify wrote")
+    spec = load_robot(folder)
+    known = Knowledge.load(spec)
+    if known is None:
+        raise UsageError(f"{folder}: keeps only values (no known.json); {MEND}")
+    return spec, known
+
+
+def check(
+    robot: Known,
+    logs: Logs,
+    unit: str = "",
+    motions: Motions = (),
+    payload_mass: float | None = None,
+    threads: int = 0,
+    json: Json = False,
+) -> None:
+    """Is this still the robot that was identified? By joint, which number moved, by how much, and what to do.
+
+    The exit code is 0 where it is, 1 where it is not, 2 where that cannot be told.
+
+    Args:
+        unit: Which one, where the dataset holds several, or logs do not say.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        threads: 0 for all cores.
+    """
+    from gaponet.api import import_logs
+    from gaponet.data.store import Dataset, open_dataset
+    from gaponet_lab.known.drift import drift
+
+    screen = Out(json)
+    spec, known = _opened(robot)
+    with tempfile.TemporaryDirectory() as place:
+        if Path(logs).exists() and not (Path(logs) / "dataset.json").is_file():
+            import_logs(logs, spec, Path(place) / "data", unit or None, payload_mass)
+            data = Dataset(Path(place) / "data")
+        else:
+            data, _ = open_dataset(logs, spec)
+        data.require_robot(spec)
+        units = sorted({e.meta.unit_id for e in data.entries})
+        if unit not in units and (unit or len(units) != 1):
+            raise UsageError(f"--unit {unit or '(none)'}: {logs} holds units {', '.join(units)}; name one")
+        entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
+        found = drift(spec, known, data.sequences(entries), threads)
+    named = {m.joint: m for m in found.moved}
+    screen.table(
+        f"{len(entries)} recordings, {found.seconds:.0f} s: what changed most, in standard deviations",
+        ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
+        [
+            _row(m, known, m.joint in named)
+            for m in (*found.moved, *(m for j, m in found.largest.items() if j not in named))
+        ],
+    )
+    for a in found.against:
+        screen.say(
+            f"  {a.recording} against the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations", "warning"
+        )
+    screen.say(f"{found.verdict}: {found.advice}")
+    screen.result({
+        "verdict": found.verdict, "advice": found.advice, "recordings": len(entries), "seconds": found.seconds,
+        "moved": [_plain(m) for m in found.moved], "largest": {j: _plain(m) for j, m in found.largest.items()},
+        "against": [vars(a) for a in found.against], "threshold": found.threshold,
+    })  # fmt: skip
+    if found.verdict != "same":
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+def _row(m: Moved, known: Knowledge, counts: bool) -> list[str]:
+    left = known.joints[m.joint].left
+    return [m.joint, m.field, _by(m, known), f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
+            "moved" if counts else ""]  # fmt: skip
+
+
+def _by(m: Moved, known: Knowledge) -> str:
+    """A change as people say it."""
+    if m.field in ("offset", "play"):
+        return f"{1e3 * m.by:+.1f} mrad"
+    if m.field == "delay":
+        return f"{1e3 * m.by:+.1f} ms"
+    if m.field in ("friction_motor", "friction_external"):
+        return f"{1e2 * m.by:+.1f} % of the load"
+    if m.field in ("kp", "stribeck_speed"):
+        return f"× {2.718281828459045**m.by:.2f}"
+    value = known.joints[m.joint].values[known.fields.index(m.field)]
+    return f"{100 * m.by / value:+.0f} %" if value > 1e-9 else "from none"
+
+
+def _plain(m: Moved) -> dict[str, object]:
+    return {**vars(m), "sigmas": m.sigmas}

@@ -1,0 +1,164 @@
+"""What is known of a robot: how sure its values are, from which logs, and whether later logs are still of it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, record, write_arm
+
+from gaponet import api
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.errors import RobotError
+from gaponet.eval.knowledge import Knowledge, values_of
+from gaponet.robot import load_robot
+from gaponet.robot_folder import save_robot
+from gaponet_lab.known.evidence import known
+
+TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+
+
+def played(robot, first=0, count=6, seconds=8, noise=4e-4, **how):
+    """Motions of an arm whose servos are softer and late, seen through a noisy encoder."""
+    found = []
+    for seed in range(first, first + count):
+        rows = round(seconds / robot.dt)
+        one = record(robot, commands(rows, seed), f"m{seed}", **({"kp": 0.8, "delay": 1} | how))
+        found.append(replace(one, qpos=one.qpos + noise * np.random.default_rng(seed).standard_normal(one.qpos.shape)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("know") / "arm")
+
+
+@pytest.fixture(scope="module")
+def folder(arm, tmp_path_factory):
+    """As if it had been identified."""
+    right = arm.with_servos(dict.fromkeys(arm.joint_names, TRUE))
+    place = tmp_path_factory.mktemp("know") / "right"
+    save_robot(right, place)
+    known(load_robot(place), played(arm), played(arm, 20, 3), nthread=1).save(place)
+    return place
+
+
+def dataset(arm, place, sequences):
+    data = Dataset.create(place, arm)
+    for one in sequences:
+        data.append(one)
+    return place
+
+
+def checked(capsys, *words):
+    code = 0
+    try:
+        code = main(["check", *map(str, words), "--threads", "1", "--json"])
+    except SystemExit as end:
+        code = end.code
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_folder_says_how_sure_it_is_and_from_which_logs(arm, folder):
+    mine = Knowledge.load(load_robot(folder))
+    (source,) = mine.sources
+    assert source["logs"].keys() == {f"m{seed}" for seed in range(6)}
+    assert source["seconds"] == pytest.approx(48.0)
+    for joint in arm.operated:
+        values, covariance = mine.si(joint)
+        np.testing.assert_allclose([values[f] for f in mine.fields], [TRUE[f] for f in mine.fields], atol=1e-5)
+        drawn = np.random.default_rng(0).multivariate_normal(
+            mine.array(joint, "values"), mine.array(joint, "covariance"), 20_000
+        )
+        spread = np.std([values_of(mine.fields, drawn)[f] for f in mine.fields], axis=1)
+        np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
+        assert mine.joints[joint].left < 2e-3
+
+
+def test_more_seconds_make_it_surer_and_are_told(arm, folder):
+    robot = load_robot(folder)
+    mine = Knowledge.load(robot)
+    more = known(robot, played(arm, 40, 4), [], before=mine, nthread=1)
+    assert len(more.sources) == 2
+    for joint in arm.operated:
+        before, after = (np.diag(k.array(joint, "covariance")) for k in (mine, more))
+        assert (after < before).all()
+
+
+def test_what_a_calibration_moves_is_unsure_of_the_old_value(arm, folder):
+    robot = load_robot(folder)
+    mine, found = Knowledge.load(robot), []
+    for by in (0.0, -0.05):
+        there = robot.with_servos({"elbow": {"offset": by}})
+        seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
+        found.append(known(there, seen, [], before=mine, nthread=1).array("elbow", "covariance"))
+    same, moved = (np.diag(covariance)[mine.fields.index("offset")] for covariance in found)
+    assert moved > 1.1 * same
+
+
+def test_a_folder_that_was_edited_is_not_believed(folder, tmp_path):
+    robot = load_robot(folder)
+    save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
+    with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or calibrate again"):
+        Knowledge.load(load_robot(tmp_path / "edited"))
+
+
+def test_a_folder_without_it_loads_and_show_says_what_to_do(arm, capsys):
+    assert Knowledge.load(arm) is None
+    assert main(["show", str(arm.folder)]) == 2
+    assert "keeps only values" in capsys.readouterr().err
+
+
+def test_a_calibration_keeps_what_it_learned(arm, folder, tmp_path):
+    data = dataset(arm, tmp_path / "data", played(arm, 60, 3, kp=0.7))
+    api.calibrate_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
+    mine = Knowledge.load(load_robot(tmp_path / "today"))
+    assert [s["made_by"] for s in mine.sources] == ["identify", "calibrate"]
+    assert mine.sources[1]["logs"].keys() == {"m60", "m61", "m62"}
+
+
+def test_show_prints_and_draws(folder, tmp_path, capsys):
+    assert main(["show", str(folder), "--out", str(tmp_path / "known.svg"), "--json"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert found["joints"]["elbow"]["standard_errors"]["kp"] > 0
+    assert "± standard error" in said.err
+    assert "elbow" in (tmp_path / "known.svg").read_text()
+    assert main(["show", str(folder), "--out", str(tmp_path / "known.pdf")]) == 2
+
+
+def test_the_same_robot_is_the_same(arm, folder, tmp_path, capsys):
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6)))
+    assert (code, said["verdict"], said["moved"]) == (0, "same", [])
+
+
+@pytest.mark.parametrize(("field", "how"), [("kp", {"kp": 0.7}), ("delay", {"delay": 2})])
+def test_what_moved_is_named(arm, folder, tmp_path, capsys, field, how):
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, **how)))
+    assert (code, said["verdict"]) == (1, "drifted")
+    assert {m["joint"] for m in said["moved"] if m["field"] == field} == set(arm.operated)
+    moved = next(m for m in said["moved"] if m["field"] == field)
+    assert moved["by"] == pytest.approx({"kp": np.log(0.7 / 0.8), "delay": 0.02}[field], rel=0.35)
+
+
+def test_a_zero_that_moved_is_named_at_its_joint(arm, folder, tmp_path, capsys):
+    shifted = [replace(s, qpos=s.qpos + np.array([0.0, 0.005])) for s in played(arm, 70, 6)]
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", shifted))
+    assert (code, [(m["joint"], m["field"]) for m in said["moved"]]) == (1, [("elbow", "offset")])
+    assert said["moved"][0]["by"] == pytest.approx(0.005, rel=0.2)
+    assert "calibrate" in said["advice"]
+
+
+def test_recordings_that_contradict_each_other_are_no_robot(arm, folder, tmp_path, capsys):
+    some = played(arm, 70, 5)
+    some[2] = replace(some[2], qpos=some[2].qpos + np.array([0.03, 0.0]))
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", some))
+    assert (code, said["verdict"]) == (1, "contradictory")
+    assert said["against"][0]["recording"] == "m72"
+    assert said["against"][0]["joint"] == "shoulder"
+
+
+def test_logs_that_cannot_be_read_are_an_error(folder, tmp_path, capsys):
+    assert main(["check", str(folder), str(tmp_path / "nothing")]) == 2
+    assert "nothing" in capsys.readouterr().err
