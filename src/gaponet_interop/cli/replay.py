@@ -14,7 +14,7 @@ from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.candidate import read_origin
 from gaponet.eval.tables import mrad
-from gaponet.files import whole
+from gaponet.files import whole, write_text
 from gaponet.parts import take
 from gaponet.robot import RobotSpec, load_robot
 
@@ -48,11 +48,15 @@ def replay(
         figure: .png and .svg to draw, of the first rollout.
     """
     from gaponet_interop.engine.rollout import SHARE, answers, summary
+    from gaponet_interop.setup.reading import read_first
 
     screen, spec = Out(json), load_robot(robot)
     draw = take("PROVIDES", "figure of a replay", "drawing") if figure else None
     known, std = _known(screen, robot, data, spec)
     with tempfile.TemporaryDirectory() as place:
+        _, _, guessed = read_first(logs, spec, described)
+        if guessed:
+            write_text(described := Path(place) / "logs.toml", guessed)
         report = api.import_logs(logs, spec, Path(place) / "data", "rollout", payload_mass, logs=described)
         rollouts = report.dataset.sequences(report.entries)
     found = answers(spec, rollouts, known, std)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import shlex
 import signal
 import sys
@@ -19,18 +18,15 @@ from gaponet.cli.logs import show_diagnosis
 from gaponet.cli.main import commands, main
 from gaponet.cli.options import Flag, Folder, Json
 from gaponet.cli.out import Out
-from gaponet.errors import GAPONetError, UsageError
+from gaponet.errors import UsageError
 from gaponet.files import write_text, writing
 from gaponet.robot import RobotSpec, as_option, available, load_robot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from gaponet.data.log import Log
     from gaponet_interop.setup.new import Wanted
 
 RAN = "commands.sh"  # what ran to its end, a line each
-NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)  # lines of a logs.toml by which joints are told apart
 NEAR = 0.01  # of a rate in whole Hz, from which a clock's rounding is told
 
 
@@ -134,8 +130,8 @@ def understand(model: Path, logs: Path, told: Path, wanted: Wanted, keep: bool =
     Raises:
         RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
     """
-    from gaponet.data.formats import find_logs, read_logs
     from gaponet_interop.setup.new import new_robot
+    from gaponet_interop.setup.reading import UnreadError, read_first
 
     with tempfile.TemporaryDirectory() as place:
         if (model / "robot.toml").is_file():
@@ -144,55 +140,16 @@ def understand(model: Path, logs: Path, told: Path, wanted: Wanted, keep: bool =
             robot = load_robot(packaged := str(model))
         else:
             robot, packaged = new_robot(model, Path(place) / "robot", wanted).robot, ""
-
-        def by(file: Path | None, described: str = "") -> Understood:
-            log = next(iter(read_logs(logs, robot, logs=file)), None)
-            if log is None:
-                raise UsageError(f"{logs}: holds no recording")
-            return Understood(robot, packaged, log[1], len(find_logs(logs)), described)
-
-        if told.is_file():
-            return by(told)
         try:
-            return by(None)
-        except GAPONetError as error:
-            return _guessed(logs, robot, told, keep, by, error)
-
-
-def _guessed(
-    logs: Path,
-    robot: RobotSpec,
-    told: Path,
-    keep: bool,
-    by: Callable[[Path, str], Understood],
-    error: GAPONetError,
-) -> Understood:
-    """The same by a logs.toml that is guessed; a person has to look at one that says which joint is which."""
-    from gaponet.data.describe.guess import guess_logs
-    from gaponet.data.formats import look
-
-    try:
-        kind, known, recordings = look(logs)
-    except GAPONetError:
-        raise error from None
-    text = guess_logs(recordings, robot, kind, dict(known))
-    why = "which joint is which is a guess" if NAMED.search(text) else ""
-    with tempfile.TemporaryDirectory() as place:
-        file = Path(place) / "logs.toml"
-        write_text(file, text)
-        try:
-            found = by(file, text)
-            if not why or not keep:
-                return found
-        except GAPONetError as again:
-            why = str(again)
-    if not keep:
-        raise UsageError(f"{why}. As far as these logs explain themselves:\n{text}")
-    told.parent.mkdir(parents=True, exist_ok=True)
-    write_text(told, text)
-    raise UsageError(
-        f"{why}: {told} says what these logs show of themselves; look it over, and give the same command again"
-    )
+            return Understood(robot, packaged, *read_first(logs, robot, told if told.is_file() else None, not keep))
+        except UnreadError as unread:
+            if not keep:
+                raise UsageError(f"{unread}. As far as these logs explain themselves:\n{unread.text}") from None
+            told.parent.mkdir(parents=True, exist_ok=True)
+            write_text(told, unread.text)
+            raise UsageError(
+                f"{unread}: {told} says what these logs show of themselves; look it over, then the same command again"
+            ) from None
 
 
 def plan(found: Understood, model: Path, logs: Path, out: Path, wanted: Wanted, stated: list[str]) -> list[list[str]]:

@@ -88,11 +88,3 @@ def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
     assert main(["start", "arm.xml", "logs"]) == 2
     assert "no fit mends it" in capsys.readouterr().err
     assert not Path("started/identified").exists()
-
-
-def test_the_whole_way_ends_in_a_robot_that_moves_like_the_logs(place, capsys):
-    assert main(["start", "arm.xml", "logs", "--to", "json", "--budget", "4s"]) == 0
-    facts = json.loads(Path("started/identified/json/facts.json").read_text())
-    assert facts["joints"]["elbow"]["kp"] == pytest.approx(14.0, rel=0.1)
-    assert facts["joints"]["elbow"]["delay"] == pytest.approx(0.04, abs=0.008)
-    assert Path("started/identified/report.html").is_file()

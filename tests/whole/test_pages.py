@@ -1,0 +1,79 @@
+"""Three people, a page each: what for-labs.md, for-rl.md and for-research.md tell them to run, run in their order."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import XML, commands, record, write_arm
+
+from gaponet.cli.main import main
+from gaponet.robot import load_robot
+
+DOCS = Path(__file__).parents[2] / "docs"
+SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A model file, logs of an arm with weaker and later servos, logs of another day, and a rollout of a simulator."""
+    folder = tmp_path_factory.mktemp("pages")
+    (folder / "arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>"))
+    robot = write_arm(folder / "nominal")
+    for name, seeds, how in (("logs", range(5), {"kp": 0.7, "delay": 2}), ("new_logs", [11], {"kp": 0.65, "delay": 2}),
+                             ("rollouts", [12], {})):  # fmt: skip
+        (folder / name).mkdir()
+        for seed in seeds:
+            s = record(robot, commands(300, seed), f"m{seed}", **how)
+            table = np.concatenate([s.dt * np.arange(300)[:, None], s.ctrl, s.qpos], axis=1)
+            head = "time,ctrl.shoulder,ctrl.elbow,qpos.shoulder,qpos.elbow"
+            np.savetxt(folder / name / f"m{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f")
+    return folder
+
+
+def blocks(page):
+    """(language, text) of a page's blocks."""
+    return re.findall(r"```(console|python)\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def play(page, capsys):
+    """Run a page from top to bottom; what it printed."""
+    capsys.readouterr()
+    for language, text in blocks(page):
+        if language == "python":
+            exec(compile(text, page, "exec"), {"__name__": page})
+            continue
+        for line in text.splitlines():
+            words = shlex.split(line)
+            if words[0] == "python":
+                print(subprocess.run([sys.executable, words[1]], capture_output=True, text=True, check=True).stdout)
+            else:  # the pages' fits take a minute; here they take seconds
+                quick = ["--budget", "3s"] if words[1] == "start" else []
+                assert main([*words[1:], *quick]) == 0, line
+    return " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("page", ["for-labs.md", "for-rl.md", "for-research.md"])  # each goes on where the last ended
+def test_a_page_does_what_it_says(place, monkeypatch, capsys, page):
+    monkeypatch.chdir(place)
+    said = play(page, capsys)
+    if page == "for-labs.md":
+        assert (place / "started/identified/report.html").is_file()
+        assert (place / "today/robot.toml").is_file()
+        found = load_robot(place / "started/identified")
+        assert found.kp[found.operated_index] == pytest.approx([14.0, 14.0], rel=0.1)
+        assert found.delay[found.operated_index] == pytest.approx([0.04, 0.04], abs=0.008)
+        here, there = map(float, re.search(r"the MJCF alone: ([\d.]+) mrad; in gaponet ([\d.]+)", said).groups())
+        assert abs(here - there) <= 0.02 * there + 0.01
+    if page == "for-rl.md":
+        assert "The robot would not do what the simulator did: " in said
+        assert (place / "mine/arm.xml").is_file()
+        assert len(np.load(place / "answer.npz")["joints"]) == 2
+    if page == "for-research.md":
+        nominal, mine, found = (
+            float(re.search(rf"{n}: ([\d.]+) mrad", said)[1]) for n in ("nominal", "mine", "identified")
+        )
+        assert found < mine < nominal
