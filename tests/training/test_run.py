@@ -232,7 +232,7 @@ def test_budgets(text, seconds, steps):
     assert Budget.parse(text) == Budget(seconds, steps)
 
 
-@pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s"])
+@pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s", "10"])
 def test_a_budget_that_makes_no_sense_is_refused(text):
     with pytest.raises(UsageError, match="--budget"):
         Budget.parse(text)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gaponet.errors import UsageError
 
 MOST = 1e12  # of steps or of any unit of time
+FEWEST = 100  # steps; whoever asks for fewer has left out a unit
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -29,6 +30,8 @@ class Budget:
         if not match or not 0 < number <= MOST:
             raise UsageError(f"--budget {text}: give a time such as 90s, 10m or 2h, or a number of control steps")
         unit = match.group(2).lower()
+        if not unit and number < FEWEST:
+            raise UsageError(f"--budget {text}: {number:g} control steps teach nothing; is it {text}s or {text}m?")
         return cls(seconds=number * UNITS[unit]) if unit else cls(steps=int(number))
 
     def spent(self, seconds: float, steps: int) -> float:
@@ -56,8 +59,8 @@ class Status:
 
     @property
     def note(self) -> str:
-        """Stage, reward, held-out error and speed, what there is of them."""
+        """Stage, reward, validation error and speed, what there is of them."""
         reward = "" if self.reward != self.reward else f", reward {self.reward:.4f}"
         best = f"{self.best_mpjae / self.nominal_mpjae:.2f} of nominal"
-        held = "" if self.val_mpjae != self.val_mpjae else f", held-out {self.val_mpjae * 1e3:.2f} mrad (best {best})"
+        held = "" if self.val_mpjae != self.val_mpjae else f", validation {self.val_mpjae * 1e3:.2f} mrad (best {best})"
         return f"{self.stage}{reward}{held}, {self.throughput:,.0f} steps/s"

@@ -7,6 +7,7 @@ import pytest
 from logs import arm_columns, table_text, wave
 
 from gaponet.cli.main import main
+from gaponet.data.describe.joints import resolve_all
 from gaponet.data.formats import detect, read_logs
 from gaponet.data.log import skipping
 from gaponet.data.store import Dataset
@@ -86,6 +87,11 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
         list(read_logs(folder, arm))
     write(tmp_path / "logs", NAMES + 'ignore = ["hip", "kn*"]\n', columns=columns)
     assert next(read_logs(folder, arm))[1].joint_names == ("shoulder", "elbow")
+
+
+def test_names_that_are_all_another_robots_say_whose(arm, so101):
+    with pytest.raises(JointMismatchError, match="no joint of robot 'arm', all of --robot so101"):
+        resolve_all(so101.operated, arm, "a.csv", None)
 
 
 @pytest.mark.parametrize("delimiter", [",", "\t", "   ", ";"])

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 from gaponet.errors import JointMismatchError
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, available, load_robot
 
 
 def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None) -> list[str]:
@@ -29,6 +29,11 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             strange.append((name, error))
     if len(strange) == 1:
         raise strange[0][1]
+    kin = [] if found or joint_map else [name for name in available() if _all_of(name, names)]
+    if strange and kin:
+        raise JointMismatchError(
+            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of --robot {kin[0]}"
+        )
     if strange:
         free = [j for j in robot.joint_names if j not in found]
         maps = []
@@ -43,6 +48,14 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
     if len(set(found)) != len(found):
         raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map or [names]")
     return found
+
+
+def _all_of(name: str, joints: Sequence[str]) -> bool:
+    """Whether these are all joints of a robot of the package."""
+    try:
+        return bool([load_robot(name).resolve(joint, "") for joint in joints])
+    except JointMismatchError:
+        return False
 
 
 def ignored(name: str, patterns: Sequence[str]) -> bool:
