@@ -16,6 +16,7 @@ from gaponet.methods import title
 from gaponet.spread import Table
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
+GROUPS = ("joint", "payload", "unit", "horizon", "motion")
 SHOWN = 8  # columns of the totals that a screen has room for
 
 
@@ -54,8 +55,8 @@ def show_verdict(out: Out, methods: dict[str, Any], dataset: str, folder: Path |
     out.say(f"next: {next_step(methods, dataset, folder, reported)}")
 
 
-def show_methods(out: Out, result: dict[str, Any]) -> None:
-    """The tables of gap and eval: totals by method, then by joint, payload, unit, horizon and motion."""
+def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GROUPS) -> None:
+    """The tables of gap and eval: totals by method, then by each group."""
     methods, kind = result["methods"], "VIRTUAL robot" if result["virtual"] else "real robot"
     out.say(
         f", {kind}, {result['sequences']} sequences, whole-motion free run; simulator {result['simulator_hash']}",
@@ -66,7 +67,7 @@ def show_methods(out: Out, result: dict[str, Any]) -> None:
     ran = result.get("simulators", {})
     if len(set(ran.values())) > 1:
         out.say("; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items()), "ran in: ")
-    for group in ("joint", "payload", "unit", "horizon", "motion"):
+    for group in groups:
         if group not in ("payload", "unit") or len(methods["nominal"][f"by_{group}"]) > 1:
             out.show(f"By {group}{UNITS.get(group, '')}", by_group(methods, group))
 

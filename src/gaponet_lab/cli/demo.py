@@ -9,14 +9,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gaponet import api
-from gaponet.cli.gap import gap
+from gaponet.cli.gap import show_methods
 from gaponet.cli.identify import identify
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.cli.train import evaluate
 from gaponet.errors import UsageError
+from gaponet.eval.verdict import verdict
 from gaponet.progress import bar
-from gaponet.robot import load_robot
+from gaponet.robot import as_option, load_robot
 from gaponet.training.config import TrainConfig, WarmStartConfig
 
 QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
@@ -50,21 +50,30 @@ def demo(
     screen, began = Out(json), time.monotonic()
     dataset, known, run = out / "dataset", out / "robot", out / "network"
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
-        screen.say(": logs in, and how far the simulator is from them", "1 Measure")
+        screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
         holdout = _make_dataset(dataset, data, robot, screen)
-        gap(str(dataset), robot=robot)
-        screen.say(": the causes, fitted to some motions and chosen on others", "2 Identify")
+        gap = api.gap(str(dataset), robot)
+        show_methods(screen, gap, ("joint",))
+        for sentence in verdict(gap["methods"]):
+            screen.say(sentence)
+        screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {known})", "2 Identify")
         if not (known / "robot.toml").is_file():
             identify(str(dataset), known, budget=budget, robot=robot, holdout_units=holdout)
-        screen.say(f": {known} is a simulator that moves like the robot; does a network find more?", "3 Use")
+        screen.say(
+            f": does a network find more?  (gaponet train {dataset} --robot {as_option(known)} --out {run})", "3 Use"
+        )
         resume = (run / "checkpoint.pt").is_file()
         config = TrainConfig(warm_start=QUICK)
         api.train(Dataset(dataset), run, network, config, robot=known, holdout_units=holdout, resume=resume)
-    evaluate(run, str(dataset), json=json)
+    found = api.evaluate(run, str(dataset)).result
+    show_methods(screen, found, ("joint", "payload"))
     with bar("report") as update:
         path = write_report(run, progress=update, picture=portrait)
+    for sentence in verdict(found["methods"]):
+        screen.say(sentence)
     screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
-    screen.say(f"Next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot ./{known}")
+    screen.say(f"next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot {as_option(known)}")
+    screen.result(found)
 
 
 def require_extras() -> None:
