@@ -119,10 +119,10 @@ def doctor(
     drawn: list[Path] = []
     if figures is not None:
         draw_findings = take("PROVIDES", "figures of findings", "drawing")
-
         with writing(figures, "figures"):
             drawn = draw_findings(data, spec, diagnosis.findings, figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
+    out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")
     out.result({"dataset": data.path.name, "robot": spec.name, "logs_toml": mended,
                 "figures": [str(path) for path in drawn]} | diagnosis.as_dict())  # fmt: skip
 
