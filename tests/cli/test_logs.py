@@ -200,14 +200,16 @@ def test_a_table_asks_for_its_units(arm, tmp_path, capsys):
     )
 
 
-def test_doctor_speaks_and_ends_with_a_verdict(logs, tmp_path, capsys):
+def test_doctor_speaks_and_ends_with_a_verdict_and_what_comes_next(logs, tmp_path, capsys):
     import_so101(logs, tmp_path / "data")
     capsys.readouterr()
     assert main(["doctor", str(tmp_path / "data")]) == 0
     told = capsys.readouterr().out
     assert "so101, 1 sequences, 1 motions" in told
     assert "49.85" in told
-    assert told.strip().split("\n")[-1].startswith("Usable. Read the")
+    verdict, next_ = told.strip().split("\n")[-2:]
+    assert verdict.startswith("Usable. Read the")
+    assert next_ == f"next: gaponet gap {tmp_path / 'data'}"
 
 
 def test_doctor_prints_one_json_object_on_stdout(logs, tmp_path, capsys):
