@@ -6,7 +6,7 @@ velocities of so long ago, and the weights say when it begins to move, and by ho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -150,6 +150,12 @@ class Response:
     cross: Array
     power: Array
     duration: float
+
+    def later(self, seconds: float) -> Response:
+        """As if the state had been read so much later; unknown is as it was."""
+        lags = np.arange(self.cross.shape[-1]) * self.step
+        moved = [np.interp(lags - np.nan_to_num(seconds), lags, x) for x in self.cross.reshape(-1, len(lags))]
+        return replace(self, cross=np.reshape(moved, self.cross.shape).astype(np.float32))
 
     @classmethod
     def of(cls, ctrl: Array, qpos: Array, dt: float) -> Response:

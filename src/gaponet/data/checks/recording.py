@@ -7,12 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.data.checks.finding import Finding, some
+from gaponet.data.checks.finding import Finding, names, some
 from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
 
 COARSE = 3e-3  # rad
 HALTED = 1.0  # s
+ALIKE = 0.02  # share by which an encoder's steps may differ
 ENOUGH = 20  # rows of torque cut off flat
 
 
@@ -154,6 +155,10 @@ def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Findi
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions told finely enough?"""
     step = np.max([s.step for s in surveys], axis=0)
+    degrees = names(robot, np.abs(np.radians(step) / np.median(step[step > 0]) - 1) < ALIKE) if step.any() else ()
+    if degrees and len(degrees) < (step > 0).sum() / 2:
+        text = f"{', '.join(degrees)} is told in steps 57.3 times as coarse as other joints: degrees beside radians?"
+        yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
     coarse = [(float(x), name) for x, name in zip(step, robot.joint_names, strict=True) if x > COARSE]
     if not coarse:
         yield Finding("ok", "resolution", f"positions are told in steps of at most {step.max() * 1e3:.2f} mrad")

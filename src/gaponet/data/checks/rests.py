@@ -28,6 +28,7 @@ SOFTNESS = (0.5, 1.8)
 LOAD = 0.01  # rad of nominal sag (rms), below which softness says nothing
 APART = 0.03  # rad between sequences of one robot
 MASS, SHARE = 0.25, 0.5  # of the heaviest label, or kg; of a sequence's misfit that another mass must explain
+FELT = 1e-3  # rad by which a joint rests elsewhere with another label
 EVIDENCE = 10.0  # of other labels: rests times the logarithm by which their scatter falls
 UNITS, CLEAR = 0.006, 6.0  # rad between two groups of recordings, and times the scatter inside them
 PLAIN = np.array([0.0, 0.0, 1.0, 0.0])  # offset, scale − 1, softness, stiction of a motor as stated
@@ -179,7 +180,8 @@ def _relabelled(surveys: list[Survey], found: _Rests, judged: list[int]) -> list
             fits = [_solve(c[mine], found.error[mine])[2] for c in (found.columns, columns)]
             evidence += float(mine.sum() * np.log(fits[0] / fits[1]))
         best = max(best, (evidence, order))
-    if best[0] < max(EVIDENCE, 0.1 * len(found.error)):
+    felt = np.abs(found.per_kg) * (labels[-1] - labels[0]) > FELT
+    if best[0] < max(EVIDENCE, 0.1 * felt.sum()):
         return []
     told = ", ".join(f"{a:g} kg rests as {b:g} kg" for a, b in zip(labels, best[1], strict=True) if a != b)
     text = f"what is labelled {told}: payload labels in each other's place? Import again with the right --payload-mass"

@@ -10,19 +10,20 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding
-from gaponet.data.signals import following
+from gaponet.data.signals import Response, following
 from gaponet.data.survey import HERTZ, Survey
 from gaponet.robot import RobotSpec
 
+ROUNDS = 6  # of shifts and of what all follow
 FEW = 4  # recordings that say nothing of one among them
-LATE, FAR = 0.015, 6.0  # s, and times the usual scatter, by which a recording follows later than the others
+LATE, FAR = 0.012, 4.0  # s, and times the usual scatter, by which a recording follows later than the others
 FIRST = -0.015  # s: joints that begin so long before their command
 LONG, APART = 0.1, 0.05  # s: dead time worth a warning; of one joint beyond the others'
 DEAD_TIMES = (
     (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
-DRIFT, SURE = 3e-4, 5.0  # s a second, and standard errors
+DRIFT, SURE = 3e-4, 4.5  # s a second, and standard errors
 NOTCH = 1.5  # depth, natural logarithm of power
 WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 GAP = 2.5  # periods without a sample
@@ -36,13 +37,12 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     same = [s for s in same if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or same
     op, fields = robot.operated_index, ("own", "cross", "power")
     own = [replace(s.response, **{f: getattr(s.response, f)[:, op] for f in fields}) for s in same]
-    told = following(own)
-    found = [*_late(same, told.whole)]
-    if found:
-        odd = {f.values["motion"] for f in found}
-        told = following(own, [s.motion not in odd for s in same])
+    found = [*_late(same, own)]
+    odd = {f.values["motion"] for f in found}
+    told = following(own, [s.motion not in odd for s in same])
     onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
-    if onset < FIRST - step:
+    apart = SURE * _scatter(told.onset - onset)
+    if onset < FIRST - step or onset < -max(-FIRST / 3, step / 2, apart):
         text = (
             f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
             "their clocks apart? Shift one of them at import"
@@ -71,12 +71,30 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "timing", "commands and states keep one time")]
 
 
-def _late(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
-    known = np.isfinite(shifts)
-    if known.sum() < FEW:
+def _scatter(away: Array) -> float:
+    """Standard error of a median from which values are so far away; those unknown do not count."""
+    known = np.abs(away[np.isfinite(away)])
+    return 1.48 * float(np.median(known)) / np.sqrt(len(known)) if len(known) else np.inf
+
+
+def _shifts(own: list[Response]) -> Array:
+    """By how much each recording follows later than all do, (recordings) s: found together with how all follow, since
+    one that is late bends what is found of the others."""
+    more = following(own).whole
+    found = np.where(np.isfinite(more), 0.0, np.nan)
+    for _ in range(ROUNDS if np.isfinite(found).sum() >= FEW else 0):
+        away = np.nan_to_num(more - np.nanmedian(more))
+        found = found + np.where(np.abs(away) > LATE / 2, away, 0.0)
+        more = following([r.later(-s) for r, s in zip(own, found, strict=True)]).whole
+    return found + np.nan_to_num(more)
+
+
+def _late(surveys: list[Survey], own: list[Response]) -> Iterator[Finding]:
+    away = _shifts(own)
+    if np.isfinite(away).sum() < FEW:
         return
-    away = shifts - np.median(shifts[known])
-    usual = max(1.48 * float(np.median(np.abs(away[known]))), 1e-3)
+    away = away - np.nanmedian(away)
+    usual = max(1.48 * float(np.nanmedian(np.abs(away))), 1e-3)
     for s, late in zip(surveys, away.tolist(), strict=True):
         if abs(late) > max(LATE, FAR * usual):
             text = (
@@ -92,7 +110,8 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
     slope = slope[np.isfinite(slope)]
     if len(slope) < FEW:
         return
-    drift, error = float(np.median(slope)), float(max(slope.std(), 2e-3 / between.max()) / np.sqrt(len(slope)))
+    drift = float(np.median(slope))
+    error = max(_scatter(slope - drift), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
     if abs(drift) > max(DRIFT, SURE * error):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
