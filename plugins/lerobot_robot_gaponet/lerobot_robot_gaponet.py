@@ -28,6 +28,8 @@ from gaponet.process import child
 from gaponet.robot import RobotSpec, load_robot
 
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
+FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of it, newest first
+PAST = 50  # periods after which a correction has forgotten where it began
 START, BACK = 180.0, 60.0  # s: until the first state; until the arm is back where it was found
 
 
@@ -64,7 +66,8 @@ class GaponetSO101Config(RobotConfig):
     """SO-101 follower; its calibration is what so101_follower's lerobot-calibrate wrote."""
 
     port: str = "/dev/ttyACM0"
-    calibration: Path | None = None  # that file, compared with what the servos hold; without one the servos' counts
+    # That file, compared with what the servos hold; default that of --robot.id, without one the servos' counts.
+    calibration: Path | None = None
     known: Path | None = None  # robot folder of gaponet identify: targets are compensated by what is known of the arm
     model: Path | None = None  # run of gaponet train, on top; without both targets go to the arm as they are
     fps: float | None = None  # control rate, Hz, the same as LeRobot's: default what the model was trained at, else 30
@@ -105,6 +108,18 @@ class GaponetSO101(Robot):
 
     def calibrate(self) -> None:
         """lerobot-calibrate --robot.type=so101_follower does it; the servos hold what it found."""
+        raise NotImplementedError(
+            "gaponet_so101 calibrates nothing: lerobot-calibrate --robot.type=so101_follower, with "
+            f"--robot.id={self.config.id or 'NAME'}; gaponet_so101 takes its file by that id"
+        )
+
+    def _calibration(self) -> Path | None:
+        """The file that was named, or the one that LeRobot's own follower wrote for this id."""
+        if self.config.calibration is not None or not self.config.id:
+            return self.config.calibration
+        own = Path(self.calibration_fpath)
+        places = [own, *(own.parent.parent / name / own.name for name in FOLLOWERS)]
+        return next((place for place in places if place.is_file()), None)
 
     def configure(self) -> None:
         """Servos are left as they are set; the limits and the model's card ask what they have."""
@@ -143,7 +158,8 @@ class GaponetSO101(Robot):
         words += ["--targets", "zmq", "--live.address", address]
         words += ["--robot", str(config.known.absolute()), "--compensate"] if config.known else []
         words += ["--model", str(config.model)] if config.model else []
-        words += ["--calibration", str(config.calibration)] if config.calibration else []
+        calibration = self._calibration()
+        words += ["--calibration", str(calibration)] if calibration else []
         return child.words("gaponet", "run", *words, *shlex.split(config.options))
 
     def get_observation(self) -> dict[str, Any]:
@@ -285,11 +301,12 @@ class GaponetMotion(Teleoperator):
 @ProcessorStepRegistry.register("gaponet_correct")
 @dataclass
 class GaponetCorrect(ProcessorStep):
-    """Corrects SO-101 joint targets, once per control period, by a model at its rate, or by an identified robot at its.
+    """Corrects joint targets, once per control period, by a model at its rate, or by an identified robot at its.
 
     For a robot that is not gaponet_so101: the correction is bounded in size and rate, but nothing watches the arm. As
-    last step of a policy's postprocessor actions are tensors (..., 6) of all joints, and no state is known; as a robot
-    action processor they are named, and the observation is used.
+    last step of a policy's postprocessor (gaponet attach) actions are tensors (..., n) of all joints, one or a chunk
+    (1, T, n) to be sent one a period, and no state is known; as a robot action processor they are named, and the
+    observation is used.
     """
 
     model: str = ""
@@ -314,15 +331,16 @@ class GaponetCorrect(ProcessorStep):
 
     def reset(self) -> None:
         self._delta: np.ndarray | None = None
+        self._chunk: np.ndarray | None = None  # rows of the last one, and before them those of which it was the sequel
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         transition = transition.copy()
         action = transition[TransitionKey.ACTION]
         named = isinstance(action, dict)
-        flat = None if named else action.reshape(-1, len(self.units.keys))
-        if flat is not None and len(flat) != 1:
-            raise ValueError(f"gaponet_correct corrects one action a period, not {len(flat)}")
-        given = action if named else dict(zip(self.units.keys, flat[0].tolist(), strict=True))
+        if not named and action.reshape(-1, len(self.units.keys)).shape[0] > 1:
+            transition[TransitionKey.ACTION] = self._corrected_chunk(action)
+            return transition
+        given = action if named else dict(zip(self.units.keys, action.flatten().tolist(), strict=True))
         seen = transition.get(TransitionKey.OBSERVATION) or {}
         state = self.units.rad(seen) if all(key in seen for key in self.units.keys) else None
         sent = self.units.named(self._corrected(self.units.rad(given), state))
@@ -330,6 +348,24 @@ class GaponetCorrect(ProcessorStep):
             action | sent if named else torch.tensor(list(sent.values()), dtype=action.dtype).reshape(action.shape)
         )
         return transition
+
+    def _corrected_chunk(self, action: torch.Tensor) -> torch.Tensor:
+        """All rows of one chunk. Nobody says how many of the last one were sent: it goes on at the nearest of them, as
+        the correction would have gone on after those before it."""
+        if action.ndim > 2 and action.shape[:-2].numel() != 1:
+            raise ValueError(f"gaponet_correct corrects one robot's chunk, not {tuple(action.shape)}")
+        keys = self.units.keys
+        rows = [self.units.rad(dict(zip(keys, x.tolist(), strict=True))) for x in action.reshape(-1, len(keys))]
+        chunk = np.array(rows)
+        before = chunk[:0]
+        if self._chunk is not None:
+            nearest = int(np.abs(self._chunk - chunk[0]).max(axis=1).argmin())
+            before = self._chunk[max(0, nearest - PAST) : nearest]
+        self._delta = None
+        sent = np.array([self._corrected(row, None) for row in (*before, *chunk)])[len(before) :]
+        self._chunk = np.concatenate([before, chunk])
+        out = [list(self.units.named(row).values()) for row in sent]
+        return torch.tensor(out, dtype=action.dtype, device=action.device).reshape(action.shape)
 
     def _corrected(self, target: np.ndarray, qpos: np.ndarray | None) -> np.ndarray:
         if not np.isfinite(target).all():

@@ -9,6 +9,7 @@ COMMANDS = {
     "robot": "gaponet_interop.cli.robot:robot",
     "replay": "gaponet_interop.cli.replay:replay",
     "torque": "gaponet_interop.cli.torque:torque",
+    "attach": "gaponet_interop.cli.attach:attach",
     "push": "gaponet_interop.cli.share:push",
     "pull": "gaponet_interop.cli.share:pull",
 }

@@ -25,7 +25,7 @@ TASKS = {
     "The gap": ("gap", "view"),
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
     "Is it closed?": ("eval", "check", "replay", "report", "runs", "experiment"),
-    "On a robot, real or virtual": ("run", "record", "virtual"),
+    "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
     "Try it, time it, share it": ("start", "demo", "bench", "push", "pull"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
