@@ -35,6 +35,9 @@ def recordings_of(folder: Path, data: str | None, robot: RobotSpec) -> tuple[lis
         return None
     dataset = Dataset.opened(data)
     dataset.require_robot(robot)
+    first = dataset.read(dataset.entries[0])
+    if np.array_equal(first.ctrl, first.qpos):  # driven by torque: no position was commanded, so none can be followed
+        return None
     parts = split_entries(dataset, ())
     if origin is not None:
         known = {part: set(origin["parts"][part].values()) for part in ("train", "val")}

@@ -71,6 +71,7 @@ def test_a_driven_arm_is_found_and_moves_as_the_simulator_does_after(robot, tmp_
     assert np.mean(after) < 0.05 * np.mean(before)
     again = load_robot(tmp_path / "found")
     assert again.damping[0] == said["joints"]["shoulder"]["damping"]
+    assert main(["export", str(tmp_path / "found"), "--to", "json"]) == 0  # judged by what the robot itself answers
 
 
 def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):
