@@ -6,6 +6,8 @@ import io
 import json
 import random
 import re
+import zipfile
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +15,7 @@ import numpy as np
 
 Files = dict[str, bytes | None]  # path below a folder → content; None is a folder where a file is expected
 Change = Callable[[bytes, random.Random], bytes]
+UNREADABLE = (ValueError, LookupError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 
 NUMBERS = (
     "nan", "NaN", "inf", "-inf", "1e30", "-1e30", "1e400", "1e-320", "0", "-0.0", "-1", "1", "2", "0.5", "3.3", "100",
@@ -50,7 +53,7 @@ def change(name: str, content: bytes, rng: random.Random) -> bytes:
     kinds = [*of[0] * 3, _bytes] if of else [_text, _bytes]
     try:
         return rng.choice(kinds)(content, rng)
-    except Exception:  # what an earlier change left cannot be parsed: bytes can always be changed
+    except UNREADABLE:  # what an earlier change left cannot be parsed: bytes can always be changed
         return _bytes(content, rng)
 
 

@@ -550,7 +550,7 @@ class Controller:
             if self._guard and not self._guard.fired():
                 self._guard.beat(weight)
             self.driver.damp(weight, share)
-        except Exception as error:  # tried again in the next period
+        except Exception as error:  # whatever a driver raises, it is to damp: again next period; raised at the end
             if not isinstance(error, DriverError | OSError):
                 self._error = self._error or error
             if not any(e.text == str(error) for e in self.recording.events):
@@ -571,6 +571,6 @@ class Controller:
         self.recording.events.append(event)
         try:
             self._on_event(event)
-        except Exception as error:  # a closed terminal, say
+        except Exception as error:  # a listener is the caller's code, and may raise anything: damp, raise it at the end
             self._error = self._error or error
             self.stop(f"its listener failed: {error}")
