@@ -188,7 +188,7 @@ class Controller:
 
     def _loop(self, policy: Policy, keys: Keys | None) -> None:
         start, k, due = self.clock.now(), 0, 0  # due: the period that should follow the last one; k, the one that can
-        for text in ("waiting for fresh states", *self.driver.facts.get("notes", ())):
+        for text in ("waiting for fresh states", *self.driver.facts.get("remarks", ())):
             self._note(start, "", text)
         self._began = start
         while self.phase is not Phase.STOPPED:

@@ -58,8 +58,8 @@ class Driver(Protocol):
             found out by whether the joints follow.
         kp, kd: Gains that the real servos follow under `write`, (n), N·m/rad and N·m·s/rad; final once connected.
         qpos_range: Where the real joints end, (n, 2) rad, where the robot itself was told; final once connected.
-        facts: What a recording keeps about the servos beside (registers, kind of machine; notes, sentences for who runs
-            it); final once connected.
+        facts: What a recording keeps about the servos beside (registers, kind of machine; remarks, sentences for who
+            runs it); final once connected.
         at_end: After a run without fault: hand_over (hold while the weight goes from 1 to 0; the robot's own controller
             takes over), hold (servos keep the last target after `close`), damp (nobody holds it afterwards).
         at_stop: What `damp` does to it, as a verb: damps, lowers.

@@ -173,10 +173,10 @@ class SO101Driver:
         self.facts = {
             "servos": servo_facts,
             "calibration": {joint: asdict(row) for joint, row in held.items()},
-            "notes": self._notes(servo_facts),
+            "remarks": self._remarks(servo_facts),
         }
 
-    def _notes(self, facts: dict[str, list[int]]) -> list[str]:
+    def _remarks(self, facts: dict[str, list[int]]) -> list[str]:
         """How the servos are set otherwise than the robot says, in sentences."""
         notes, said = [], (self.robot.nominal or self.robot).kp
         odd = [(j, p, kp, k) for j, p, kp, k in zip(self.joint_names, facts["p"], self.kp, said, strict=True)

@@ -13,6 +13,7 @@ import pytest
 from robots.control.loopback import living
 
 from gaponet.data.importer import import_logs
+from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.errors import LogError
 from gaponet.robot import RobotSpec, load_robot
 from gaponet_robots.control.clock import SimulatedClock
@@ -171,6 +172,14 @@ def test_an_honest_arm_is_believed(so101, clock, bus):
     assert recording.fault is None
     assert [e.phase for e in recording.events] == ["idle", "blend_in", "run", "blend_out", "stopped"]
     assert bus.get(reg.TORQUE_ENABLE) == [1] * 6
+
+
+def test_what_is_remarked_about_the_servos_hinders_no_recording(so101, clock, bus):
+    bus.put(reg.P, 16)  # as LeRobot leaves them
+    recording = play(so101, clock)
+    assert any("16" in remark for remark in recording.meta["remarks"])
+    meta = SequenceMeta("so101", "lab", "sway", 0.0, "hand", "joint", 0, True, "sway.parquet")
+    assert len(to_sequence(recording.log(), so101, meta)) == 75
 
 
 # ---- ends

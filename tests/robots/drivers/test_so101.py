@@ -84,7 +84,7 @@ def test_the_gains_are_those_of_the_servos_and_what_differs_is_said(driver, so10
     np.testing.assert_allclose(driver.kp, 17.8 / 2)  # LeRobot's P of 16; robot.toml's 17.8 N·m/rad is 32
     assert driver.facts["servos"]["p"] == [16] * 6
     assert driver.facts["servos"]["torque_limit"] == [1000] * 6
-    (note,) = driver.facts["notes"]
+    (note,) = driver.facts["remarks"]
     assert note.startswith("P of all joints is 16, about 8.9 N·m/rad, robot.toml says 17.8")
 
 
@@ -97,7 +97,7 @@ def test_a_servo_that_is_set_otherwise_is_named(so101, wire, servos):
     driver = SO101Driver(so101, timeout=SILENCE)
     driver.connect()
     np.testing.assert_allclose(driver.kp, so101.kp)
-    i, limit, speed = driver.facts["notes"]
+    i, limit, speed = driver.facts["remarks"]
     assert i.startswith("shoulder_lift: I is not 0")
     assert limit.startswith("gripper: the torque limit")
     assert speed.startswith("elbow_flex: the servo limits its speed")
@@ -412,7 +412,7 @@ def follow(driver: SO101Driver, joint: int, by: float, seconds: float = 2.0) -> 
 
 def test_the_virtual_arm_follows_and_its_readings_are_whole_steps(connect, so101, arm):
     driver = connect()
-    assert driver.facts["notes"] == []
+    assert driver.facts["remarks"] == []
     roll = so101.index(["wrist_roll"])[0]
     assert abs(follow(driver, roll, 0.3)) < 0.05
     steps = driver.read().qpos[roll] / STEP + driver.steps.zero[roll]

@@ -1,0 +1,175 @@
+"""docs/first-ten-minutes.md and the run of README.md as they are written, on virtual robots behind their buses."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
+pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
+
+pytestmark = pytest.mark.faults
+
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs" / "first-ten-minutes.md").read_text(encoding="utf-8")
+BUSY = ["--rate", "4", "--safety.acceleration", "2"]  # machines that run tests are
+DOMAIN = str(20 + os.getpid() % 150)
+LONGEST = 90.0  # s for anything to be said
+
+
+class Terminal:
+    """A command of the page at a terminal: what it says, and keys."""
+
+    def __init__(self, written: str, *more: str, cwd: Path, **names: str) -> None:
+        """
+        Args:
+            written: A piece of the page.
+            more: Options beside.
+            names: What stands here for a word of the page.
+        """
+        assert written in PAGE, "the page says something else"
+        for word, there in names.items():
+            written = written.replace({"port": "/dev/ttyACM0", "link": "/tmp/so101"}[word], there)
+        words = [sys.executable, "-P", "-m", *written.split(), *more]
+        self.master, slave = os.openpty()
+        self.process = subprocess.Popen(
+            words, stdin=slave, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, cwd=cwd, bufsize=0
+        )
+        os.close(slave)
+        self.said = ""
+
+    def until(self, text: str) -> str:
+        """Wait until it has said something; all that it has said, in one line."""
+        self._read(lambda: text in self.said)
+        assert text in self.said, self.said
+        return " ".join(self.said.split())
+
+    def end(self, code: int = 0) -> str:
+        """Wait for its end."""
+        self._read(lambda: False)
+        assert self.process.wait(LONGEST) == code, self.said
+        return " ".join(self.said.split())
+
+    def _read(self, done: Callable[[], bool]) -> None:
+        assert self.process.stdout
+        deadline = time.monotonic() + LONGEST
+        while not done() and time.monotonic() < deadline:
+            if select.select([self.process.stdout], [], [], 0.1)[0]:
+                data = os.read(self.process.stdout.fileno(), 1 << 16)
+                if not data:
+                    return
+                self.said += data.decode(errors="replace")
+
+    def key(self, letter: str = "\n") -> None:
+        os.write(self.master, letter.encode())
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(LONGEST)
+        os.close(self.master)
+
+
+@pytest.fixture
+def at(tmp_path: Path) -> Iterator[Callable[..., Terminal]]:
+    opened: list[Terminal] = []
+
+    def open_one(*words: str, **names: str) -> Terminal:
+        opened.append(Terminal(*words, cwd=tmp_path, **names))
+        return opened[-1]
+
+    yield open_one
+    for terminal in opened:
+        terminal.close()
+
+
+def rows(joint: str) -> str:
+    """first.csv as the page has it, for a joint."""
+    table = re.search(r"    time,wrist_roll\n((?:    .*\n)+)", PAGE)
+    assert table
+    return f"time,{joint}\n" + re.sub(r"(?m)^    ", "", table[1])
+
+
+def test_an_so101_from_the_rehearsal_to_the_library(at, tmp_path):
+    (tmp_path / "first.csv").write_text(rows("wrist_roll"))
+    link, file = str(tmp_path / "so101"), str(tmp_path / "calibration.json")
+    served = at("gaponet virtual serve --robot so101 --link /tmp/so101", "--calibration", file, link=link)
+    served.until("Ctrl-C ends it")
+    time.sleep(2.0)  # it lies down
+
+    listening = at("gaponet robot link --driver so101 --port /dev/ttyACM0", port=link).end()
+    assert "states, a second" in listening
+    first = "gaponet run --driver so101 --port /tmp/so101 --motion first.csv"
+
+    run = at(first, *BUSY, link=link)
+    said = run.until("Enter to start")
+    assert "held where found: shoulder_pan, shoulder_lift, elbow_flex, wrist_flex, gripper" in said
+    assert "is held; a stop lowers it" in said
+    run.key()
+    said = run.end()
+    assert all(phase in said for phase in ("blend_in to the first target", "run motion", "blend_out end", "stopped"))
+
+    run = at(first, *BUSY, link=link)
+    run.until("Enter to start")
+    run.key()
+    run.until("to the first target")
+    run.key("x")
+    said = run.end(3)
+    assert "stop: asked to stop: key 'x'" in said
+    assert "stopped let go: all servos say that their torque is off" in said
+
+    words = ["--port", link, "--calibration", file, "--motion", "first.csv", "--dry-run", *BUSY]
+    assert "nothing was sent" in at("gaponet run --driver so101", *words).end()
+
+    words = ["--driver", "so101", "--port", link, "--motion", "tour-all-0", "--unit-id", "lab", "--payload-mass", "0"]
+    assert "added to set" in at("gaponet record", *words, "--out", "set", "--yes", *BUSY).end()
+    at("gaponet excite --robot so101 --out motions", "--minutes", "1").end()
+    motion = sorted((tmp_path / "motions").glob("*.txt"))[0]
+    words = ["--port", link, "--motion", str(motion), "--yes", *BUSY]
+    assert "stopped end: back where it was found; hold" in at("gaponet run --driver so101", *words).end()
+
+
+def test_an_h1_2_from_the_rehearsal_to_the_stop(at, tmp_path):
+    (tmp_path / "first.csv").write_text(rows("left_wrist_roll_joint"))
+    bus = ["--domain", DOMAIN]
+    at("gaponet virtual serve --robot h1_2 --unit 4", *bus, "--rate", "100").until("Ctrl-C ends it")
+    listening = at("gaponet robot link", *bus).end()
+    assert "rt/arm_sdk" in listening
+    first = "gaponet run --driver unitree --motion first.csv"
+
+    run = at(first, *bus, *BUSY)
+    said = run.until("Enter to start")
+    assert "torso" in said
+    run.key()
+    assert "stopped handed over" in run.end()
+
+    run = at(first, *bus, *BUSY)
+    run.until("Enter to start")
+    run.key()
+    run.until("to the first target")
+    run.key("x")
+    assert "stop: asked to stop: key 'x'" in run.end(3)
+
+    words = ["--motion", "sweep-left_elbow", "--unit-id", "lab", "--payload-mass", "0", "--out", "set", "--yes"]
+    assert "added to set" in at("gaponet record", "--driver", "unitree", *words, *bus, *BUSY).end()
+
+
+def test_the_readmes_command_on_a_robot(at, tmp_path):
+    """With the packaged robot in the place of an identified one, and a virtual bus in that of the real one."""
+    written = re.search(
+        r"gaponet run --motion FILE --robot \./my_so101 --driver so101 --compensate", (ROOT / "README.md").read_text()
+    )
+    assert written
+    (tmp_path / "first.csv").write_text(rows("wrist_roll"))
+    link = str(tmp_path / "so101")
+    at("gaponet virtual serve --robot so101 --link /tmp/so101", link=link).until("Ctrl-C ends it")
+    words = written[0].replace("FILE", "first.csv").replace("./my_so101", "so101").split()[2:]
+    said = at("gaponet run", *words, "--port", link, "--yes", *BUSY).end()
+    assert "stopped end: back where it was found; hold" in said
