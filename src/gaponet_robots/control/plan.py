@@ -110,12 +110,10 @@ class Planner:
             raise UsageError(f"motion '{motion.name}' begins with {self._said(start)}. Begin it elsewhere")
         fitted = self._calm(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
-        by_hand = "(bring the robot nearer by hand, or name more joints)"
-        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to where the motion begins {by_hand}"))
-        back = None
-        if self.config.blend_out:
-            back = ended(self._way(fitted.ctrl[-1], found, columns, near, f"back to where the robot is {by_hand}"))
-        return self._judged(Plan(found, into, fitted, back, changed=_changes(wanted, fitted)), near)
+        place = "where the robot is (bring it nearer by hand, or name more joints)"
+        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to where the motion begins from {place}"))
+        back = self._way(fitted.ctrl[-1], found, columns, near, f"back to {place}") if self.config.blend_out else None
+        return self._judged(Plan(found, into, fitted, back and ended(back), changed=_changes(wanted, fitted)), near)
 
     def begin(self, first: Array, found: Array) -> Plan:
         """The way from where the robot was found to the first of targets that come as it moves, both (n,) rad.
