@@ -257,8 +257,7 @@ class Controller:
 
     def _follows(self, state: State) -> Fault | None:
         """The joint that does not go where the last commands went."""
-        watched = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT)
-        if self._laden is None or self._ctrl is None or self.phase not in watched:
+        if not (self._laden and self._ctrl is not None and self.phase in COMMANDING[:3]):
             self.following.rest()
             return None
         handed = self._handed if self.driver.at_end == "hand_over" else 1.0

@@ -111,9 +111,10 @@ class Planner:
         fitted = self._calm(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
         place = "where the robot is (bring it nearer by hand, or name more joints)"
-        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to where the motion begins from {place}"))
-        back = self._way(fitted.ctrl[-1], found, columns, near, f"back to {place}") if self.config.blend_out else None
-        return self._judged(Plan(found, into, fitted, back and ended(back), changed=_changes(wanted, fitted)), near)
+        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to the motion's begin from {place}"))
+        way = self._way(fitted.ctrl[-1], found, columns, near, f"back to {place}")
+        back = ended(way) if self.config.blend_out else None
+        return self._judged(Plan(found, into, fitted, back, changed=_changes(wanted, fitted)), near)
 
     def begin(self, first: Array, found: Array) -> Plan:
         """The way from where the robot was found to the first of targets that come as it moves, both (n,) rad.
