@@ -30,6 +30,7 @@ def change(servos: Servos, how: str) -> None:
         at = rng.randrange(len(reply))
         return reply[:at] + bytes([reply[at] ^ rng.randrange(1, 256)]) + reply[at + 1 :]
 
+    servos.status[2] = 0
     if how in ("overload", "overheat", "voltage", "sensor"):
         servos.status[2] = {"voltage": 1, "sensor": 2, "overheat": 4, "overload": 32}[how]
     servos.adversary = {

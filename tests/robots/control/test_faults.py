@@ -7,7 +7,9 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
 from robots.control.robot_process import RobotProcess
 
 from gaponet.errors import UsageError
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot import load_robot
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import DriverError
 from gaponet_robots.control.phases import ControlConfig, Phase
@@ -31,6 +33,7 @@ DOMAIN = 20 + os.getpid() % 150
 SLOW = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=0.3)  # machines that run tests are busy
 SAFETY = SafetyConfig(acceleration=5.0)  # at 10 Hz a state is so old before it is too old
 ROBOT = load_robot("h1_2")
+TORSO = ROBOT.index(["torso_joint"])[0]
 AT = 4  # period of the run in which the fault is injected
 
 
@@ -48,23 +51,41 @@ def swing(k: int) -> np.ndarray:
     return target
 
 
-def run(at_fault, robot: RobotSpec = ROBOT, domain: int = DOMAIN) -> Recording:
-    """Swing; do something in period AT; give up long after."""
-
-    injected = [0.0]
+def once(at_fault: Callable[[], object], injected: list[float]) -> Recording:
+    """Swing; do something in period AT, and note when; give up long after."""
 
     def policy(k, state):
         if k == AT:
-            injected[0] = time.monotonic()
+            injected.append(time.monotonic())
             at_fault()
         return swing(k) if k < AT + 30 else None
 
-    driver = UnitreeDriver(robot, domain=domain)
-    recording = Controller(driver, robot, SLOW, SAFETY, guard=False).run(policy)
-    damped = next((e.time for e in recording.events if e.phase == Phase.DAMP), float("nan"))
-    kind = recording.fault.kind if recording.fault else "none"
-    print(f"{kind}: damped {1e3 * (damped - injected[0]):.0f} ms after the fault, live, {SLOW.rate:g} Hz")
-    return recording
+    return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+
+
+def steady(served: RobotProcess, attempt: Callable[[list[float]], Any], kind: str = "", tries: int = 8) -> Any:
+    """What an attempt gives in which this machine kept time.
+
+    A run that a late period or an old state ended before the fault was there, or in the place of another kind of fault,
+    tells of this machine and not of the controller: again. An attempt notes when it injects the fault.
+    """
+    for _ in range(tries):
+        served.ask("clear")
+        injected: list[float] = []
+        recording = attempt(injected)
+        fault = recording.fault
+        late = fault and fault.kind in ("stale", "overrun")
+        if not late or (fault.kind == kind and injected and fault.time > injected[0]):
+            if fault and injected:
+                passed = next((1e3 * (e.time - injected[0]) for e in recording.events if e.phase == Phase.DAMP), np.nan)
+                print(f"{fault.kind}: damped {passed:.0f} ms after the fault, live, {SLOW.rate:g} Hz")
+            return recording
+    pytest.fail(f"this machine is too busy: {tries} runs ended with {fault}")
+
+
+def arms(heard: dict[str, list]) -> np.ndarray:
+    """Stiffness that the robot heard, (commands, joints) without the torso, which is held while the arms damp."""
+    return np.delete(np.array(heard["kp"]).reshape(-1, len(ROBOT.joint_names)), TORSO, axis=1)
 
 
 def judge(recording: Recording, heard: dict[str, list]) -> None:
@@ -80,9 +101,8 @@ def judge(recording: Recording, heard: dict[str, list]) -> None:
     assert (ctrl[stiff] <= limits.high + 1e-6).all()
     assert (np.abs(np.diff(ctrl[stiff], axis=0)) <= limits.speed * 0.1 + 1e-6).all()
     np.testing.assert_array_equal(np.array(heard["kp"])[:, :12], 0.0)  # legs are never commanded
-    torso = ROBOT.index(["torso_joint"])
-    assert (np.array(heard["kp"])[:, torso] == ROBOT.kp[torso]).all(), "the torso is held"
-    assert np.ptp(np.array(heard["ctrl"])[:, torso]) == 0, "where it was found"
+    assert (np.array(heard["kp"])[:, TORSO] == ROBOT.kp[TORSO]).all(), "the torso is held"
+    assert np.ptp(np.array(heard["ctrl"])[:, TORSO]) == 0, "where it was found"
     assert heard["refused"] == 0
     for row in recording.rows:
         if row.ctrl is not None:
@@ -100,8 +120,7 @@ def judge(recording: Recording, heard: dict[str, list]) -> None:
     ],
 )  # fmt: skip
 def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
-    served.ask("clear")
-    recording = run(lambda: served.ask(f"fault {fault}"))
+    recording = steady(served, lambda injected: once(lambda: served.ask(f"fault {fault}"), injected), kind)
     assert recording.fault is not None
     assert recording.fault.kind == kind, recording.fault.text
     sent_after = sum(r.phase == "run" for r in recording.rows) - (AT + 1)
@@ -111,47 +130,53 @@ def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
 
 def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(served):
     """10 s ahead, and back again: the run goes on. Messages that cease are then seen as ever."""
-    served.ask("clear")
 
-    def policy(k, state):
-        word = {AT: "fault clock", AT + 5: "fault none", AT + 10: "fault clock", AT + 15: "fault stop"}.get(k)
-        if word:
-            served.ask(word)
-        return swing(k)
+    def attempt(injected: list[float]) -> Recording:
+        def policy(k, state):
+            word = {AT: "fault clock", AT + 5: "fault none", AT + 10: "fault clock", AT + 15: "fault stop"}.get(k)
+            if k == AT + 15:
+                injected.append(time.monotonic())
+            if word:
+                served.ask(word)
+            return swing(k)
 
-    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+        return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+
+    recording = steady(served, attempt, "stale")
     assert recording.fault.kind == "stale", recording.fault.text
     assert 0 <= sum(r.phase == "run" for r in recording.rows) - (AT + 15 + 1) <= 2
     judge(recording, served.ask("heard"))
 
 
 def test_a_robot_that_comes_back_is_not_commanded_again(served):
-    domain = DOMAIN + 1
-    robots = [RobotProcess(domain)]
+    domain, config = DOMAIN + 1, ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=8.0)
+    robots: list[RobotProcess] = []
 
-    def cut():
-        robots[0].kill()
+    def attempt(injected: list[float]) -> Recording:
+        def policy(k, state):
+            if k == AT:
+                injected.append(time.monotonic())
+                robots[-1].kill()
+            return swing(k)
 
-    driver = UnitreeDriver(ROBOT, domain=domain)
-    config = ControlConfig(rate=10, blend=0.3, blend_speed=4.0, settle=0.0, damp=8.0)
-    controller = Controller(driver, ROBOT, config, SAFETY, guard=False)
+        def told(event):
+            if event.phase == "damp" and injected:
+                robots.append(RobotProcess(domain))
 
-    def policy(k, state):
-        if k == AT:
-            cut()
-        return swing(k)
+        robots.append(RobotProcess(domain))
+        driver = UnitreeDriver(ROBOT, domain=domain, sole=False)  # DDS remembers for a while who commanded before
+        try:
+            return Controller(driver, ROBOT, config, SAFETY, guard=False, on_event=told).run(policy)
+        finally:
+            if not injected:
+                robots[-1].kill()
 
-    def told(event):
-        if event.phase == "damp":
-            robots.append(RobotProcess(domain))
-
-    controller._on_event = told
-    recording = controller.run(policy)
+    recording = steady(served, attempt, "stale")
     assert recording.fault.kind == "stale", recording.fault.text
-    heard = robots[1].ask("heard")
-    robots[1].kill()
+    heard = robots[-1].ask("heard")
+    robots[-1].kill()
     assert len(heard["kp"]) > 0
-    np.testing.assert_array_equal(np.delete(heard["kp"], 12, axis=1), 0.0)  # the torso is held while the arms damp
+    np.testing.assert_array_equal(arms(heard), 0.0)
 
 
 def test_a_g1_is_refused_and_hears_nothing(served):
@@ -159,7 +184,7 @@ def test_a_g1_is_refused_and_hears_nothing(served):
     served.ask("machine 5")
     time.sleep(0.2)
     with pytest.raises(DriverError, match="not an H1-2: its mode_machine is 5, a G1's; nothing was sent"):
-        run(lambda: None)
+        once(lambda: None, [])
     assert served.ask("heard")["time"] == []
     served.ask("clear")
 
@@ -177,29 +202,31 @@ def test_a_stop_before_the_start_and_a_robot_that_is_never_ready_send_nothing(se
 
 
 def test_a_good_run_ends_with_the_arms_held_until_they_are_the_robots_again(served):
-    served.ask("clear")
-    driver = UnitreeDriver(ROBOT, domain=DOMAIN)
-    recording = Controller(driver, ROBOT, SLOW, SAFETY).run(lambda k, state: ROBOT.qpos_home if k < 10 else None)
+    rest = lambda k, state: ROBOT.qpos_home if k < 10 else None  # noqa: E731
+    driver = lambda: UnitreeDriver(ROBOT, domain=DOMAIN)  # noqa: E731
+    recording = steady(served, lambda _: Controller(driver(), ROBOT, SLOW, SAFETY).run(rest))
     assert recording.fault is None
     heard = served.ask("heard")
-    arms = ROBOT.index(recording.commanded)
-    assert (np.array(heard["kp"])[:, arms] > 0).all(), "no damping: the arms would sink"
+    held = ROBOT.index(recording.commanded)
+    assert (np.array(heard["kp"])[:, held] > 0).all(), "no damping: the arms would sink"
     assert heard["weight"][-1] == 0.0
     sunk = recording.rows[-1].state.qpos - recording.rows[0].state.qpos
     assert np.abs(sunk).max() < 0.05
 
 
 def test_a_policy_that_crashes_leaves_a_damped_robot(served):
-    served.ask("clear")
-
     def crash():
         raise ZeroDivisionError
 
-    with pytest.raises(ZeroDivisionError):
-        run(crash)
+    def attempt(injected: list[float]) -> Any:
+        try:
+            return once(crash, injected)
+        except ZeroDivisionError:
+            return SimpleNamespace(fault=None, raised=True)
+
+    assert steady(served, attempt).raised
     time.sleep(0.3)
-    kp = np.array(served.ask("heard")["kp"])
-    damped = (kp == 0).all(axis=1)
+    damped = (arms(served.ask("heard")) == 0).all(axis=1)
     assert damped.sum() >= 3, "SLOW damps for three periods"
     assert (np.diff(damped.astype(int)) >= 0).all()
 
@@ -242,26 +269,34 @@ Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY).r
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
 def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how):
-    served.ask("clear")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
-    process = subprocess.Popen([sys.executable, "-c", CONTROLLER, str(DOMAIN)], env=environment)
-    try:
-        wait(lambda: len(served.ask("heard")["kp"]) > 10)
-        with pytest.raises(UsageError, match="another process commands this robot"):
-            run(lambda: None)
-        process.send_signal(how)
-        wait(lambda: not np.any(served.ask("heard")["kp"][-1]))
-        heard = served.ask("heard")
-        stiff = np.any(heard["kp"], axis=1)
-        assert (np.diff(stiff.astype(int)) <= 0).all()
-        wait(lambda: served.ask("heard")["weight"][-1] < 0.05)  # in the end the arms are handed back
-        process.send_signal(signal.SIGCONT)  # who comes back from standing still has nothing more to say
-        process.wait(20)
-        time.sleep(0.3)
-        assert not np.any(served.ask("heard")["kp"][-1])
-    finally:
-        process.kill()
-        process.wait()
+    for _ in range(8):
+        served.ask("clear")
+        process = subprocess.Popen([sys.executable, "-c", CONTROLLER, str(DOMAIN)], env=environment)
+        try:
+            wait(lambda process=process: len(arms(served.ask("heard"))) > 10 or process.poll() is not None)
+            refused = False
+            try:
+                once(lambda: None, [])
+            except UsageError as error:
+                refused = "another process commands this robot" in str(error)
+            if process.poll() is not None or not arms(served.ask("heard"))[-1].any():
+                continue  # a late period has ended it
+            process.send_signal(how)
+            assert refused
+            wait(lambda: not arms(served.ask("heard"))[-1].any())
+            heard = served.ask("heard")
+            assert (np.diff(arms(heard).any(axis=1).astype(int)) <= 0).all()
+            wait(lambda: served.ask("heard")["weight"][-1] < 0.05)  # in the end the arms are handed back
+            process.send_signal(signal.SIGCONT)  # who comes back from standing still has nothing more to say
+            process.wait(20)
+            time.sleep(0.3)
+            assert not arms(served.ask("heard"))[-1].any()
+            return
+        finally:
+            process.kill()
+            process.wait()
+    pytest.fail("this machine is too busy: no controller lived until it was to be ended")
 
 
 def wait(done, seconds: float = 60.0) -> None:

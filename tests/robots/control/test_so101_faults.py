@@ -67,7 +67,18 @@ def servos() -> Iterator[ServoProcess]:
 
 
 def move(servos: ServoProcess, fault: str) -> Recording:
-    """Play a motion during which the servos go wrong."""
+    """Play a motion during which the servos go wrong; again where a late period of this machine ended it before."""
+    for _ in range(8):
+        recording = once(servos, fault)
+        late = recording.fault and recording.fault.kind in ("overrun", "stale")
+        reached = len(recording.during("run")) > AT
+        if not late or (fault in ("dead", "silent", "corrupt", "late", "babble") and reached):
+            return recording
+        servos.tell("well")
+    pytest.fail(f"this machine is too busy: {recording.fault}")
+
+
+def once(servos: ServoProcess, fault: str) -> Recording:
     driver = SO101Driver(ROBOT, servos.port, timeout=TIMEOUT)
 
     def policy(k: int, state: object) -> np.ndarray | None:
