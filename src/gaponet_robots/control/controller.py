@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -37,6 +37,8 @@ from gaponet_robots.control.stop import Keys, StopRequest, on_signal
 from gaponet_robots.motion.minjerk import blend
 from gaponet_robots.motion.way import Search, Way
 from gaponet_robots.targets.policy import NotYet, Policy, play
+
+_T = TypeVar("_T")
 
 
 class Compensates(Protocol):
@@ -129,7 +131,7 @@ class Controller:
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
             self._planner = Planner(robot, driver.commanded, self.config, self.safety)
         self._fence: Fence | None = None
-        self._looking: Search[Way] | None = None  # for the way back from targets that were not known in advance
+        self._looking: Search[Any] | None = None  # for the ways to and from targets that are not known in advance
         self._cut = ""  # what a target was cut for in the last period
         self._since = self._fresh = 0
         self._unfresh: Fault | None = None
@@ -323,17 +325,21 @@ class Controller:
             return
         first = policy(0, state)
         if isinstance(first, Fault):
-            self._began = now  # all else is well
-            if not isinstance(first, NotYet):
+            if isinstance(first, NotYet):
+                self._began = now  # all else is well
+            elif (
+                first.kind != "silence" or not self.plan or now - self._began > PATIENCE
+            ):  # senders wait while it plans
                 self._fail(k, now, first)
             return
         if first is None or not np.isfinite(first[self.joints]).all():
             self._fail(k, now, Fault("target", "the motion has no first target, or it is not a number"))
             return
+        before = self.plan
         unsafe = self._planned(first, state, now) or self._admitted(state.qpos[self.joints])
         if unsafe:
             self._fail(k, now, unsafe)
-        if unsafe or not self._fresh:
+        if unsafe or (self._planner and (before is None or self.plan is not before)):
             return
         self._found = state.qpos[self.joints].copy()
         self._ctrl, self._asked = self._found.copy(), self._found.copy()
@@ -351,12 +357,29 @@ class Controller:
                 return None
             if self.plan.motion is not None:
                 return Fault("plan", f"{joint} moved by {moved.max():.2f} rad since the plan was made; run it again")
+            self.plan = None
         if self._planner is not None:
+            self._looking = self._looking or self._planner.begin(first, state.qpos)
             try:
-                self.plan = self._planner.begin(first, state.qpos)
+                self.plan = self._look(self._looking)
             except UsageError as error:
                 return Fault("plan", str(error))
-            self._fresh, self._began = 0, now  # it may have taken longer than a period
+            self._began = now
+        return None
+
+    def _look(self, search: Search[_T]) -> _T | None:
+        """Go on looking for a share of this period: what was found; None where it is not over.
+
+        Raises:
+            UsageError: There is none.
+        """
+        until = self.clock.now() + LOOK * self.dt
+        try:
+            while self.clock.now() <= until:
+                next(search)
+        except StopIteration as end:
+            self._looking = None
+            return end.value
         return None
 
     def _admitted(self, found: Array) -> Fault | None:
@@ -497,10 +520,15 @@ class Controller:
                 ends = self._full(self._last, state), self._full(self._found, state)
                 self._looking = self._planner.back(*ends) if self.dt >= SLOW else None
         if self._looking:
-            if why := self._look(self._looking, k, state):
-                return self._end(k, now, f"where it is: {why}")
-            if self._looking:
+            try:
+                way = self._look(self._looking)
+            except UsageError as error:
+                self._looking = None
+                return self._end(k, now, f"where it is: {error}")
+            if way is None:
                 return self._last, 1.0
+            self._since = k
+            self._go(way, self._last, self._found, state)
         passed = (k - self._since) * self.dt
         if self.phase is Phase.RELEASE:
             if self._weight == 0.0:
@@ -514,20 +542,6 @@ class Controller:
             self._last = self._found
             return self._end(k, now, "back where it was found")
         return self._along(passed, self._from, self._found), 1.0
-
-    def _look(self, search: Search[Way], k: int, state: State) -> str:
-        """Go on looking for the way back for a share of this period, while the robot stands; why there is none."""
-        until = self.clock.now() + LOOK * self.dt
-        try:
-            while self.clock.now() <= until:
-                next(search)
-        except StopIteration as end:
-            self._looking, self._since = None, k
-            self._go(end.value, self._last, self._found, state)
-        except UsageError as error:
-            self._looking = None
-            return str(error)
-        return ""
 
     def _end(self, k: int, now: float, text: str) -> tuple[Array | None, float]:
         """The end of a run without fault, as the driver's robot can have it."""

@@ -116,8 +116,9 @@ class Planner:
         back = ended(way) if self.config.blend_out else None
         return self._judged(Plan(found, into, fitted, back, changed=_changes(wanted, fitted)), near)
 
-    def begin(self, first: Array, found: Array) -> Plan:
-        """The way from where the robot was found to the first of targets that come as it moves, both (n,) rad.
+    def begin(self, first: Array, found: Array) -> Search[Plan]:
+        """The way from where the robot was found to the first of targets that come as it moves, both (n,) rad; looks
+        for it step by step.
 
         Raises:
             UsageError: As `plan`.
@@ -133,7 +134,8 @@ class Planner:
         shares = np.linspace(1.0, 0.0, 41)[:, None]  # one that is only too near is not gone to as far as that
         clear = (self.collision.distances(found + shares * (goal - found)) >= near).all(axis=1)
         goal = found + float(shares[int(clear.argmax()), 0]) * (goal - found)
-        return self._judged(Plan(found, ended(self._way(found, goal, moved, near, "to the first target"))), near)
+        into = yield from self._way(found, goal, moved, near, "to the first target")
+        return self._judged(Plan(found, into), near)
 
     def _calm(self, motion: Motion) -> Motion:
         """The motion, slowed where it accelerates more than joints can."""

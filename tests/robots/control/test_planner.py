@@ -74,7 +74,7 @@ def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
     with pytest.raises(UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"):
         planner.plan(motion(so101, under), FOLDED)
     with pytest.raises(UsageError, match=r"the first target brings .* and the plane at 0 m"):
-        planner.begin(under, FOLDED)
+        ended(planner.begin(under, FOLDED))
 
 
 def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():

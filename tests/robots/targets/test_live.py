@@ -230,6 +230,37 @@ def test_a_sender_that_dies_while_the_robot_goes_to_its_first_target_ends_in_dam
     judge(arm, recording)
 
 
+def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
+    """It says something only where it has heard a state; none comes while the way to its first target is looked for."""
+    clock = SimulatedClock()
+
+    class Answering(Scripted):
+        def receive(self):
+            said, self.said = self.said, []
+            return said
+
+        def publish(self, to, state):
+            self.said = [Heard("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]
+
+    wire = Answering(clock, None)
+    config = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
+    targets = LiveTargets(wire, so101, so101.joint_names, clock, DT, 5.0)
+    driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), clock)
+    controller = Controller(driver, so101, config, clock=clock)
+    begin = controller._planner.begin
+
+    def slow(first, found):
+        for _ in range(400):
+            clock._now += 0.005
+            yield
+        return (yield from begin(first, found))
+
+    controller._planner.begin = slow
+    recording = controller.run(lambda k, state: targets(k, state) if k < 20 else None)
+    assert recording.fault is None, recording.fault
+    assert [e.phase for e in recording.events] == ["idle", "blend_in", "run", "blend_out", "stopped"]
+
+
 def test_a_message_without_a_clock_is_taken_as_it_comes(arm):
     recording, *_ = live(arm, lambda t: [good(t)._replace(time=None)])
     assert recording.fault is None
