@@ -90,7 +90,14 @@ def write(robot: Stranger, folder: Path, logs: Iterable[Any]) -> float:
 
 
 def play(
-    seed: int, folder: Path, motions: int, seconds: float | None, small: bool, named: str = "", spoil: str = SPOILS[0]
+    seed: int,
+    folder: Path,
+    motions: int,
+    seconds: float | None,
+    small: bool,
+    named: str = "",
+    spoil: str = SPOILS[0],
+    rival: bool = True,
 ) -> Row:
     """One robot of the tournament."""
     robot = spoiled(draw(seed, small=small, named=named), spoil)
@@ -125,6 +132,8 @@ def play(
     except RefusedError as refused:
         row["refused"] = str(refused)
     row["identified"] = left(fresh, found) if (found / "robot.toml").exists() else row["nominal"]
+    if not rival:
+        return row
     took, (dataset, spec) = Taken(), open_dataset(str(data), None, None)
     save_robot(plain_fit(dataset.sequences(split_entries(dataset)["train"]), spec), folder / "plain")
     row["plain_seconds"], row["plain_cpu"] = took()
@@ -253,6 +262,7 @@ def main() -> None:
     parser.add_argument("--motions", type=int, default=12)
     parser.add_argument("--seconds", type=float, help="recorded of each robot; default two to five minutes")
     parser.add_argument("--small", action="store_true", help="small robots, a minute of logs")
+    parser.add_argument("--alone", action="store_true", help="without the plain script")
     parser.add_argument("--named", default="", help="part of a public model's path: every robot is this one")
     parser.add_argument("--spoil", default=SPOILS[0], choices=SPOILS, help="what its file has wrong beyond that")
     parser.add_argument("--seeds", type=int, nargs="*", help="these, instead of a range; measured again")
@@ -270,7 +280,11 @@ def main() -> None:
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
         with multiprocessing.get_context("fork").Pool(1) as process:
-            rows.append(process.apply(play, (seed, folder, args.motions, seconds, args.small, args.named, args.spoil)))
+            rows.append(
+                process.apply(
+                    play, (seed, folder, args.motions, seconds, args.small, args.named, args.spoil, not args.alone)
+                )
+            )
         journal.write_text("".join(json.dumps(row) + "\n" for row in rows))
         r = rows[-1]
         print(

@@ -308,6 +308,7 @@ def _public(path: Path, welded: tuple[str, ...]) -> mujoco.MjSpec:
     for joint in [j for j in spec.joints if j.type != hinge or any(w in j.name for w in welded)]:
         spec.delete(joint)
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.compiler.boundmass, spec.compiler.boundinertia = 0.01, 1e-6  # of bodies whose mass was their mesh's
     return mujoco.MjSpec.from_string(_plain(spec))
 
 
