@@ -32,12 +32,10 @@ GAP = 2.5  # periods without a sample
 def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands and states of one time, and is their clock one clock?"""
     step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
-    same = [s for s in surveys if s.response.step == step]
+    every = [s for s in surveys if s.response.step == step]
     # Across a hole states are interpolated: they begin to move before anything was measured.
-    same = [s for s in same if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or same
-    op, fields = robot.operated_index, ("own", "cross", "power")
-    own = [replace(s.response, **{f: getattr(s.response, f)[:, op] for f in fields}) for s in same]
-    found = [*_late(same, own)]
+    same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
+    found, own = [*_late(every, _operated(every, robot))], _operated(same, robot)
     odd = {f.values["motion"] for f in found}
     told = following(own, [s.motion not in odd for s in same])
     onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
@@ -69,6 +67,11 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         )
         found.append(Finding("warning", "averaged", text, (), {"width_s": width}))
     yield from found or [Finding("ok", "timing", "commands and states keep one time")]
+
+
+def _operated(surveys: list[Survey], robot: RobotSpec) -> list[Response]:
+    op, fields = robot.operated_index, ("own", "cross", "power")
+    return [replace(s.response, **{f: getattr(s.response, f)[:, op] for f in fields}) for s in surveys]
 
 
 def _scatter(away: Array) -> float:
