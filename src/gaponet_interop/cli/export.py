@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -13,17 +13,23 @@ from gaponet.errors import UsageError
 from gaponet.robot import load_robot
 from gaponet.robot_folder import KEPT, keeps_robot
 
+if TYPE_CHECKING:
+    from gaponet_interop.engine.ranges import Engine, Scope
+
 Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.")]
 
 
 def export(
     robot: Holder,
-    to: Literal["onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "json"] = "onnx",
+    to: Literal["onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "json", "randomization"] = "onnx",
     out: Path | None = None,
     data: str | None = None,
     into: Path | None = None,
     prefix: str = "",
     payload_mass: float = 0.0,
+    engine: Literal["json", "mujoco", "mjlab", "isaaclab"] = "json",
+    scope: Literal["today", "any-day", "any-robot"] = "today",
+    units: tuple[Path, ...] = (),
     json: Json = False,
 ) -> None:
     """Write an identified robot for another engine, or a run's network for another program.
@@ -32,7 +38,7 @@ def export(
         to: Of a robot or of a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
             no gaponet; isaaclab; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a run: onnx
             (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for mjlab and
-            Isaac Lab).
+            Isaac Lab). Of a robot, randomization: what to randomise in training.
         out: Folder; default one with that name in the robot or run, for onnx the run's model folder.
         data: Dataset on which a servo law's nearest plain servos are fitted, and every form is judged; default the one
             that the robot was identified from, and without any what the robot itself answers.
@@ -40,8 +46,15 @@ def export(
             robot's).
         prefix: What that file has before each joint's name.
         payload_mass: kg in each hand.
+        engine: Whose words the ranges are written in, beside units drawn whole (randomization.json).
+        scope: today: this robot as it was last fitted. any-day: as sessions on several days found it. any-robot: as
+            robots of its type differ.
+        units: For any-robot: robot folders of the type.
     """
     screen = Out(json)
+    if to == "randomization":
+        _randomization(screen, robot, out, engine, scope, units)
+        return
     if to in ("onnx", "torch"):
         if data or into or prefix:
             raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
@@ -65,6 +78,24 @@ def export(
     told = f"; next, in {'MuJoCo' if to == 'mjcf' else to}: python {check}" if check.is_file() else ""
     screen.say(f"{made.file or folder}: {spec.name} for {to}{told}")
     screen.result({"path": str(folder), "to": to, "robot": spec.name, "left": made.left, "notes": made.notes})
+
+
+def _randomization(
+    screen: Out, robot: Path, out: Path | None, engine: Engine, scope: Scope, units: tuple[Path, ...]
+) -> None:
+    from gaponet.cli.identify import COLUMNS
+    from gaponet_interop.engine.ranges import as_rows, ranges, write_ranges
+
+    made = ranges(_simulator(robot), scope, units)
+    file = write_ranges(made, engine, out or robot / "randomization")
+    screen.table(f"{made.robot}, {scope}: 9 of 10 units lie within", *as_rows(made, COLUMNS))
+    for note in made.notes:
+        screen.say(f"  {note}", "note", "cyan")
+    if made.unknown:
+        told = "; ".join(made.unknown)
+        screen.say(f"  not determined by any log, and left at their values: {told}", "warning", "yellow")
+    screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
+    screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
 
 
 def _simulator(holder: Path) -> Path:

@@ -113,7 +113,7 @@ def check(
             raise UsageError(f"--unit {unit or '(none)'}: {logs} holds units {', '.join(units)}; name one")
         entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
         found = drift(spec, known, data.sequences(entries), threads)
-    named = {m.joint: m for m in found.moved}
+    named = {m.joint for m in found.moved}
     screen.table(
         f"{len(entries)} recordings, {found.seconds:.0f} s: what changed most, in standard deviations",
         ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
@@ -123,9 +123,8 @@ def check(
         ],
     )
     for a in found.against:
-        screen.say(
-            f"  {a.recording} against the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations", "warning"
-        )
+        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
+        screen.say(f"  {what}", "warning", "yellow")
     screen.say(f"{found.verdict}: {found.advice}")
     screen.result({
         "verdict": found.verdict, "advice": found.advice, "recordings": len(entries), "seconds": found.seconds,
@@ -138,7 +137,8 @@ def check(
 
 
 def _row(m: Moved, known: Knowledge, counts: bool) -> list[str]:
-    left = known.joints[m.joint].left
+    mine = [k.left for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
+    left = sum(mine) / len(mine)
     return [m.joint, m.field, _by(m, known), f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
             "moved" if counts else ""]  # fmt: skip
 

@@ -23,11 +23,14 @@ from gaponet.sim.axes import OVER_KP
 from gaponet.sim.joint_runs import SOFT
 from gaponet_lab.known.evidence import PLAY, Evidence, evidence, inverted, spread_of
 
-ALARM = 0.002  # of a robot that did not change: how often any of its numbers is said to have moved
+ALARM = 0.006  # of a robot that did not change: how often any of its numbers is said to have moved
 AGAINST = 1e-4  # the same of a recording that is said to contradict the others
 FELT = 0.15  # of what the model leaves anyway: a change that moves a joint by less is none that matters
 MOST = 3  # numbers of a joint that are named
-FEWEST, ROBUST = 6, 12  # recordings that speak for themselves; clusters that a scatter known from before counts as
+FEWEST, TRUSTED = 6, 40  # recordings that speak for themselves; the most clusters that what was known counts as
+MINORITY = 1 / 3  # of the recordings: so many that say something else are set aside, more contradict the others
+SHARED = ("delay",)  # of one bus: all joints' move together
+EVERY = "every joint"
 WARM = ("damping", "frictionloss", "stribeck")
 ELSE = 0.4  # of all joints: so many with kp or several numbers moved are another robot's
 
@@ -69,7 +72,8 @@ class Against:
 
 @dataclass(frozen=True)
 class Drift:
-    """What was found; the largest change of every joint with its standard deviations, whether it counts or not."""
+    """What was found; the largest change of every joint, whether it counts or not; recordings that were set aside since
+    they differ from the others."""
 
     verdict: Verdict
     moved: tuple[Moved, ...]
@@ -94,30 +98,29 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
     if not says.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*known.fields, PLAY), robot.operated
-    grouped = says.by_recording() if len(says.names) >= FEWEST else says
-    clusters = grouped.pulls.shape[1]
-    scatter = np.stack([known.array(j, "scatter") for j in joints])
-    free = ROBUST + clusters - 1
-    tests = len(joints) * len(fields)
-    threshold = float(student.isf(ALARM / tests / 2, free))
-    normal, spread = grouped.normals.sum(axis=1), spread_of(grouped.pulls)
-    expected = widened(normal, np.maximum(scatter, 1.0))
-    spread = (ROBUST * expected + (clusters - 1) * spread) / free
-    moved: list[Moved] = []
-    largest: dict[str, Moved] = {}
-    for i, joint in enumerate(joints):
-        step, about = known.array(joint, "step"), known.array(joint, "step_covariance")
-        pull = -grouped.pulls[i].sum(axis=0) - normal[i] @ step
-        variance = spread[i] + normal[i] @ about @ normal[i]
-        felt = FELT * known.joints[joint].left
-        way = directions(known, joint)
-        length = SOFT * np.sqrt(np.maximum(np.diag(way.T @ normal[i] @ way), 0.0) / max(int(says.rows[i]), 1))
-        found, first = _explained(joint, fields, normal[i] @ way, length, pull, variance, threshold, felt)
-        moved += found
-        if first is not None:
-            largest[joint] = first
+    scatter = np.stack([np.maximum(known.array(j, "scatter"), 1.0) for j in joints])
     against = _contradictions(says.by_recording(), scatter, known, joints, fields)
-    verdict = "contradictory" if against else "drifted" if moved else "same"
+    aside = {a.recording for a in against}
+    contradictory = len(aside) > MINORITY * len(says.names)
+    says = says if contradictory else says.without(aside)
+    grouped = says.by_recording() if len(says.names) >= FEWEST else says
+    clusters, trusted = grouped.pulls.shape[1], min(known.clusters, TRUSTED)
+    tests = len(joints) * len(fields) + len(SHARED)
+    threshold = float(student.isf(ALARM / tests / 2, trusted + clusters - 1))
+    normal = grouped.normals.sum(axis=1)
+    spread = trusted * widened(normal, scatter) + (clusters - 1) * spread_of(grouped.pulls)
+    each = [
+        _Joint.of(j, fields, known, normal[i], grouped.pulls[i].sum(axis=0), spread[i] / (trusted + clusters - 1),
+                  int(says.rows[i]))
+        for i, j in enumerate(joints)
+    ]  # fmt: skip
+    moved = [m for f in SHARED if len(joints) > 1 and (m := _together(each, fields.index(f), threshold))]
+    largest: dict[str, Moved] = {m.joint: m for m in moved}
+    for one in each:
+        found, first = one.explained(threshold)
+        moved += found
+        largest |= {one.name: first} if first else {}
+    verdict = "contradictory" if contradictory else "drifted" if moved else "same"
     seconds = float(sum(s.duration for s in sequences))
     return Drift(verdict, tuple(moved), largest, against, _advice(verdict, moved, against, joints), threshold, seconds)
 
@@ -137,38 +140,76 @@ def directions(known: Knowledge, joint: str) -> Array:
     return found
 
 
-def _explained(
-    joint: str, fields: ListOf[str], columns: Array, length: Array, pull: Array, variance: Array, threshold: float,
-    felt: float,
-) -> tuple[list[Moved], Moved | None]:  # fmt: skip
-    """The numbers that moved, and the largest change of one alone; each is worth naming where it also is felt.
+@dataclass
+class _Joint:
+    """One joint's pull (Q), what a change of each number pulls (Q, Q), the inverse of the pull's covariance (Q, Q), by
+    how much a change of one moves the joint, RMS (Q) rad, and what is felt, rad."""
 
-    columns: what a change of each number pulls, (Q, Q); length: by how much it moves the joint, RMS, (Q) rad.
-    """
-    size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
-    weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
-    told: list[Moved] = []
-    first: Moved | None = None
-    while len(told) < MOST:
-        chosen, best = [fields.index(m.field) for m in told], 0.0
-        what: list[Moved] = []
-        for k in range(len(fields)):
-            if k in chosen or length[k] <= 0:
-                continue
-            by, error = _solved(columns[:, [*chosen, k]], weight, pull)
-            if abs(by[-1]) / error[-1] > best:
-                best = abs(by[-1]) / error[-1]
-                what = [
-                    Moved(joint, fields[i], float(b), float(e), float(abs(b) * length[i]))
-                    for i, b, e in zip([*chosen, k], by, error, strict=True)
-                ]
-        if not what:
-            break
-        first = first or what[-1]
-        if best < threshold or what[-1].moves < felt:
-            break
-        told = what
-    return told, first
+    name: str
+    fields: tuple[str, ...]
+    pull: Array
+    columns: Array
+    weight: Array
+    length: Array
+    felt: float
+
+    @classmethod
+    def of(
+        cls,
+        joint: str,
+        fields: tuple[str, ...],
+        known: Knowledge,
+        normal: Array,
+        pulls: Array,
+        spread: Array,
+        rows: int,
+    ) -> _Joint:
+        """What is left of the pulls that the robot had when it was identified."""
+        step, about, way = known.array(joint, "step"), known.array(joint, "step_covariance"), directions(known, joint)
+        variance = spread + normal @ about @ normal
+        size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
+        weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
+        length = SOFT * np.sqrt(np.maximum(np.diag(way.T @ normal @ way), 0.0) / max(rows, 1))
+        felt = FELT * known.joints[joint].left
+        return cls(joint, fields, -pulls - normal @ step, normal @ way, weight, length, felt)
+
+    def explained(self, threshold: float) -> tuple[list[Moved], Moved | None]:
+        """The numbers that moved, and the largest change of one alone; each is worth naming where it also is felt."""
+        told: list[Moved] = []
+        first: Moved | None = None
+        while len(told) < MOST:
+            chosen, what = [self.fields.index(m.field) for m in told], list[Moved]()
+            for k in np.flatnonzero(self.length > 0).tolist():
+                if k not in chosen:
+                    tried = self._moved([*chosen, k])
+                    what = tried if not what or abs(tried[-1].sigmas) > abs(what[-1].sigmas) else what
+            first = first or (what[-1] if what else None)
+            if not what or abs(what[-1].sigmas) < threshold or what[-1].moves < self.felt:
+                break
+            told = what
+        return told, first
+
+    def _moved(self, numbers: list[int]) -> list[Moved]:
+        by, error = _solved(self.columns[:, numbers], self.weight, self.pull)
+        return [
+            Moved(self.name, self.fields[i], float(b), float(e), float(abs(b) * self.length[i]))
+            for i, b, e in zip(numbers, by, error, strict=True)
+        ]
+
+
+def _together(joints: ListOf[_Joint], number: int, threshold: float) -> Moved | None:
+    """A number that moved in every joint by the same, if that says more than the joints do alone; it is taken out."""
+    known = np.array([j.columns[:, number] @ j.weight @ j.columns[:, number] for j in joints])
+    says = np.array([j.columns[:, number] @ j.weight @ j.pull for j in joints])
+    by, error = float(says.sum() / max(known.sum(), 1e-300)), float(max(known.sum(), 1e-300) ** -0.5)
+    moves = float(np.sqrt(np.mean([(by * j.length[number]) ** 2 for j in joints])))
+    found = Moved(EVERY, joints[0].fields[number], by, error, moves)
+    alone = max((abs(m.sigmas) for j in joints if (m := j.explained(np.inf)[1])), default=0.0)
+    if abs(found.sigmas) < max(threshold, alone) or moves < np.mean([j.felt for j in joints]):
+        return None
+    for j in joints:
+        j.pull = j.pull - by * j.columns[:, number]
+    return found
 
 
 def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
@@ -180,33 +221,37 @@ def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
 def _contradictions(
     says: Evidence, scatter: Array, known: Knowledge, joints: ListOf[str], fields: ListOf[str]
 ) -> tuple[Against, ...]:
-    """Recordings that differ from the rest of them by more than recordings do, the farthest number of each."""
-    count = len(says.names)
-    if count < 2:
-        return ()
-    limit = float(student.isf(AGAINST / (count * len(joints) * len(fields)) / 2, ROBUST))
+    """Recordings that differ from the rest of them by more than recordings do, the farthest first, which is then left
+    out of the rest; of each its farthest number."""
     found: list[Against] = []
-    for r in range(count):
-        worst: Against | None = None
-        for i, joint in enumerate(joints):
-            mine, all_of = says.normals[i, r], says.normals[i].sum(axis=0)
-            rest = all_of - mine
-            pull, others = -says.pulls[i, r], -(says.pulls[i].sum(axis=0) - says.pulls[i, r])
-            root = np.sqrt(np.maximum(scatter[i], 1.0))
-            inverse = inverted(rest[None])[0]
-            carried = mine @ inverse
-            left = pull - carried @ others
-            variance = np.outer(root, root) * mine + carried @ (np.outer(root, root) * rest) @ carried.T
+    while len(says.names) > 1 and (worst := _farthest(says, scatter, known, joints, fields)):
+        found.append(worst)
+        says = says.without({worst.recording})
+    return tuple(found)
+
+
+def _farthest(
+    says: Evidence, scatter: Array, known: Knowledge, joints: ListOf[str], fields: ListOf[str]
+) -> Against | None:
+    count, worst = len(says.names), None
+    limit = float(student.isf(AGAINST / (count * len(joints) * len(fields)) / 2, min(known.clusters, TRUSTED)))
+    for i, joint in enumerate(joints):
+        total, pulls = says.normals[i].sum(axis=0), says.pulls[i].sum(axis=0)
+        for r in range(count):
+            mine, rest = says.normals[i, r], total - says.normals[i, r]
+            carried = mine @ inverted(rest[None])[0]
+            left = carried @ (pulls - says.pulls[i, r]) - says.pulls[i, r]
+            variance = widened(mine, scatter[i]) + carried @ widened(rest, scatter[i]) @ carried.T
+            weight = np.linalg.pinv(variance, rcond=1e-9, hermitian=True)
             for k in range(len(fields)):
                 if mine[k, k] <= 0 or rest[k, k] < 0.5 * mine[k, k]:
                     continue
-                by, error = _solved(mine[:, [k]], np.linalg.pinv(variance, rcond=1e-9, hermitian=True), left)
+                by, error = _solved(mine[:, [k]], weight, left)
                 sigmas = float(by[0] / error[0])
                 felt = SOFT * abs(by[0]) * np.sqrt(mine[k, k] * count / max(float(says.rows[i]), 1))
                 if abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0) and felt > known.joints[joint].left:
                     worst = Against(says.names[r], joint, fields[k], float(by[0]), sigmas)
-        found += [worst] if worst else []
-    return tuple(found)
+    return worst
 
 
 def _advice(verdict: Verdict, moved: ListOf[Moved], against: ListOf[Against], joints: ListOf[str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any
@@ -47,6 +47,16 @@ class Evidence:
         pick = (self.recording == order[:, None]).astype(float)
         pulls, normals = np.einsum("rc,ncq->nrq", pick, self.pulls), np.einsum("rc,ncqp->nrqp", pick, self.normals)
         return Evidence(pulls, normals, self.rows, order, self.names)
+
+    def without(self, names: Collection[str]) -> Evidence:
+        """The same without these recordings."""
+        if not names:
+            return self
+        keep = np.array([self.names[r] not in names for r in self.recording])
+        left = tuple(name for name in self.names if name not in names)
+        order = np.array([left.index(self.names[r]) for r in self.recording[keep]])
+        rows = self.rows * keep.mean()  # windows are as long as each other
+        return Evidence(self.pulls[:, keep], self.normals[:, keep], rows, order, left)
 
     def scatter(self) -> Array:
         """Variance of the clusters' sum of pulls over that of independent rows, (n, Q)."""

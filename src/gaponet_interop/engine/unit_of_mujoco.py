@@ -1,0 +1,45 @@
+"""One unit of a robot in a MuJoCo model, without gaponet. python mujoco_randomization.py MODEL.xml tries it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+HERE = Path(__file__).parent
+
+
+def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
+    """The file; "units": field → samples × joints, numbers that belong together in one row."""
+    return dict(json.loads(file.read_text(encoding="utf-8")))
+
+
+def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, dict[str, float]]:
+    """Set kp, damping, friction and armature of every joint to those of a unit; kd of the servos stays.
+
+    Returns:
+        Joint → what MuJoCo's model does not hold: offset (rad, added to every target), delay (s), terms of the law.
+    """
+    left: dict[str, dict[str, float]] = {}
+    for i, name in enumerate(drawn["joints"]):
+        unit = {field: float(values[row][i]) for field, values in drawn["units"].items()}
+        joint = model.joint(name)
+        dof = joint.dofadr[0]
+        model.dof_damping[dof] = unit.pop("damping")
+        model.dof_frictionloss[dof], model.dof_armature[dof] = unit.pop("frictionloss"), unit.pop("armature")
+        for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
+            if model.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT:
+                model.actuator_gainprm[servo, 0], model.actuator_biasprm[servo, 1] = unit["kp"], -unit["kp"]
+        del unit["kp"]
+        left[name] = unit
+    return left
+
+
+if __name__ == "__main__":
+    model, drawn = mujoco.MjModel.from_xml_path(sys.argv[1]), units()
+    for row in range(3):
+        print(row, apply(model, drawn, row))
