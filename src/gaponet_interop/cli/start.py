@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from gaponet_interop.setup.new import Wanted
 
 RAN = "commands.sh"  # what ran to its end, a line each
+FEWEST = 3  # recordings, from which some are kept for judging; fewer are cut
+PIECE, SHORTEST = 8.0, 4.0  # s of a piece, and below which it is none
 NEAR = 0.01  # of a rate in whole Hz, from which a clock's rounding is told
 
 
@@ -163,6 +165,9 @@ def plan(found: Understood, model: Path, logs: Path, out: Path, wanted: Wanted, 
         todo.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", f"{found.rate:g}", *words])
     robot, told = found.packaged or as_option(out / "robot"), out / "logs.toml"
     described = ["--logs", str(told)] if found.described or told.is_file() else []
+    time = found.log.channels["ctrl"].time
+    piece = min(PIECE, float(time[-1] - time[0]) / FEWEST)
+    described += ["--cut", f"{piece:.3g}"] if found.recordings < FEWEST and piece >= SHORTEST else []
     todo += [
         ["import", str(logs), "--robot", robot, *stated, *described, "--out", data],
         ["doctor", data],

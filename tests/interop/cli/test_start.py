@@ -43,6 +43,20 @@ def test_a_dry_run_says_what_was_understood_and_writes_nothing(place, capsys):
     assert sorted(place.rglob("*")) == before
 
 
+def test_a_single_recording_is_cut_so_that_parts_of_it_can_judge(place, capsys):
+    for seed in range(1, 5):
+        Path(f"logs/swing_{seed}.csv").unlink()
+    one = Path("logs/swing_0.csv")
+    head, *rows = one.read_text().splitlines()
+    later = [f"{float(row.split(',')[0]) + 6000},{row.partition(',')[2]}" for row in rows]
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    assert "--cut" not in json.loads(capsys.readouterr().out)["commands"][1]  # 6 s are too short
+    last = [f"{float(row.split(',')[0]) + 6000},{row.partition(',')[2]}" for row in later]
+    one.write_text("\n".join([head, *rows, *later, *last]))
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    assert "--cut 5.99" in json.loads(capsys.readouterr().out)["commands"][1]
+
+
 def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, monkeypatch, capsys):
     ran = []
 
