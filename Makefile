@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults live peers engines buckets browser adversary fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
+.PHONY: setup demo test faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
 
 setup: $(VENV)/.done
 
@@ -61,6 +61,10 @@ browser: setup
 adversary: setup
 	OMP_NUM_THREADS=1 $(BIN)/python tests/robots/control/adversary.py --states 1000000
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/robots/control/plan_adversary.py --poses 1000 --seconds 60
+
+# Ten small robots that nobody tuned on, beside the plain script: minutes, resumable.
+tournament: setup
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/robots.py tournament_work --robots 10 --small
 
 # Changed files at random into everything that reads files: a quarter of an hour; counts as JSON, exit code 1 where one
 # ends in anything but one clear error. FUZZ="--only sage --mutants 1000 --keep failed" looks at one reader.

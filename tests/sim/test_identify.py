@@ -7,8 +7,9 @@ import pytest
 from arm import TOML, recordings, write_arm
 
 from gaponet.errors import UsageError
+from gaponet.robot import load_robot
 from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import identify, with_stops
+from gaponet.sim.identify import _Limbs, identify, with_stops
 
 
 @pytest.fixture(scope="module")
@@ -69,3 +70,12 @@ def test_a_joint_behind_one_command_is_loaded_and_one_behind_many_is_stopped(tmp
     found = with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))])
     assert found.qpos_range[0, 1] == pytest.approx(0.3, abs=1e-3)
     np.testing.assert_array_equal(found.qpos_range[1], robot.qpos_range[1])
+
+
+def test_what_is_told_of_limbs_is_told_of_their_joints():
+    limbs = _Limbs(load_robot("so101"))
+    assert limbs.at.tolist() == [[0, 1, 2, 3, 4]]
+    limbs.at = np.array([[0, 2, 4], [1, 3, -1]])  # of two limbs, one shorter
+    x = np.arange(30.0).reshape(2, 5, 3)
+    assert limbs.pack(x).shape == (2, 2, 9)
+    np.testing.assert_array_equal(limbs.unpack(limbs.pack(x)), x)

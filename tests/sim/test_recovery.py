@@ -47,9 +47,11 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
             assert std[joint][field] < value
 
 
+TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
+
+
 def test_a_table_comes_back(tmp_path):
-    tip = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
-    robot = write_arm(tmp_path / "arm", toml=TOML + tip)
+    robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
     heights = touching.tip_heights(parts, robot)
     found = touching.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
@@ -59,3 +61,11 @@ def test_a_table_comes_back(tmp_path):
     assert np.abs(found.robot.zero).max() < 0.02
     free = played(robot, robot, 2, 100)
     assert not touching.fit_table(free, robot, -0.1, 1, lambda error: None).kept
+
+
+def test_an_arm_that_stays_within_a_hand_of_its_lowest_point_keeps_rows_to_fit(tmp_path):
+    robot = write_arm(tmp_path, toml=TOML + TIP)
+    heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
+    below = touching.touching_below(robot, heights)
+    assert np.mean(np.concatenate(heights) >= below) >= 0.5
+    assert touching.touching_below(robot, [np.r_[0.0, np.full(50, 0.4)]]) == touching.CLEARANCE

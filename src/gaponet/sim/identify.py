@@ -38,7 +38,7 @@ STARTS, SPREAD = 4, 2.0  # of each search, and how far apart in the parameters' 
 SHORT = 0.5  # s: a search begins with runs so short
 SEARCH = (10, 8, 15)  # iterations: of all starts on short runs, of all on whole windows, of the better half
 TOGETHER = (2, 3)  # iterations of the whole robot, joint by joint: from both starts, from the better one
-LIMBS = 8  # and of limbs, whose joints answer for each other
+LIMBS, LIMB_RUNS = 8, 160  # and of limbs, whose joints answer for each other: iterations, and candidates of all
 ENOUGH, LITTLE = 2e-3, 2e-4  # of the whole robot's cost, of the limbs': a fall that is worth another iteration
 POLISH = 2  # iterations of the whole robot with a term of the law
 CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
@@ -412,7 +412,8 @@ class Fit:
         rows, first = limbs.pack(runs.rows[:, None]).sum(axis=1), [self.base.operated[i] for i in limbs.at[:, 0]]
         x, (low, high) = limbs.pack(axes.of(values)[None]), map(limbs.pack, (axes.low, axes.high))
         tell = clock.tell("limbs", tuple(first), rows)
-        x, _ = descend(x, low, high, errors, LIMBS, tell, clock.over, LITTLE)
+        count = max(1, min(LIMBS, LIMB_RUNS // (x.shape[-1] + 5)))
+        x, _ = descend(x, low, high, errors, count, tell, clock.over, LITTLE)
         return {f: v[0].copy() for f, v in axes.values(limbs.unpack(x)).items()}
 
     def learn(self, cost: Array, rows: Array) -> None:

@@ -30,12 +30,12 @@ CLEARANCE = 0.045  # m above the lowest tip, or the table, in which a joint's ze
 WINDOW = 5.0  # s
 WINDOWS, PER_MOTION = 14, 2
 HEIGHTS, STEP = 10, 0.005  # tried first, from the lowest tip upwards, and m between them
-CANDIDATES, GENERATIONS, AROUND = 16, 15, 1.5  # of the search, and how wide it begins, in large changes
+CANDIDATES, GENERATIONS, AROUND = 16, 10, 1.5  # of the search, and how wide it begins, in large changes
 ZERO, PRICE = 0.02, 2e-3  # rad: an ordinary zero, and what it costs (soft square of one for a row)
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
 STIFFNESS = (np.log(100.0), np.log(1e5), 0.7, np.log(2000.0))
-STARTS = tuple(np.log((500.0, 2000.0, 8000.0)))  # stiffness from which the search begins, each by itself
+STARTS = tuple(np.log((500.0, 8000.0)))  # stiffness from which the search begins, each by itself
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,12 @@ def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
 
 
 def touching_below(robot: RobotSpec, heights: ListOf[Array]) -> float:
-    """Height under which a tip may touch, m."""
+    """Height under which a tip may touch, m: of half of the rows at most, so that motions close to the table, or to
+    nothing at all, leave rows to be fitted."""
     if not robot.tips or not heights:
         return -np.inf
-    lowest = min(h.min() for h in heights) if robot.table is None else robot.table.height
-    return float(lowest + CLEARANCE)
+    rows = np.concatenate(heights)
+    return float(min((rows.min() if robot.table is None else robot.table.height) + CLEARANCE, np.median(rows)))
 
 
 def low_windows(sequences: ListOf[Sequence], heights: ListOf[Array], below: float) -> list[Sequence]:
