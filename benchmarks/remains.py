@@ -24,7 +24,7 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
-from gaponet.model.calibration import Calibration, recordings
+from gaponet.model.calibration import Calibration
 from gaponet.robot import RobotSpec
 from gaponet.sim.identify import DEFAULT_TERMS
 from gaponet.sim.refit import refit
@@ -169,7 +169,7 @@ def main() -> None:
     bench = replace(bench, test=[s for s in bench.test if s.meta.unit_id == UNIT])
     runs = sorted((args.work / "virtual" / "cells").glob("identified+*"))[: args.seeds]
     models = [GapModel.load(r) for r in runs]
-    given = bench.data.sequences(recordings(bench.data, models[0], UNIT, ()))
+    given = bench.data.sequences(Calibration.recordings(bench.data, models[0], UNIT, ()))
     methods = methods_of(bench, models, given)
     whole = Played.of(bench, bench.test, methods)
     said = [f"{m}: {cell(whole.errors[m])} mrad." for m in METHODS]

@@ -411,7 +411,7 @@ def calibrate(
     data, spec = _opened(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
-    entries = calibration.recordings(data, model, unit, motions)
+    entries = calibration.Calibration.recordings(data, model, unit, motions)
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
     with bar("calibrating") as update:

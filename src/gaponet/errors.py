@@ -39,10 +39,6 @@ class ModelError(GAPONetError):
     """A run or model artifact is missing, damaged or does not fit the robot, rate or gains."""
 
 
-class RemoteError(GAPONetError):
-    """A place on the network cannot be reached, or does not hold what it says."""
-
-
 class NoGainError(GAPONetError):
     """Nothing that was fitted follows the recordings better than what is known already."""
 

@@ -118,6 +118,11 @@ class Pool:
                 yield early.pop(turn).result()
                 turn += 1
 
+    @staticmethod
+    def cores(threads: int) -> int:
+        """How many jobs on so many threads each this machine has cores for."""
+        return max(1, (os.cpu_count() or 1) // threads)
+
 
 def _done(work: Callable[[Job], Result], job: Job) -> tuple[Result | None, Exception | None]:
     """A job in its worker."""
@@ -146,7 +151,7 @@ def opened(where: str | Executor, workers: int, threads: int, folder: Path) -> I
         UsageError: No such executor, or no cluster there.
     """
     if isinstance(where, Executor):
-        yield Pool(where, workers or cores(threads), threads)
+        yield Pool(where, workers or Pool.cores(threads), threads)
         return
     kind, _, at = where.partition(":")
     if kind not in KINDS or (at and kind == LOCAL):
@@ -155,11 +160,6 @@ def opened(where: str | Executor, workers: int, threads: int, folder: Path) -> I
         with _for_children(threads):
             executor, size = KINDS[kind](stack, at, workers, threads, folder)
         yield Pool(executor, max(1, size), threads)
-
-
-def cores(threads: int) -> int:
-    """How many jobs on so many threads each this machine has cores for."""
-    return max(1, (os.cpu_count() or 1) // threads)
 
 
 class _Processes(Executor):
@@ -184,7 +184,7 @@ class _Processes(Executor):
 
 
 def _local(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -> tuple[Executor, int]:
-    return stack.enter_context(_Processes()), workers or cores(threads)
+    return stack.enter_context(_Processes()), workers or Pool.cores(threads)
 
 
 class _Ray(Executor):
@@ -231,7 +231,7 @@ def _dask(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -
     stack.enter_context(dask.config.set(retried_here))
     address = at or os.environ.get("DASK_SCHEDULER_ADDRESS")
     try:
-        here = {"n_workers": workers or cores(threads), "threads_per_worker": 1, "memory_limit": 0}
+        here = {"n_workers": workers or Pool.cores(threads), "threads_per_worker": 1, "memory_limit": 0}
         cluster = address or stack.enter_context(LocalCluster(host=LOOPBACK, dashboard_address=f"{LOOPBACK}:0", **here))
         client = stack.enter_context(Client(cluster))
     except (OSError, ValueError) as error:
@@ -286,7 +286,8 @@ def _submitit(stack: ExitStack, at: str, workers: int, threads: int, folder: Pat
         auto.update_parameters(**({"timeout_min": DAY, "cpus_per_task": threads} | asked))
     except (ValueError, TypeError, NameError, RuntimeError) as error:
         raise UsageError(f"--executor submitit:{at}: {error}") from None
-    return stack.enter_context(_Submitit(auto)), workers or (cores(threads) if auto.cluster == LOCAL else MOST_WORKERS)
+    usual = Pool.cores(threads) if auto.cluster == LOCAL else MOST_WORKERS
+    return stack.enter_context(_Submitit(auto)), workers or usual
 
 
 KINDS = {LOCAL: _local, "ray": _ray, "dask": _dask, "submitit": _submitit}

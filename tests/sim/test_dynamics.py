@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gaponet.robot import load_robot
-from gaponet.sim.dynamics import equivalent_torque, inverse_dynamics, static_torque
+from gaponet.sim.dynamics import inverse_dynamics, static_torque
 from gaponet.sim.model import build_model
 
 
@@ -13,14 +13,6 @@ def test_static_torque_of_a_level_arm_is_its_weight(arm):
     tau = static_torque(build_model(arm, 0.5), np.zeros((1, 2)))[0]
     assert tau[0] == pytest.approx(-9.81 * (0.3 * 0.1 + 0.2 * 0.3 + 0.5 * 0.4), rel=1e-6)
     assert tau[1] == pytest.approx(-9.81 * (0.2 * 0.1 + 0.5 * 0.2), rel=1e-6)
-
-
-def test_a_still_recording_needs_its_static_torque(arm):
-    model = build_model(arm, 0.2)
-    qpos = np.repeat(np.array([[0.4, -0.2]]), 80, axis=0)
-    tau, qacc = equivalent_torque(model, qpos, 0.02)
-    assert np.allclose(tau, static_torque(model, qpos), atol=1e-6)
-    assert np.abs(qacc).max() < 1e-6
 
 
 @pytest.mark.parametrize("payload", [0.0, 3.0])

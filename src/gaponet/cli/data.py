@@ -208,14 +208,14 @@ def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Acti
 def _show_card(out: Out, made: dict[str, Any]) -> None:
     """Counts, repeatability and licence; ranges of all signals stand in CARD.md."""
     from gaponet.data.card import NOT_STATED
-    from gaponet.data.card_text import TITLES, headline, number, shares
+    from gaponet.data.card_text import TITLES, headline, shares
 
     out.say("", headline(made))
     for name in TITLES:
         out.show("", shares(made, name))
     repeated = made["repeatability"]
     if repeated["channels"]:
-        spread = ", ".join(f"{name} {number(c['mean'])} {c['unit']}" for name, c in repeated["channels"].items())
+        spread = ", ".join(f"{name} {c['mean']:.3g} {c['unit']}" for name, c in repeated["channels"].items())
         out.say(
             f"repeatability (std over {repeated['sequences']} repetitions in {repeated['groups']} groups): {spread}"
         )

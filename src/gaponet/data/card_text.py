@@ -74,8 +74,8 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     yield ""
     channels = found["channels"]
     joints = dict.fromkeys(j for c in channels.values() for j in c["joints"])
-    rows = [(joint, *(number(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
-    mean = ("mean", *(number(c["mean"]) for c in channels.values()))
+    rows = [(joint, *(_number(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
+    mean = ("mean", *(_number(c["mean"]) for c in channels.values()))
     heads = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
     yield from (Table("repeatability", heads, (*rows, mean)).markdown(), "")
 
@@ -86,11 +86,11 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
     for name, signal in card["signals"].items():
         yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)"
         yield ""
-        rows = tuple((joint, *map(number, values.values())) for joint, values in signal["joints"].items())
+        rows = tuple((joint, *map(_number, values.values())) for joint, values in signal["joints"].items())
         heads = ("joint", "least", "1 %", "mean", "99 %", "greatest", "std")
         yield from (Table(name, heads, rows).markdown(), "")
 
 
-def number(value: float | None) -> str:
+def _number(value: float | None) -> str:
     """Three digits that count; a dash for nothing."""
     return "–" if value is None else f"{value:.3g}"

@@ -177,6 +177,14 @@ class Response:
         same, other, strength = (np.array(x, np.float32) for x in (own, cross, power))
         return Response(step, same, other, strength, duration=len(ctrl) * dt)
 
+    @staticmethod
+    def sharp(found: list[Response]) -> Array:
+        """Joints whose commands change quickly enough to show when the joint begins to move, (n)."""
+        lags = [max(round(0.02 / r.step), 1) for r in found]
+        now, soon = (np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(found, ks, strict=True)], axis=0)
+                     for ks in ([0] * len(found), lags))  # fmt: skip
+        return np.asarray(soon < SHARP * now)
+
 
 @dataclass(frozen=True)
 class _Following:
@@ -203,7 +211,7 @@ def following(found: list[Response], told: list[bool] | None = None) -> _Followi
     use = np.ones(len(found), bool) if told is None else np.array(told)
     parts = [np.stack([getattr(r, f) for r in found]).astype(float) for f in ("own", "cross", "power")]
     own, cross, power = (x[use].sum(axis=(0, 1)) for x in parts)
-    quick = sharp(found)
+    quick = Response.sharp(found)
     onset, fits = np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
     for j in range(n):
         if own[j, 0] <= 0 or power[j] <= 0:
@@ -229,14 +237,6 @@ def following(found: list[Response], told: list[bool] | None = None) -> _Followi
         square[:, 1:] *= 2
         fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
     return _Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
-
-
-def sharp(found: list[Response]) -> Array:
-    """Joints whose commands change quickly enough to show when the joint begins to move, (n)."""
-    lags = [max(round(0.02 / r.step), 1) for r in found]
-    now, soon = (np.sum([r.own.sum(axis=0)[:, k] for r, k in zip(found, ks, strict=True)], axis=0)
-                 for ks in ([0] * len(found), lags))  # fmt: skip
-    return np.asarray(soon < SHARP * now)
 
 
 def _peaks(fits: Array) -> Array:

@@ -324,7 +324,7 @@ class Dataset:
         """A dataset folder, or one behind an address.
 
         Raises:
-            DatasetError, RemoteError: As open_dataset.
+            DatasetError: As open_dataset.
         """
         if "://" not in str(place):
             return Dataset(place)
@@ -398,7 +398,7 @@ def open_dataset(
         run: Whose robot is taken where the dataset keeps none.
 
     Raises:
-        DatasetError, RemoteError: There is no dataset, it is damaged, or it cannot be reached.
+        DatasetError: There is no dataset, it is damaged, or it cannot be reached.
 
     A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
     is said on stderr.

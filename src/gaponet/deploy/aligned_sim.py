@@ -7,14 +7,17 @@ one would (deploy/transfer.py).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.deploy.transfer import Inverse, Reference, Transfer, of_simulator, periods_of
+from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
 from gaponet.errors import UsageError
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.inverse import PROBES, ClosedForm, Probed
 
 
 class AlignedSim:
@@ -81,7 +84,7 @@ class AlignedSim:
         if isinstance(model, GapModel) and not told and model.corrects(robot) and periods_of(model, self.dt) == 1:
             self.loop = model.loop(self.num_envs)
         elif model is not None:
-            inverted = of_simulator(self.sim, robot, own, locked, inverse, nthread)
+            inverted = _inverse_of(self.sim, robot, own, locked, inverse, nthread)
             self.transfer = Transfer(model, inverted, conditions, locked, nthread, extrapolate)
         late = max(robot.delay.max(), 0.0 if self.transfer is None else self.transfer.sim.robot.delay.max())
         self._depth = 1 + int(np.ceil(late / self.dt))
@@ -145,3 +148,26 @@ class AlignedSim:
 
     def _past(self, target: Array) -> Array:
         return np.repeat(target[:, None], self._depth, axis=1)
+
+
+def _inverse_of(
+    sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
+) -> ClosedForm | Probed:
+    """The inverse of a batch of robots; by answers, copies of each, without the table, step ahead."""
+    if how == "closed":
+        return ClosedForm.of(BatchSim(robot, conditions, nthread, locked))
+    count = max(len(PROBES), 1 + sim.n)
+    copies = BatchSim(replace(robot, table=None), conditions * count, nthread, locked)
+    ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
+
+    def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
+        asked = np.arange(len(targets) * sim.num_envs)
+        copies.set_state({name: np.concatenate([x] * count) for name, x in sim.state().items()})
+        copies.qvel[:] = np.tile(qvel, (count, 1))
+        told = np.zeros((copies.num_envs, copies.n))
+        told[asked] = targets.reshape(len(asked), -1)
+        for _ in range(1 + ahead):
+            copies.step(told, asked)
+        return copies.qpos[asked].reshape(targets.shape), copies.qvel[asked].reshape(targets.shape)
+
+    return Probed(answer, conditions[0].dt, ahead)

@@ -14,7 +14,6 @@ its motors.
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -25,7 +24,7 @@ from gaponet.errors import ModelError
 from gaponet.model.artifact import DT_TOLERANCE, GapModel
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.inverse import PROBES, ClosedForm, Period, Probed
+from gaponet.sim.inverse import ClosedForm, Period, Probed
 from gaponet.sim.replay import idle_limbs
 
 Inverse = Literal["closed", "probes"]
@@ -162,29 +161,6 @@ class TransferCorrector:
         out, free = np.array(target, float), self.free
         out[:, free] = self.transfer.command(qpos[:, free], qvel[:, free], target[:, free])
         return out
-
-
-def of_simulator(
-    sim: BatchSim, robot: RobotSpec, conditions: list[Condition], locked: tuple[str, ...], how: Inverse, nthread: int
-) -> ClosedForm | Probed:
-    """The inverse of a batch of robots; by answers, copies of each, without the table, step ahead."""
-    if how == "closed":
-        return ClosedForm.of(BatchSim(robot, conditions, nthread, locked))
-    count = max(len(PROBES), 1 + sim.n)
-    copies = BatchSim(replace(robot, table=None), conditions * count, nthread, locked)
-    ahead = int(np.ceil(robot.delay.max() / conditions[0].dt - 1e-9))
-
-    def answer(targets: Array, qvel: Array) -> tuple[Array, Array]:
-        asked = np.arange(len(targets) * sim.num_envs)
-        copies.set_state({name: np.concatenate([x] * count) for name, x in sim.state().items()})
-        copies.qvel[:] = np.tile(qvel, (count, 1))
-        told = np.zeros((copies.num_envs, copies.n))
-        told[asked] = targets.reshape(len(asked), -1)
-        for _ in range(1 + ahead):
-            copies.step(told, asked)
-        return copies.qpos[asked].reshape(targets.shape), copies.qvel[asked].reshape(targets.shape)
-
-    return Probed(answer, conditions[0].dt, ahead)
 
 
 def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:

@@ -122,32 +122,6 @@ class _Card(TypedDict):
     sha256: NotRequired[dict[str, Sha256]]
 
 
-def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
-    """A card as it stands in the file, every field of a sensible type and size, and the shape of its model.
-
-    Raises:
-        ModelError: Damaged, or written by a newer version.
-    """
-    mend = "restore it or train again"
-    read_format(_Card, file, FORMAT, ModelError, mend)
-    card = read_json(dict[str, Any], file, ModelError, mend)
-    for field, value in RETIRED.items():
-        if (had := card["model"].pop(field, value)) != value:
-            raise ModelError(f"{file}: trained with {field} {had}, which gaponet has no more; train again without it")
-    if card.pop("family", None):
-        raise ModelError(f"{file}: trained in a family of simulators, which gaponet has no more; see gaponet.Transfer")
-    config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
-    n = len(card["joint_names"])
-    lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
-    for name, values in (lists | {f"recorded.{k}": v for k, v in card.get("recorded", {}).items()}).items():
-        if values is not None and len(values) != n:
-            raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
-    for low, high in card.get("qpos_range", []):
-        if low is not None and high is not None and not low < high:
-            raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
-    return card, config
-
-
 def _require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
     """Refuse a network that does not answer (k, width) numbers with (k, *shape) finite ones up to `largest` (rad)."""
     try:
@@ -193,7 +167,7 @@ class GapModel:
         for name in (CARD, *([WEIGHTS] if backend == "onnxruntime" else [])):
             if not (folder / name).is_file():
                 raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
-        card, config = read_card(folder / CARD)
+        card, config = GapModel.read_card(folder / CARD)
         numpy = backend == "numpy"
         file = folder / (fused.FILE if numpy else WEIGHTS)
         network = NumpyNetwork(file) if numpy else OnnxNetwork(file, threads)
@@ -306,6 +280,32 @@ class GapModel:
     def weights_hash(self) -> str:
         """First 12 hex digits of the SHA-256 of model.onnx."""
         return sha256(self.path / WEIGHTS)[:12]
+
+    @staticmethod
+    def read_card(file: Path) -> tuple[dict[str, Any], ModelConfig]:
+        """A card as it stands in the file, every field of a sensible type and size, and the shape of its model.
+
+        Raises:
+            ModelError: Damaged, or written by a newer version.
+        """
+        mend = "restore it or train again"
+        read_format(_Card, file, FORMAT, ModelError, mend)
+        card = read_json(dict[str, Any], file, ModelError, mend)
+        for field, value in RETIRED.items():
+            if (had := card["model"].pop(field, value)) != value:
+                raise ModelError(f"{file}: trained with {field} {had}, which is no more; train again without it")
+        if card.pop("family", None):
+            raise ModelError(f"{file}: trained in a family of simulators, which is no more; see gaponet.Transfer")
+        config = validated(ModelConfig, card["model"], f"{file}: model", ModelError, mend)
+        n = len(card["joint_names"])
+        lists = {name: card.get(name) for name in ("kp", "kd", "qpos_range")}
+        for name, values in (lists | {f"recorded.{k}": v for k, v in card.get("recorded", {}).items()}).items():
+            if values is not None and len(values) != n:
+                raise ModelError(f"{file}: {name}: should have one entry for each of {n} joints; {mend}")
+        for low, high in card.get("qpos_range", []):
+            if low is not None and high is not None and not low < high:
+                raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
+        return card, config
 
 
 def sha256(file: Path) -> str:

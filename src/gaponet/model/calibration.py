@@ -105,19 +105,19 @@ class Calibration:
             found[one.unit_id] = one
         return found
 
+    @staticmethod
+    def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
+        """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
 
-def recordings(data: Dataset, model: GapModel, unit: str, motions: tuple[str, ...]) -> list[Entry]:
-    """Recordings of a unit: of these motions, else of those that the model was trained on, else all.
-
-    Raises:
-        UsageError: No such unit, or none is named and the dataset holds several.
-    """
-    units = sorted({e.meta.unit_id for e in data.entries})
-    if unit not in units and (unit or len(units) != 1):
-        raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
-    entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
-    trained = [e for e in entries if e.meta.motion in model.card["motions"]["train"]]
-    return entries if motions else trained or entries
+        Raises:
+            UsageError: No such unit, or none is named and the dataset holds several.
+        """
+        units = sorted({e.meta.unit_id for e in data.entries})
+        if unit not in units and (unit or len(units) != 1):
+            raise UsageError(f"--unit {unit or '(none)'}: {data.path} holds units {', '.join(units)}; name one")
+        entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
+        trained = [e for e in entries if e.meta.motion in model.card["motions"]["train"]]
+        return entries if motions else trained or entries
 
 
 def _one_unit(sequences: ListOf[Sequence]) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import RobotSpec
 from gaponet.sim.model import build_model
 
@@ -43,24 +42,6 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
     """Torque that holds each posture still, (T, n), N·m."""
     zero = np.zeros_like(qpos)
     return inverse_dynamics(model, qpos, zero, zero)
-
-
-def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
-    """What the nominal, payload-carrying model would have needed to move as recorded.
-
-    Args:
-        model: Nominal simulator with the recording's payload (sim.model.build_model).
-        qpos: Recorded, (T, n) rad.
-        dt: s.
-        cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
-
-    Returns:
-        Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.
-    """
-    smooth = lowpass(qpos.astype(float), dt, cutoff)
-    qvel = differentiate(smooth, dt)
-    qacc = differentiate(qvel, dt)
-    return inverse_dynamics(model, smooth, qvel, qacc), qacc
 
 
 def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:

@@ -104,7 +104,7 @@ def _simulator(holder: Path) -> Path:
 
 
 def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: float) -> None:
-    from gaponet.model.artifact import CARD, GapModel, read_card
+    from gaponet.model.artifact import CARD, GapModel
 
     if (run / "robot.toml").is_file():
         raise UsageError(f"{run}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton or json")
@@ -119,7 +119,7 @@ def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: fl
         from gaponet.robot_folder import kept_robot, save_robot
 
         path = out or run / "model"
-        card, config = read_card(run / "model" / CARD)
+        card, config = GapModel.read_card(run / "model" / CARD)
         net = trained_network(run, config, len(card["joint_names"]))
         difference = write(net, path, card, drawn_states(net))
         if path != run / "model" and keeps_robot(run):

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaponet.errors import RemoteError
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.target import BLOCK, INDEX, LARGEST_INDEX, Anew, ChangedError, Kind, Part, part_of, reaching
 
 if TYPE_CHECKING:

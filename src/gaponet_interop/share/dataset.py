@@ -18,13 +18,14 @@ from gaponet.data.importer import import_logs
 from gaponet.data.split import read_split
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.data.writers import export
-from gaponet.errors import DatasetError, RemoteError
+from gaponet.errors import DatasetError
 from gaponet.files import write_text
 from gaponet.progress import Progress
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import KEPT, require_bare, save_robot
 from gaponet.sim.dynamics import gravity_of
 from gaponet.sim.model import model_hash
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.readme import dataset_readme
 from gaponet_interop.share.target import Index
 

@@ -14,8 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from gaponet.errors import RemoteError
 from gaponet_interop.formats.lerobot_set import VERSION as LEROBOT_TAG
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, Kind, Part, reaching
 
 TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}

@@ -17,12 +17,13 @@ from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
 
-from gaponet.errors import GAPONetError, RemoteError, UsageError
+from gaponet.errors import GAPONetError, UsageError
 from gaponet.files import MARK, writing
 from gaponet.progress import bar, noted
 from gaponet.structure import parse_json
 from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share import run as runs
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.open import open_target
 from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, ChangedError, Index, Kind, Part, Target, part_of
 

@@ -6,11 +6,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-from gaponet.errors import ModelError, RemoteError
+from gaponet.errors import ModelError
 from gaponet.eval.run_files import read_config, read_metrics
 from gaponet.files import write_text
 from gaponet.model.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, require_bare
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.readme import run_readme
 from gaponet_interop.share.target import Index
 

@@ -21,12 +21,13 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta, to_sequence
 from gaponet.data.store import Dataset, Entry, entry_id
-from gaponet.errors import DatasetError, GAPONetError, RemoteError
+from gaponet.errors import DatasetError, GAPONetError
 from gaponet.structure import LARGEST_ARRAYS
 from gaponet_interop.formats.lerobot import read_episode
 from gaponet_interop.formats.lerobot_set import FEATURES, Set, Stated, sets_under
 from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share.bucket import Bucket
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.move import download, read_index
 from gaponet_interop.share.target import INDEX, reaching
 

@@ -11,8 +11,8 @@ from typing import Annotated, Literal, Protocol
 
 from annotated_types import Interval, Len
 
-from gaponet.errors import RemoteError
 from gaponet.structure import Name, Sha256
+from gaponet_interop.share.errors import RemoteError
 
 Kind = Literal["dataset", "run"]
 Anew = Literal["", "damaged", "all"]

@@ -10,7 +10,7 @@ from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.run_files import read_config, read_metrics, read_progress
 from gaponet.methods import method, title
-from gaponet.model.artifact import CARD, read_card
+from gaponet.model.artifact import CARD, GapModel
 from gaponet.robot_folder import kept_robot
 
 
@@ -48,7 +48,7 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
     """What the files of a run say; None where they do not say it yet."""
     config, last = read_config(run), _last(run)
     kind, file = config["model"]["kind"], run / "model" / CARD
-    card = read_card(file)[0] if file.is_file() else {}
+    card = GapModel.read_card(file)[0] if file.is_file() else {}
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else {}
     val = card.get("val_mpjae", {"model": last.get("best"), "nominal": last.get("nominal_mpjae")})
     own = method(kind, kept_robot(run, config["robot"]))

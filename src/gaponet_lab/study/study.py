@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
-from gaponet.executor import LOCAL, MOST_WORKERS, cores
+from gaponet.executor import LOCAL, MOST_WORKERS, Pool
 from gaponet.methods import IDENTIFIED
 from gaponet.robot import RobotSpec
 from gaponet.training.budget import Budget
@@ -102,7 +102,7 @@ class Study:
     @property
     def at_once(self) -> int:
         """Trainings, as far as is known before a cluster is asked."""
-        return self.workers or (cores(self.threads) if self.executor == LOCAL else MOST_WORKERS)
+        return self.workers or (Pool.cores(self.threads) if self.executor == LOCAL else MOST_WORKERS)
 
     def variant(self, word: str) -> Variant:
         """A model as written, on this configuration."""

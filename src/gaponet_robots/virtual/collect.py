@@ -19,7 +19,7 @@ from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
 from gaponet.errors import DatasetError, UsageError
-from gaponet.executor import LOCAL, MOST_WORKERS, cores, opened
+from gaponet.executor import LOCAL, MOST_WORKERS, Pool, opened
 from gaponet.files import write_text, writing
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
@@ -96,7 +96,7 @@ def collect(
         }
         missing = [t for t in wanted if _key(t.motion, t.unit, t.payload, 1 / t.rate, t.repetition) not in present]
         written, seconds = 0, 0.0
-        jobs = [Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _parts(missing, nproc or cores(1))]
+        jobs = [Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _parts(missing, nproc or Pool.cores(1))]
         if twins:
             pair_dataset(dataset, robot, lock_idle=True)  # those that a killed run had no time for
         for sequence, twin in _record(jobs, nproc, twins, executor, dataset.path):
@@ -174,7 +174,7 @@ def _record(
 ) -> Iterator[tuple[Sequence, Twin | None]]:
     """Sequences in the jobs' order, whichever worker is first."""
     work = partial(_played, twins=twins)
-    if executor == LOCAL and (len(jobs) < 2 or (nproc or cores(1)) == 1):
+    if executor == LOCAL and (len(jobs) < 2 or (nproc or Pool.cores(1)) == 1):
         for job in jobs:
             yield from work(job)
         return

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import RobotSpec
-from gaponet.sim.dynamics import equivalent_torque
+from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
 from gaponet_robots.motion.library import Library
 from gaponet_robots.motion.motion import Motion
@@ -126,3 +128,21 @@ def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMe
         kp=tuple(job.robot.kp.tolist()),
         kd=tuple(job.robot.kd.tolist()),
     )
+
+
+def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
+    """What the nominal, payload-carrying model would have needed to move as recorded.
+
+    Args:
+        model: Nominal simulator with the recording's payload (sim.model.build_model).
+        qpos: Recorded, (T, n) rad.
+        dt: s.
+        cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
+
+    Returns:
+        Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.
+    """
+    smooth = lowpass(qpos.astype(float), dt, cutoff)
+    qvel = differentiate(smooth, dt)
+    qacc = differentiate(qvel, dt)
+    return inverse_dynamics(model, smooth, qvel, qacc), qacc

@@ -16,9 +16,10 @@ from runs import untrained
 from gaponet.cli.main import main
 from gaponet.data.split import make_split, write_split
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.errors import DatasetError, RemoteError, UsageError
+from gaponet.errors import DatasetError, UsageError
 from gaponet.model.artifact import GapModel
 from gaponet_interop.share.bucket import Bucket
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.move import pull, push
 from gaponet_interop.share.target import part_of
 

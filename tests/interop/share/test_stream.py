@@ -15,7 +15,8 @@ from gaponet.cli.main import main
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.split import make_split, write_split
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, RemoteError
+from gaponet.errors import DatasetError
+from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.move import push
 from gaponet_interop.share.target import part_of
 

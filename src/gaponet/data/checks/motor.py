@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, names, some
+from gaponet.data.checks.finding import Finding, some
 from gaponet.data.holds import Holds, StaticError
-from gaponet.data.signals import FAST, sharp
+from gaponet.data.signals import FAST, Response
 from gaponet.data.survey import Survey, Torque
 from gaponet.robot import RobotSpec
 
@@ -38,7 +38,8 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"state follows command after (median and range over motions at {FAST} rad/s or faster) {told}: "
         f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
     )
-    own, jumps = _servo_lag(robot), dict(zip(robot.joint_names, sharp([s.response for s in surveys]), strict=True))
+    own, sharp = _servo_lag(robot), Response.sharp([s.response for s in surveys])
+    jumps = dict(zip(robot.joint_names, sharp, strict=True))
     asked = [name for name in found if name in robot.operated and not jumps[name]]  # of others `timing` sees more
     extra = {name: float(np.median(found[name])) - own[name] for name in asked}
     usual = float(np.median(list(extra.values()))) if extra else 0.0
@@ -103,8 +104,8 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     low, high = np.min([t.low for _, t in told], axis=0), np.max([t.high for _, t in told], axis=0)
     used = np.max([s.qpos_range for s, _ in told], axis=0) > 0.05
-    dead, alive = names(robot, used & (low == high)), names(robot, used & (low < high))
-    unsigned = names(robot, used & (low < high) & (low >= 0))
+    dead, alive = _names(robot, used & (low == high)), _names(robot, used & (low < high))
+    unsigned = _names(robot, used & (low < high) & (low >= 0))
     found = []
     if dead:
         found.append(Finding("warning", "torque", f"torque of {', '.join(dead)} never changes; ignore it", dead))
@@ -159,6 +160,11 @@ def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticEr
 def _mrad(error: StaticError) -> str:
     band = f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
     return f"{error.middle * 1e3:+.0f}{band}"
+
+
+def _names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
+    """Joint names where mask (n) is true."""
+    return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)
 
 
 CHECKS = (_lag, _sag, _torque)
