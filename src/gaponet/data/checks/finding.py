@@ -49,3 +49,8 @@ def proposal(findings: list[Finding]) -> str:
     if not bad:
         lines = ["# gaponet doctor --fix: nothing to mend."]
     return "\n".join(lines) + "\n"
+
+
+def names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
+    """Joint names where mask (n) is true."""
+    return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)

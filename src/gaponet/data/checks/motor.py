@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, some
+from gaponet.data.checks.finding import Finding, names, some
 from gaponet.data.holds import Holds, StaticError
 from gaponet.data.signals import FAST, Response
 from gaponet.data.survey import Survey, Torque
@@ -104,8 +104,8 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     low, high = np.min([t.low for _, t in told], axis=0), np.max([t.high for _, t in told], axis=0)
     used = np.max([s.qpos_range for s, _ in told], axis=0) > 0.05
-    dead, alive = _names(robot, used & (low == high)), _names(robot, used & (low < high))
-    unsigned = _names(robot, used & (low < high) & (low >= 0))
+    dead, alive = names(robot, used & (low == high)), names(robot, used & (low < high))
+    unsigned = names(robot, used & (low < high) & (low >= 0))
     found = []
     if dead:
         found.append(Finding("warning", "torque", f"torque of {', '.join(dead)} never changes; ignore it", dead))
@@ -160,11 +160,6 @@ def static_errors(surveys: list[Survey], robot: RobotSpec) -> dict[str, StaticEr
 def _mrad(error: StaticError) -> str:
     band = f" ± {error.half_band * 1e3:.0f}" if error.balanced else " (approached from one side only)"
     return f"{error.middle * 1e3:+.0f}{band}"
-
-
-def _names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
-    """Joint names where mask (n) is true."""
-    return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)
 
 
 CHECKS = (_lag, _sag, _torque)
