@@ -6,6 +6,9 @@ import json
 from dataclasses import dataclass, field
 from typing import Any
 
+from gaponet.arrays import Array
+from gaponet.robot import RobotSpec
+
 # ok; note, a fact to know; warning, usable but look first; error, do not train on it before it is mended.
 LEVELS = ("ok", "note", "warning", "error")
 
