@@ -33,7 +33,7 @@ test: setup
 
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
-	$(BIN)/python -m pytest -m faults -rP
+	$(BIN)/python -m pytest -m faults -rP tests/robots
 
 # Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
 live: setup

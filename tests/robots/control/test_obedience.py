@@ -83,6 +83,8 @@ class Bus:
         elif self.way == "zero":
             self.put(reg.HOMING_OFFSET, self.arm.calibration.rows["elbow_flex"].homing_offset + 33, (ELBOW,))
             self.arm.calibration.zero[2] -= 33  # 0.05 rad
+        elif self.way == "mode":
+            self.put(reg.MODE, 1, (ELBOW,))
         elif self.way == "limit":
             self.put(reg.TORQUE_LIMIT, 200, (ELBOW,))
         elif self.way == "lost":
@@ -141,7 +143,8 @@ WAYS = {
     "ignores": "it holds the goal", "resets": r"servo 5 \(wrist_roll\): its torque is off",
     "brown-out": "shoulder_pan.*its torque is off.*gripper",
     "gain": r"servo 3 \(elbow_flex\): its p went from 32 to 128", "zero": "elbow_flex.*: its homing offset went from",
-    "limit": "elbow_flex.*: its torque limit went from 1000 to 200", "crossed": "elbow_flex.*: it holds the goal",
+    "limit": "elbow_flex.*: its torque limit went from 1000 to 200", "mode": "elbow_flex.*: its mode went from 0 to 1",
+    "crossed": "elbow_flex.*: it holds the goal",
 }  # fmt: skip
 
 
@@ -287,6 +290,7 @@ def swing(
     [
         ("ignores", 0.0), ("ignores", 2.0), ("listens midway", 2.5), ("limp", 2.0), ("all limp", 2.0), ("weak", 2.0),
         ("crossed", 0.0), ("mirrored", 0.0), ("blocked", 0.5), ("blocked", 2.6), ("blocked", 3.4),
+        ("zero", 2.5),
     ],
 )  # fmt: skip
 def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_data(monkeypatch, way, at):
@@ -297,11 +301,13 @@ def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_d
         assert [e.phase for e in recording.events][-2:] == ["release", "stopped"]
         assert recording.events[-1].text == "let go; the robot did not obey"
     else:
-        assert (recording.fault.kind, recording.fault.phase) == ("frozen", "damp")
+        assert (recording.fault.kind, recording.fault.phase) == ("jump" if way == "zero" else "frozen", "damp")
     with pytest.raises(LogError, match="did not do what it was told"):
         recording.log()
     steps = np.abs(np.diff([row.state.qpos for row in recording.rows], axis=0))
-    assert steps.max() < 0.06 or "limp" in way, "nothing jumps when a robot listens again, and what is limp falls"
+    assert steps.max() < 0.06 or "limp" in way or way == "zero", (
+        "nothing jumps when a robot listens again, and what is limp falls"
+    )
     if at == 0.0 and way == "ignores":
         assert max(row.time for row in recording.rows if row.phase == "blend_in") < recording.rows[0].time + 3.0
 
