@@ -9,10 +9,12 @@ import pytest
 from arm import recordings, write_arm
 from logs import arm_sequence, late, wave
 
+from gaponet.data.signals import differentiate, lowpass
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.robot import available, load_robot
-from gaponet.sim.dynamics import gravity_of
+from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.model import build_model
 from gaponet_lab.real.adversaries import ADVERSARIES
 from gaponet_lab.real.bench import Bench, load_method
 from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
@@ -106,8 +108,11 @@ def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
     windows = []
     for mass in (0.0, 0.2, 0.4):
         for s in recordings(robot, 2, rows=200):
-            tau = gravity_of(true)(s.qpos, mass + 0.1, "both")
-            one = replace(s, tau=tau, qvel=0 * s.qvel, meta=replace(s.meta, payload_mass=mass))
+            model = build_model(true, mass + 0.1, "both", s.dt)
+            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
+            qvel = differentiate(qpos, s.dt)
+            tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
+            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass))
             windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
     moved, load = hanging(windows, robot)
     assert moved.payload_mounts[0].pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)

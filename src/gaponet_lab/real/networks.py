@@ -16,10 +16,10 @@ from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
 from gaponet_lab.real.questions import Question
-from gaponet_lab.real.rivals import Answer, Method, identified, nominal
+from gaponet_lab.real.rivals import Answer, Method, best, nominal
 
 RECIPE = TrainConfig(warm_start=WarmStartConfig(rounds=3), mixed_gains=True)
-BASES = {"": nominal, "identification + ": identified}
+BASES = {"": nominal, "identification + ": best}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 TRAINED = (("", "shared_mlp"), ("", "gaponet"), ("identification + ", "gaponet"))
 

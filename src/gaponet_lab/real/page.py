@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LOOKS = {  # method's title → colour, marker
-    "nominal simulator": (colour("nominal"), "|"),
     "constant offset by joint, payload, unit": (colour("offset"), "x"),
     "delay + offset": (colour("delay_offset"), "s"),
     "identified elsewhere": (shade(colour("identified"), 0.5), "o"),
     "identification": (colour("identified"), "o"),
+    "identification from torque": (shade(colour("identified"), -0.4), "o"),
     "identified elsewhere, calibrated": (colour("calibrated"), "D"),
     "shared MLP": (colour("shared_mlp"), "^"),
     "GAPONet": (colour("gaponet"), "^"),
@@ -38,7 +38,12 @@ COLUMNS = (
     "motions",
     "recordings",
 )
-NAME = "bench_real"
+NAME = "real"
+TITLE = """# Real robots
+
+`gaponet bench real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in free run from the
+recorded start. ± is the standard error over independent motions, of differences to the nominal simulator paired;
+"floor" is what two recordings of one command differ by."""
 
 
 def table(rows: list[dict[str, Any]]) -> list[list[str]]:
@@ -58,13 +63,19 @@ def _pm(value: float, error: float | None) -> str:
 def write_page(found: dict[str, Any], out: Path) -> list[Path]:
     """JSON, Markdown and figure in a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    rows = found["rows"]
-    write_text(out / f"{NAME}.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n")
-    lines = ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
+    rows, name = found["rows"], f"{NAME}-{found['adversary']}".rstrip("-")
+    write_text(out / f"{name}.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n")
+    lines = [TITLE, "", f"![What methods leave of the nominal error]({name}.png)", ""]
+    if found["adversary"]:
+        lines += [f"ADVERSARY: {found['adversary']}.", ""]
+    lines += ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
     lines += ["| " + " | ".join(cells) + " |" for cells in table(rows)]
-    write_text(out / f"{NAME}.md", "\n".join(lines) + "\n")
-    figures = save(draw(rows, found["cards"]), out / NAME) if rows else []
-    return [out / f"{NAME}.md", out / f"{NAME}.json", *figures]
+    spent = ", ".join(f"{what} {seconds:,} s" for what, seconds in found["seconds"].items())
+    agreed = [f"Labels of {what}: {json.dumps(agreement)}." for what, agreement in found["labels"].items()]
+    lines += ["", f"From file to table, on this machine: {spent}.", *agreed]
+    write_text(out / f"{name}.md", "\n".join(lines) + "\n")
+    figures = save(draw(rows, found["cards"]), out / name) if rows else []
+    return [out / f"{name}.md", out / f"{name}.json", *figures]
 
 
 @styled
@@ -79,20 +90,20 @@ def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
         nominal = mine[0]["mrad"]
         if mine[0]["floor_mrad"] is not None:
             ax.barh(y, mine[0]["floor_mrad"] / nominal, 0.8, color="#111111", alpha=0.1, lw=0,
-                    label="two recordings of one command differ by")  # fmt: skip
-        shown = [r for r in mine if r["method"] in LOOKS]
+                    label="repetitions differ by")  # fmt: skip
+        shown = [r for r in mine if r["method"] in LOOKS]  # the nominal simulator is the line
         for i, r in enumerate(shown):
             own, marker = LOOKS[r["method"]]
             place = y + 0.5 * (i / max(len(shown) - 1, 1) - 0.5)
             x, error = r["of_nominal"], (r["standard_error"] or 0.0) / nominal
             ax.errorbar(min(x, WIDEST), place, xerr=error or None, fmt=marker if x <= WIDEST else ">", ms=4.5,
-                        color=own, elinewidth=0.8, label=r["method"])  # fmt: skip
-    ax.axvline(1.0, color=colour("nominal"), lw=0.8, zorder=0)
+                        color=own, elinewidth=0.8, label=r["method"].partition(" by ")[0])  # fmt: skip
+    ax.axvline(1.0, color=colour("nominal"), lw=1.2, zorder=0, label="nominal simulator")
     ax.set_yticks(np.arange(len(asked)), names)
     ax.tick_params(axis="y", length=0)
     ax.set_ylim(len(asked) - 0.4, -0.6)
-    ax.set_xlim(0.0, min(1.05 * max(r["of_nominal"] for r in rows if r["method"] in LOOKS), WIDEST))
+    ax.set_xlim(0.0, max(1.05, min(1.05 * max(r["of_nominal"] for r in rows), WIDEST)))
     ax.grid(axis="y", visible=False)
-    ax.set_xlabel("mean |error| in free run, of the nominal simulator's; bars: standard error over motions")
+    ax.set_xlabel("mean |error|, of the nominal simulator's")
     legend(fig)
     return fig

@@ -20,6 +20,7 @@ from gaponet.robot import RobotSpec
 
 FOLDS = 3
 FEW = 6  # recordings of a unit, of each joint, to calibrate with
+ALIKE = 0.02  # rad that repetitions' commands differ by in the mean: one may begin a part of a period later
 VAL = 8  # one in so many pairs of motion and payload judges, where motions are too few for a part of their own
 Made = TypeVar("Made")
 
@@ -75,7 +76,7 @@ def questions(
 
     if name in ("new motions", "another session"):
         parts = split_entries(dataset)
-        few = _half_a_minute(parts["train"]) if name == "another session" else []
+        few = parts["train"] if name == "another session" else []
         yield ask(parts["train"], parts["val"], parts["test"], few)
     elif name == "later repetitions":
         parts = in_turn(dataset, "repetition")
@@ -112,28 +113,35 @@ def _joint(entry: Entry) -> str:
     return entry.meta.motion.split("-to")[0] if unknown else ""
 
 
-def _half_a_minute(entries: list[Entry], seconds: float = 30.0) -> list[Entry]:
-    """The first recording by the hash of its name; what is used of it is cut later."""
-    name = hash_order({e.meta.motion for e in entries})[0]
-    return [e for e in entries if e.meta.motion == name]
+def rehearsal(known: list[Sequence]) -> tuple[list[Sequence], list[Sequence]]:
+    """Recordings to learn from, and one command of each joint that has several, to be asked, among those known."""
+    judges = set()
+    for unrecorded in {s.meta.unrecorded for s in known}:
+        motions = hash_order(s.meta.motion for s in known if s.meta.unrecorded == unrecorded)
+        judges |= set(motions[:1] if len(motions) > 1 else [])
+    return [s for s in known if s.meta.motion not in judges], [s for s in known if s.meta.motion in judges]
 
 
 def floor(question: Question) -> float:
-    """Mean |difference| of two recordings of one command, unit and payload, rad; nan where there are none."""
+    """Mean |difference| in how two recordings of one command, unit and payload follow it, rad; nan without any."""
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.motion, strict=True):
         groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded), []).append(s)
-    apart = [d for group in groups.values() for d in _differences(group, question.robot)]
+    pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
+    least = min((command for command, _ in pairs), default=0.0)
+    apart = [d for command, d in pairs if command <= max(least, SAME_COMMAND)]
     return float(np.mean(apart)) if apart else float("nan")
 
 
-def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[float]:
+def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
+    """Of two recordings: by how much their commands differ in the mean, and how they follow them, rad."""
     for a, first in enumerate(group):
         for second in group[a + 1 :]:
             rows = min(len(first), len(second))
-            if np.abs(first.ctrl[:rows] - second.ctrl[:rows]).max() < 5 * SAME_COMMAND:
-                error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows])[:, recorded(first, robot)]
-                yield float(error.mean())
+            told = first.ctrl[:rows] - second.ctrl[:rows]
+            error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - told)[:, recorded(first, robot)]
+            if np.abs(told).mean() < ALIKE:
+                yield float(np.abs(told).mean()), float(error.mean())
 
 
 def recorded(sequence: Sequence, robot: RobotSpec) -> list[int]:
