@@ -119,7 +119,7 @@ class TrainConfig:
     validate_every: Annotated[int, Interval(ge=1, le=10000000)] = 10
     """PPO updates between free runs over the validation motions."""
     threads: Annotated[int, Interval(ge=0, le=4096)] = 0
-    """Threads of the simulator, and in turn of the learner; 0 for all cores."""
+    """Threads of the simulator, and in turn of the learner; 0 for all cores, of the learner for OMP_NUM_THREADS."""
     device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
     """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'); warp-cpu: the same on the CPU, slowly, to
     test it. Scores, identification and robots stay on C MuJoCo."""

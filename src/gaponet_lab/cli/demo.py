@@ -13,7 +13,7 @@ from gaponet.cli.gap import show_methods
 from gaponet.cli.identify import identify
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.eval.verdict import verdict
 from gaponet.progress import bar
 from gaponet.robot import as_option, load_robot
@@ -62,9 +62,14 @@ def demo(
         screen.say(
             f": does a network find more?  (gaponet train {dataset} --robot {as_option(known)} --out {run})", "3 Use"
         )
-        resume = (run / "checkpoint.pt").is_file()
-        config = TrainConfig(warm_start=QUICK)
-        api.train(Dataset(dataset), run, network, config, robot=known, holdout_units=holdout, resume=resume)
+        resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(warm_start=QUICK)
+        try:
+            api.train(Dataset(dataset), run, network, config, robot=known, holdout_units=holdout, resume=resume)
+        except ModelError:  # a machine with much other work
+            screen.say(
+                f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
+            )
+            run = known
     found = api.evaluate(run, str(dataset)).result
     show_methods(screen, found, ("joint", "payload"))
     with bar("report") as update:
