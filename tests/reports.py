@@ -12,7 +12,7 @@ from arm import recordings
 from runs import untrained
 
 from gaponet.data.store import Dataset
-from gaponet.eval.evaluate import evaluate, save
+from gaponet.eval.evaluate import evaluate
 from gaponet.robot import RobotSpec
 
 FACTS = {
@@ -34,7 +34,7 @@ def evaluated_run(arm: RobotSpec, data: Dataset, folder: Path, simulator: RobotS
     amend(folder, **FACTS, stages={"warm_start_rounds": [3, 10], "ppo_updates": 0})
     (folder / "config.json").write_text(json.dumps(CONFIG))
     (folder / "progress.jsonl").write_text(json.dumps(LINE) + "\n")
-    save(evaluate([folder], data, arm), folder)
+    evaluate([folder], data, arm).save(folder)
     return folder
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.spread import Spread
-from gaponet_lab.plot.style import DASHED, DOTTED, figure, legend, styled
+from gaponet_lab.plot.style import DASHED, DOTTED, LETTER, figure, legend, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +24,8 @@ LEAST = 0.06  # rad, of an axis of positions
 @styled
 def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
     """Bars with error bars, the methods of each group side by side."""
-    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7), 3.3)
+    word = max((len(word) for group in groups for word in group.split()), default=0)
+    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3), 3.3)
     ax = fig.subplots()
     draw_bars(ax, groups, methods)
     ax.set_ylabel(axis)
@@ -73,7 +74,6 @@ def against(
     looks: Mapping[str, tuple[str, str]],
     reference: str,
     title: str = "",
-    limit: float | None = None,
 ) -> Figure:
     """Positions by method over time, a column per joint; below them how far each is from the reference, on one scale.
 
@@ -81,7 +81,6 @@ def against(
         time: (T,) s.
         joints: What the column is called → what it shows.
         looks: Label and colour of each method, of the reference, and of "command".
-        limit: Largest error that has to fit, mrad; default that of this figure.
     """
     some = next(iter(joints.values()))
     rows = {"position, rad": 1.8, "zoom, rad": 1.6 * (some.zoom is not None), "error, mrad": 1.1,
@@ -108,7 +107,7 @@ def against(
         row[0].set_ylabel(label)
         if label in ("error, mrad", "Δa, mrad"):
             seen = max(abs(v) for ax in row for v in ax.dataLim.intervaly)
-            end = 1.08 * (limit if limit and label == "error, mrad" else seen) or 1.0
+            end = 1.08 * seen or 1.0
             for ax in row:
                 ax.set_ylim(-end, end)
     fig.align_ylabels(axes[:, 0])

@@ -88,7 +88,7 @@ def training_curve(progress: list[dict[str, Any]]) -> Figure:
 def trajectories(
     arrays: dict[str, Array], shown: list[dict[str, Any]], joints: tuple[str, ...], methods: list[str]
 ) -> dict[int, Figure]:
-    """Command, recorded and simulated positions of a few joints over each motion shown, errors on one scale for all.
+    """Command, recorded and simulated positions of a few joints over each motion shown.
 
     Args:
         arrays: For each row ROW/METHOD, recorded, command, delta/METHOD, (T, n) rad.
@@ -103,19 +103,8 @@ def trajectories(
         start = busiest(recorded, rows := round(WINDOW / dt))
         window = slice(start, min(start + rows, len(recorded)))
         drawn[row] = np.arange(len(recorded))[window] * dt, _courses(arrays, row, joints, methods, window, dt)
-    limit = max(
-        (
-            1e3 * float(np.abs(q - c.base).max())
-            for _, cs in drawn.values()
-            for c in cs.values()
-            for q in c.found.values()
-        ),
-        default=0.0,
-    )
     travel = {row: np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in drawn}
-    return {
-        row: against(*drawn[row], looks, "recorded", limit=limit) for row in sorted(drawn, key=lambda row: -travel[row])
-    }
+    return {row: against(*drawn[row], looks, "recorded") for row in sorted(drawn, key=lambda row: -travel[row])}
 
 
 def _courses(

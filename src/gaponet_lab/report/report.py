@@ -145,7 +145,7 @@ def _page(
         *(element("div", text, css="warn") for text in warnings(card, own, metrics)),
         *photo,
         element("h2", f"Errors, whole-motion free run {held_out}"),
-        _table(totals(methods, _both, metrics.get("simulators")), best),
+        _table(totals(methods, _both), best), *_simulators(metrics.get("simulators", {})),
         _explained(methods),
         element("h2", "By joint"), _by_joint(methods, own, metrics),
         element("div", *bars, css="row"),
@@ -169,6 +169,12 @@ def _page(
     return page(f"{robot.name} {name}", Markup("").join(body))
 
 
+def _simulators(ran: dict[str, str]) -> Iterator[Markup]:
+    if ran:
+        said = "; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items())
+        yield element("p", f"Simulators, by their hashes: {said}.", css="small")
+
+
 def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: RobotSpec) -> Iterator[Markup]:
     from gaponet_lab.report import figures as draw
 
@@ -182,7 +188,7 @@ def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: Robo
     yield element(
         "p", "The 20 s with most motion of each recording, of the joints that move the three with the largest nominal "
         "error. The zoom (shaded above) is where the command turns or stops: there lag and sag are seen. Errors of "
-        "all motions are on one scale; Δa is the learned correction.", css="small",
+        "one motion are on one scale; Δa is the learned correction.", css="small",
     )  # fmt: skip
     yield from shown[:OPEN]
     if shown[OPEN:]:
