@@ -11,7 +11,7 @@ from cells import note_threads, wait_for_the_end
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.executor import opened
-from gaponet.model.baselines import delay_offset
+from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 from gaponet_lab.study.pool import SETUP, plan, run_cells, train_cell
 from gaponet_lab.study.variant import parse_variant
@@ -120,8 +120,8 @@ def test_a_model_named_twice_is_refused(data, arm, tmp_path):
 
 def test_what_is_the_same_for_all_cells_is_fitted_once(data, arm, tmp_path, monkeypatch):
     fits = []
-    whole = delay_offset.fit
-    monkeypatch.setattr(delay_offset, "fit", lambda *args: fits.append(1) or whole(*args))
+    whole = DelayOffset.fit
+    monkeypatch.setattr(DelayOffset, "fit", lambda *args: fits.append(1) or whole(*args))
     first, second, part = cells(data, arm, tmp_path / "out", ("mlp", "mlp:history=2", "mlp:train_share=0.5"))
     for cell in (first, second, part):
         train_cell(cell, lambda share, note: None)
