@@ -171,9 +171,9 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
     all_of = {"every joint": float((error <= [k.band for k in mine.joints.values()]).mean())}
     there = Dataset(other)
     later = there.sequences(there.entries)
-    asked = {f"first day, never fitted, {i + 1}": (val + test)[i::3] for i in range(3)}
-    asked |= {f"first day, fitted, {i + 1}": train[i::5] for i in range(5)}
-    asked |= {f"other day, {i + 1}": later[i::8] for i in range(8)}
+    asked = {f"first day, never fitted, half {i + 1}": (val + test)[i::2] for i in range(2)}
+    asked |= {f"first day, fitted, half {i + 1}": train[i::2] for i in range(2)}
+    asked |= {f"other day, quarter {i + 1}": later[i::4] for i in range(4)}
     for name, logs in asked.items():
         began = time.monotonic()
         found = drift(robot, mine, logs)

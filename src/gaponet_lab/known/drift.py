@@ -23,12 +23,12 @@ from gaponet.sim.axes import OVER_KP
 from gaponet.sim.joint_runs import SOFT
 from gaponet_lab.known.evidence import PLAY, Evidence, evidence, inverted, spread_of
 
-ALARM = 0.006  # of a robot that did not change: how often any of its numbers is said to have moved
+ALARM = 0.003  # of a robot that did not change: how often any of its numbers is said to have moved
 AGAINST = 1e-4  # the same of a recording that is said to contradict the others
 FELT = 0.15  # of what the model leaves anyway: a change that moves a joint by less is none that matters
 MOST = 3  # numbers of a joint that are named
-FEWEST, TRUSTED = 6, 40  # recordings that speak for themselves; the most clusters that what was known counts as
-MINORITY = 1 / 3  # of the recordings: so many that say something else are set aside, more contradict the others
+TRUSTED = 40  # the most clusters that what was known counts as
+MINORITY = 0.4  # of the recordings: so many that say something else are set aside, more contradict the others
 SHARED = ("delay",)  # of one bus: all joints' move together
 EVERY = "every joint"
 WARM = ("damping", "frictionloss", "stribeck")
@@ -103,7 +103,7 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
     aside = {a.recording for a in against}
     contradictory = len(aside) > MINORITY * len(says.names)
     says = says if contradictory else says.without(aside)
-    grouped = says.by_recording() if len(says.names) >= FEWEST else says
+    grouped = says.by_recording() if len(says.names) > 1 else says
     clusters, trusted = grouped.pulls.shape[1], min(known.clusters, TRUSTED)
     tests = len(joints) * len(fields) + len(SHARED)
     threshold = float(student.isf(ALARM / tests / 2, trusted + clusters - 1))
