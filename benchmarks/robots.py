@@ -235,8 +235,10 @@ def picture(rows: list[Row]) -> Figure:
     ax.plot(ends, ends, color="0.6", lw=0.8)
     ax.set(xscale="log", yscale="log", xlim=ends, ylim=ends, aspect="equal",
            xlabel="plain script, share of the file's error", ylabel="gaponet identify")  # fmt: skip
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.legend(loc="upper left")
-    ax.set_title("Robots that nobody tuned on (VIRTUAL)")
+    ax.set_title("VIRTUAL robots that nobody tuned on")
     return fig
 
 
