@@ -2,7 +2,8 @@
 
     python .ci/parts.py [core] [robots] [interop] [lab] [all]      default: all five; needs uv and the package index
 
-Prints of each its lines, its wheel, what the environment takes on disk, and how long its import and --version take.
+Prints of each, before its tests, its lines, its wheel, what the environment takes on disk, and how long its import and
+--version take.
 """
 
 from __future__ import annotations
@@ -76,6 +77,12 @@ def main(wanted: list[str]) -> None:
             empty = seconds(bin / "python", "-c", "pass", folder=folder)
             helped = seconds(bin / "gaponet", "--version", folder=folder)
             lines = sum(len(f.read_text().splitlines()) for p in packages for f in (ROOT / "src" / p).rglob("*.py"))
+            print(
+                f"{name}: {', '.join(packages)}; {lines:,} lines, wheel {wheel.stat().st_size / 1e6:.2f} MB, "
+                f"environment {size / 1e6:.0f} MB without extras, import {1e3 * (load - empty):.0f} ms, "
+                f"--version {1e3 * helped:.0f} ms",
+                flush=True,
+            )
             run(*pip, f"gaponet[{extras}] @ {wheel.as_uri()}", "pytest", folder=folder)
             shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
             for other in ("pyproject.toml", "docs", "examples", "benchmarks"):
@@ -84,12 +91,6 @@ def main(wanted: list[str]) -> None:
             checkout = "--ignore=tests/test_package.py"  # it is about the repository
             run(bin / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", checkout, *(tests or ["tests"]),
                 folder=folder)  # fmt: skip
-            print(
-                f"{name}: {', '.join(packages)}; {lines:,} lines, wheel {wheel.stat().st_size / 1e6:.2f} MB, "
-                f"environment {size / 1e6:.0f} MB without extras, import {1e3 * (load - empty):.0f} ms, "
-                f"--version {1e3 * helped:.0f} ms",
-                flush=True,
-            )
 
 
 if __name__ == "__main__":
