@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
 from gaponet.data.sequence import Sequence
-from gaponet.model.baselines.mlp import matched_hidden
+from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.layers import dense, size
@@ -82,7 +82,9 @@ def learners(
         f"… with mini-batches of {ours:,}": (batched(env, config, ours), batch),
     }
     if config.model.kind != "mlp":
-        hidden = matched_hidden(config.model, env.num_actions, size(build_network(config.model, env.num_actions)))
+        hidden = DeltaMLP.matched_hidden(
+            config.model, env.num_actions, size(build_network(config.model, env.num_actions))
+        )
         models["… and an MLP of as many parameters"] = batched(env, config, ours, hidden), batch
     single, samples, close = separate(robot, config, recordings(robot, 8))
     models["stable-baselines3, SubprocVecEnv"] = single, samples

@@ -40,7 +40,7 @@ POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
-class Outcome(Generic[Job, Result]):
+class _Outcome(Generic[Job, Result]):
     """What came of a job."""
 
     job: Job
@@ -69,7 +69,7 @@ class Pool:
         jobs: Iterable[Job],
         look: Callable[[], None] = lambda: None,
         stop: Callable[[Job], bool] = lambda job: True,
-    ) -> Iterator[Outcome[Job, Result]]:
+    ) -> Iterator[_Outcome[Job, Result]]:
         """Do the jobs; yields what came of each as it ends.
 
         Args:
@@ -94,13 +94,13 @@ class Pool:
                     job, died = running.pop(future)
                     lost = future.exception()
                     if lost is None:
-                        yield Outcome(job, *future.result())
+                        yield _Outcome(job, *future.result())
                     elif died < RETRIES:
                         submit(job, died + 1)
                     else:
                         said = str(lost).strip() or type(lost).__name__
                         why = f"{died + 1} workers died of it, out of memory? The last: {said}"
-                        yield Outcome(job, None, WorkerError(why))
+                        yield _Outcome(job, None, WorkerError(why))
                 look()
         finally:
             for future, (job, _) in running.items():
@@ -110,7 +110,7 @@ class Pool:
 
     def map(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
         """Results in the order of the jobs, whichever is done first; raises the first error in its turn."""
-        early: dict[int, Outcome[Any, Result]] = {}
+        early: dict[int, _Outcome[Any, Result]] = {}
         turn = 0
         for outcome in self.run(partial(_second, work), enumerate(jobs)):
             early[outcome.job[0]] = outcome

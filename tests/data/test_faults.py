@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from faulty import FAULTS, all_of, examine, recordings
 
-from gaponet.data.checks.finding import proposal
+from gaponet.data.checks.finding import Finding
 from gaponet.data.store import Dataset
 from gaponet.errors import GAPONetError
 from gaponet.robot import load_robot
@@ -92,14 +92,14 @@ def test_a_fault_is_found_and_named_or_refused(robot, logs, tmp_path, fault):
 @pytest.mark.parametrize("fault", ["sign of command and state", "zero of command and state", "joint order"])
 def test_the_doctors_proposal_for_logs_toml_mends_what_it_can(robot, logs, tmp_path, fault):
     faulty = FAULTS[fault][0](logs)
-    proposed = proposal(examine(robot, faulty, tmp_path / "faulty").findings)
+    proposed = Finding.proposal(examine(robot, faulty, tmp_path / "faulty").findings)
     assert "applied to nothing" in proposed
     mended = examine(robot, faulty, tmp_path / "mended", logs_toml=proposed)
     assert [f.message for f in mended.findings if f.level in ("warning", "error")] == []
 
 
 def test_good_logs_need_no_mending(robot, logs, tmp_path):
-    assert proposal(examine(robot, logs, tmp_path).findings) == "# gaponet doctor --fix: nothing to mend.\n"
+    assert Finding.proposal(examine(robot, logs, tmp_path).findings) == "# gaponet doctor --fix: nothing to mend.\n"
 
 
 def test_each_finding_has_a_picture(robot, logs, tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 from arm import commands, record, write_arm
 
-from gaponet.model.baselines.delay_offset import DelayOffset, pieces
+from gaponet.model.baselines.delay_offset import DelayOffset
 from gaponet.sim.replay import replay
 
 
@@ -25,5 +25,5 @@ def test_with_the_true_delay_the_simulator_follows_exactly(tmp_path):
 def test_pieces_cover_long_sequences(tmp_path):
     robot = write_arm(tmp_path)
     sequence = record(robot, commands(2500, 0), "m")
-    assert sum(map(len, pieces([sequence], seconds=20.0))) == 2500
-    assert sum(map(len, pieces([sequence] * 40, seconds=20.0, frames=10_000))) < 20_000
+    assert sum(map(len, DelayOffset.pieces([sequence], seconds=20.0))) == 2500
+    assert sum(map(len, DelayOffset.pieces([sequence] * 40, seconds=20.0, frames=10_000))) < 20_000

@@ -9,7 +9,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.training.config import PPOConfig, RewardConfig
 from gaponet.training.env import DeltaEnv
-from gaponet.training.ppo import Learner, advantages
+from gaponet.training.ppo import Learner
 from gaponet.training.sensor_fit import fit_inputs
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
@@ -27,7 +27,7 @@ def env(tmp_path):
 def test_advantages_by_hand():
     reward, value = torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1), torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1)
     done = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1, 1)  # a motion ends after the second step
-    found = advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
+    found = Learner.advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
     # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's, which adds nothing.
     assert found.tolist() == [1.25, 1.0, 6.0]
 

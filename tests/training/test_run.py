@@ -15,7 +15,7 @@ from gaponet.errors import DatasetError, ModelError, UsageError
 from gaponet.eval.evaluate import ORDER, evaluate
 from gaponet.eval.verdict import LEARNED
 from gaponet.methods import METHODS
-from gaponet.model.artifact import how_trained
+from gaponet.model.artifact import GapModel
 from gaponet.model.config import ModelConfig
 from gaponet.training.budget import Budget
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
@@ -63,7 +63,7 @@ def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot
         Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
     assert not (tmp_path / "run/model").exists()
     card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
-    assert how_trained(card) == "1 of 3 rounds of the supervised start, no PPO"
+    assert GapModel.how_trained(card) == "1 of 3 rounds of the supervised start, no PPO"
 
 
 def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
@@ -275,7 +275,7 @@ def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, ro
     assert rounds == [("warm start", True)] * 2
     assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
     assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
-    assert how_trained(model.card) == (
+    assert GapModel.how_trained(model.card) == (
         f"2 of 9 rounds of the supervised start, worse than no correction; {len(updates) - 1} updates of PPO from the "
         "untrained network"
     )

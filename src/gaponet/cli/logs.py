@@ -104,16 +104,16 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
-    from gaponet.data.checks.finding import proposal
-    from gaponet.data.doctor import inventory
+    from gaponet.data.checks.finding import Finding
+    from gaponet.data.doctor import Diagnosis
     from gaponet.data.store import open_dataset
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
     diagnosis = api.doctor(data, spec)
-    out.say(f", {inventory(data)}", spec.name)
+    out.say(f", {Diagnosis.inventory(data)}", spec.name)
     show_diagnosis(out, diagnosis)
-    mended = proposal(diagnosis.findings) if fix else ""
+    mended = Finding.proposal(diagnosis.findings) if fix else ""
     for line in mended.splitlines():
         out.say(line)
     drawn: list[Path] = []

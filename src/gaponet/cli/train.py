@@ -40,7 +40,7 @@ def train(
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         config: Everything else.
     """
-    from gaponet.model.artifact import how_trained
+    from gaponet.model.artifact import GapModel
     from gaponet.training.ranks import started
 
     screen = Out(json)
@@ -53,7 +53,7 @@ def train(
     screen.say(
         f"best on validation: {mrad(val['model'])} mrad, without the network {mrad(val['start'])}, nominal "
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
-        f"{card['seconds']:.0f} s: {how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
+        f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
     screen.say(f"model in {trained.path}; next: gaponet eval {out} {quote(dataset)}")
     shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")

@@ -87,6 +87,19 @@ class Diagnosis:
         findings.sort(key=lambda f: -LEVELS.index(f.level))
         return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 
+    @staticmethod
+    def inventory(dataset: Dataset) -> str:
+        """How much there is, of which units and payloads."""
+        motions = len({e.meta.motion for e in dataset.entries})
+        units = Counter(e.meta.unit_id for e in dataset.entries)
+        payloads = sorted({e.meta.payload_mass for e in dataset.entries})
+        virtual = sum(e.meta.virtual for e in dataset.entries)
+        kind = f", {virtual} of them VIRTUAL" if virtual else ""
+        return (
+            f"{len(dataset)} sequences{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
+            f"units {', '.join(units)}; payloads {', '.join(f'{p:g}' for p in payloads)} kg"
+        )
+
 
 def _weighed(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, model: Gravity) -> list[Finding]:
     """What gravity says, where nothing is wrong that it would only say in other words."""
@@ -96,19 +109,6 @@ def _weighed(findings: list[Finding], surveys: list[Survey], robot: RobotSpec, m
         return [Finding("ok", "gravity", text)]
     found = [*gravity(surveys, robot, model)]
     return found if any(f.level == "warning" for f in found) else [*found, *rests(surveys, robot, model)]
-
-
-def inventory(dataset: Dataset) -> str:
-    """How much there is, of which units and payloads."""
-    motions = len({e.meta.motion for e in dataset.entries})
-    units = Counter(e.meta.unit_id for e in dataset.entries)
-    payloads = sorted({e.meta.payload_mass for e in dataset.entries})
-    virtual = sum(e.meta.virtual for e in dataset.entries)
-    kind = f", {virtual} of them VIRTUAL" if virtual else ""
-    return (
-        f"{len(dataset)} sequences{kind}, {motions} motions, {dataset.hours() * 60:.1f} min; "
-        f"units {', '.join(units)}; payloads {', '.join(f'{p:g}' for p in payloads)} kg"
-    )
 
 
 def _sequence_row(s: Survey, robot: RobotSpec) -> dict[str, Any]:

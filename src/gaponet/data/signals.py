@@ -185,6 +185,44 @@ class Response:
                      for ks in ([0] * len(found), lags))  # fmt: skip
         return np.asarray(soon < SHARP * now)
 
+    @staticmethod
+    def following(found: list[Response], told: list[bool] | None = None) -> _Following:
+        """What recordings at one step say together; those not `told` are shifted against the others, which alone say
+        how joints follow."""
+        from scipy.linalg import toeplitz
+
+        step, n, lags = found[0].step, *found[0].own.shape[1:]
+        at = (np.arange(lags) - round(BEFORE / step)) * step
+        use = np.ones(len(found), bool) if told is None else np.array(told)
+        parts = [np.stack([getattr(r, f) for r in found]).astype(float) for f in ("own", "cross", "power")]
+        own, cross, power = (x[use].sum(axis=(0, 1)) for x in parts)
+        quick = Response.sharp(found)
+        onset, fits = np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
+        for j in range(n):
+            if own[j, 0] <= 0 or power[j] <= 0:
+                continue
+            weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
+            left = power[j] - weights @ cross[j]
+            if left > FOLLOWS * power[j] or weights.sum() < 0.3:
+                continue
+            way = np.cumsum(weights) / weights.sum()
+            first = int(np.argmax(way > 0.05))
+            onset[j] = (
+                np.nan
+                if not quick[j]
+                else (
+                    at[first]
+                    + step
+                    - step * (way[first] - 0.05) / max(way[first] - (way[first - 1] if first else 0.0), 1e-9)
+                )
+            )
+            moved = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS])
+            spread = np.fft.rfft(moved, 2 * lags, axis=1)
+            square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
+            square[:, 1:] *= 2
+            fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
+        return _Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
+
 
 @dataclass(frozen=True)
 class _Following:
@@ -200,43 +238,6 @@ class _Following:
     onset: Array
     shifts: Array
     whole: Array
-
-
-def following(found: list[Response], told: list[bool] | None = None) -> _Following:
-    """Of recordings at one step; those not `told` are shifted against the others, which alone say how joints follow."""
-    from scipy.linalg import toeplitz
-
-    step, n, lags = found[0].step, *found[0].own.shape[1:]
-    at = (np.arange(lags) - round(BEFORE / step)) * step
-    use = np.ones(len(found), bool) if told is None else np.array(told)
-    parts = [np.stack([getattr(r, f) for r in found]).astype(float) for f in ("own", "cross", "power")]
-    own, cross, power = (x[use].sum(axis=(0, 1)) for x in parts)
-    quick = Response.sharp(found)
-    onset, fits = np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
-    for j in range(n):
-        if own[j, 0] <= 0 or power[j] <= 0:
-            continue
-        weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
-        left = power[j] - weights @ cross[j]
-        if left > FOLLOWS * power[j] or weights.sum() < 0.3:
-            continue
-        way = np.cumsum(weights) / weights.sum()
-        first = int(np.argmax(way > 0.05))
-        onset[j] = (
-            np.nan
-            if not quick[j]
-            else (
-                at[first]
-                + step
-                - step * (way[first] - 0.05) / max(way[first] - (way[first - 1] if first else 0.0), 1e-9)
-            )
-        )
-        moved = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS])
-        spread = np.fft.rfft(moved, 2 * lags, axis=1)
-        square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
-        square[:, 1:] *= 2
-        fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
-    return _Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
 
 
 def _peaks(fits: Array) -> Array:

@@ -61,19 +61,6 @@ def make_card(config: ModelConfig, robot: RobotSpec, **facts: Any) -> dict[str, 
     } | facts
 
 
-def how_trained(card: dict[str, Any]) -> str:
-    """What the budget bought, in words; a model that saw no update of PPO is a supervised start and is called so."""
-    if "stages" not in card:
-        return "by an older gaponet, which did not keep what training got to"
-    (done, planned), updates = card["stages"]["warm_start_rounds"], card["stages"]["ppo_updates"]
-    warm = (
-        f"{done} of {planned} rounds of the supervised start" if done < planned else f"supervised start ({done} rounds)"
-    )
-    if card["stages"].get("ppo_anew"):
-        return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
-    return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
-
-
 class _SensorR2(TypedDict):
     """How well the sensor predictor explains what it was not fitted to."""
 
@@ -306,6 +293,21 @@ class GapModel:
             if low is not None and high is not None and not low < high:
                 raise ModelError(f"{file}: qpos_range: {low} to {high} is no range; {mend}")
         return card, config
+
+    @staticmethod
+    def how_trained(card: dict[str, Any]) -> str:
+        """What the budget bought, in words; a model that saw no update of PPO is called a supervised start."""
+        if "stages" not in card:
+            return "by an older gaponet, which did not keep what training got to"
+        (done, planned), updates = card["stages"]["warm_start_rounds"], card["stages"]["ppo_updates"]
+        warm = (
+            f"{done} of {planned} rounds of the supervised start"
+            if done < planned
+            else f"supervised start ({done} rounds)"
+        )
+        if card["stages"].get("ppo_anew"):
+            return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
+        return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"
 
 
 def sha256(file: Path) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import ModelError
-from gaponet.model.fused import FusedForward, read_weights
+from gaponet.model.fused import FusedForward
 from gaponet.process.sandbox import inside
 
 ROWS, ROWS_SHARED = 64, 256  # of a batch at once, by one thread and by several: what lies between layers stays in cache
@@ -141,7 +141,7 @@ class NumpyNetwork:
                 f"{path}: missing: this artifact was written without it, or its kind of network has no numpy form; "
                 "write it with gaponet export RUN, or load with backend='onnxruntime'"
             )
-        self.weights = read_weights(path)
+        self.weights = FusedForward.read_weights(path)
         self._made: dict[int, FusedForward] = {}
 
     def __call__(self, x: Array) -> Array:

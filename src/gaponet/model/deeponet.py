@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from gaponet.model.baselines.fno import DeltaFNO
-from gaponet.model.baselines.mlp import DeltaMLP, matched_hidden
+from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.baselines.transformer import DeltaTransformer
 from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, Standardise, dense, size
@@ -127,7 +127,8 @@ class SharedMLP(OperatorNet):
         asked = self.input_dims(config, n)[2] + n
         weights = size(self.branch) + size(self.trunk) + n
         del self.branch, self.trunk, self.bias
-        hidden = matched_hidden(config.mlp_hidden, weights, lambda widths: dense(self.branch_inputs + asked, widths, 1))
+        width = lambda widths: dense(self.branch_inputs + asked, widths, 1)  # noqa: E731
+        hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, width)
         self.net = dense(self.branch_inputs + asked, hidden, 1, zero=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
@@ -148,7 +149,8 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
     if not config.mlp_match:
         return DeltaMLP(config, n)
     weights = _operator_size(config, n)
-    return DeltaMLP(config, n, matched_hidden(config.mlp_hidden, weights, lambda widths: DeltaMLP(config, n, widths)))
+    hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, lambda widths: DeltaMLP(config, n, widths))
+    return DeltaMLP(config, n, hidden)
 
 
 def _operator_size(config: ModelConfig, n: int) -> int:

@@ -31,14 +31,6 @@ PARTS = ("predictor", "branch", "trunk", "pair")
 JOINT_WISE = ("joint", "pair")  # kinds whose rows are joints of one simulation after another
 
 
-def read_weights(path: Path) -> dict[str, Array]:
-    """Arrays of a weights.npz; no pickle is ever loaded."""
-    weights = read_npz(path, ModelError, "write it again with gaponet export RUN")
-    if "offset" not in weights:
-        raise ModelError(f"{path}: written by an earlier gaponet; write it again with gaponet export RUN")
-    return weights
-
-
 class FusedForward:
     """The forward of `batch` observations, as a list of numpy calls on buffers made here; running it allocates nothing.
 
@@ -115,6 +107,14 @@ class FusedForward:
         self._do(np.exp, low, out=low)
         self._do(np.subtract, low, np.float32(1), out=low)
         self._do(np.maximum, x, low, out=x)
+
+    @staticmethod
+    def read_weights(path: Path) -> dict[str, Array]:
+        """Arrays of a weights.npz; no pickle is ever loaded."""
+        weights = read_npz(path, ModelError, "write it again with gaponet export RUN")
+        if "offset" not in weights:
+            raise ModelError(f"{path}: written by an earlier gaponet; write it again with gaponet export RUN")
+        return weights
 
 
 def _empty(*shape: int) -> Array:

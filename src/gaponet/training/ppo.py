@@ -111,7 +111,7 @@ class Learner:
                 rows.append(row)
             seen = {name: torch.stack([r[name] for r in rows]) for name in rows[0]}
             last = self.look()["value"]
-            seen["advantage"] = advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
+            seen["advantage"] = Learner.advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
             seen["returns"] = seen["advantage"] + seen["value"]
             self._measure(seen)
         fields = _Batch.__dataclass_fields__
@@ -193,22 +193,22 @@ class Learner:
         self.noise.copy_(state["noise"])
         self.updates, self.ready = state["updates"], state["ready"]
 
+    @staticmethod
+    def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
+        """Generalised advantage estimates (Schulman et al. 2016).
 
-def advantages(reward: Tensor, value: Tensor, last: Tensor, done: Tensor, gamma: float, lam: float) -> Tensor:
-    """Generalised advantage estimates (Schulman et al. 2016).
-
-    Args:
-        reward: (T, N, n), of a motion's last step with what is worth what would have come.
-        value: (T, N, n), of the state before each step.
-        last: (N, n), of the state after the last.
-        done: (T, N, 1), 1 where a motion ended.
-        gamma: Discount per step.
-        lam: λ.
-    """
-    found, ahead = torch.empty_like(reward), torch.zeros_like(last)
-    for t in reversed(range(len(reward))):
-        goes_on = 1 - done[t]
-        surprise = reward[t] + gamma * goes_on * last - value[t]
-        ahead = surprise + gamma * lam * goes_on * ahead
-        found[t], last = ahead, value[t]
-    return found
+        Args:
+            reward: (T, N, n), of a motion's last step with what is worth what would have come.
+            value: (T, N, n), of the state before each step.
+            last: (N, n), of the state after the last.
+            done: (T, N, 1), 1 where a motion ended.
+            gamma: Discount per step.
+            lam: λ.
+        """
+        found, ahead = torch.empty_like(reward), torch.zeros_like(last)
+        for t in reversed(range(len(reward))):
+            goes_on = 1 - done[t]
+            surprise = reward[t] + gamma * goes_on * last - value[t]
+            ahead = surprise + gamma * lam * goes_on * ahead
+            found[t], last = ahead, value[t]
+        return found

@@ -233,11 +233,6 @@ def require_equal(*states: dict[str, Tensor]) -> None:
         raise ModelError(f"the ranks' networks differ ({', '.join(found)}), a bug; --resume goes on from before")
 
 
-def seed(first: int) -> int:
-    """The seed of what shall differ between ranks, from that of the first."""
-    return first + APART * rank()
-
-
 def share(config: TrainConfig) -> TrainConfig:
     """This rank's part of a training: of simulations, of each batch and of the machine's cores.
 

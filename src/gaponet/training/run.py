@@ -99,7 +99,7 @@ class Trainer:
         torch.set_num_threads(self.own.learner_threads)
         self.net = build_network(config.model, self.n)
         if ranks.rank():  # the same network, other noise
-            torch.manual_seed(ranks.seed(config.seed))
+            torch.manual_seed(_seed(config.seed))
         self.untrained = copy.deepcopy(self.net.state_dict())
         self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
         self.nominal, self.found = float("nan"), Update()
@@ -158,7 +158,7 @@ class Trainer:
         env = self._env(config.num_envs, 10**9, self.config.seed)
         limit = 0.99 * self.config.model.delta_max
         labels = inverse_labels(self.train_set, self.robot, limit)
-        warm = WarmStart(self.net, env, labels, config, ranks.seed(self.config.seed), self.own.threads)
+        warm = WarmStart(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
         if self.kept.rounds_done == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
@@ -256,7 +256,7 @@ class Trainer:
 
     def _env(self, num_envs: int, episode_steps: int, seed: int, device: str | None = None) -> DeltaEnv:
         c = self.own
-        how = c.reward, ranks.seed(seed), c.threads, device or c.device
+        how = c.reward, _seed(seed), c.threads, device or c.device
         return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
 
     # ---- validation, checkpoints, card
@@ -364,3 +364,8 @@ def _recorded_gains(metas: list[SequenceMeta], robot: RobotSpec) -> dict[str, li
         gains = {tuple(round(g[i], 9) for i in robot.operated_index) for m in metas if (g := getattr(m, name))}
         found[name] = list(gains.pop()) if len(gains) == 1 else None
     return found
+
+
+def _seed(first: int) -> int:
+    """The seed of what shall differ between ranks, from that of the first."""
+    return first + ranks.APART * ranks.rank()

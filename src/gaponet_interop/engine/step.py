@@ -13,7 +13,7 @@ from gaponet.errors import ModelError
 from gaponet.model.artifact import GapModel
 from gaponet.model.export import PARITY, trained_network
 from gaponet.model.fuse import FusedNet
-from gaponet.model.fused import FILE, read_weights
+from gaponet.model.fused import FILE, FusedForward
 
 CHECKED = 12  # control periods
 
@@ -81,7 +81,7 @@ def torch_network(model: GapModel, run: Path) -> nn.Module:
     """The network of an artifact in torch: from its weights.npz, or the run's checkpoint where there is none."""
     weights = model.path / FILE
     if weights.is_file():
-        return FusedNet(read_weights(weights)).eval()
+        return FusedNet(FusedForward.read_weights(weights)).eval()
     return trained_network(run, model.config, len(model.card["joint_names"]))
 
 

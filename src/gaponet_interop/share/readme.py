@@ -7,7 +7,7 @@ from typing import Any
 
 from gaponet.data.card import NOT_STATED
 from gaponet.eval.tables import totals
-from gaponet.model.artifact import how_trained
+from gaponet.model.artifact import GapModel
 from gaponet.text import markdown
 
 LICENCES = ("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0", "cc-by-sa-4.0", "cc-by-nc-4.0")  # the Hub's
@@ -47,7 +47,7 @@ def run_readme(facts: dict[str, Any], address: str) -> str:
         f"# {markdown(card['robot'])}: a model of its motor gap" + (", trained on VIRTUAL robots" if virtual else ""),
         "",
         f"- corrects the targets of {len(card['joint_names'])} joints: {markdown(', '.join(card['joint_names']))}",
-        f"- trained {markdown(how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
+        f"- trained {markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
         f"{markdown(str(card.get('dataset_hash', '')))}",
         f"- at {rates} Hz, in simulator {markdown(card['simulator'])}",
         f"- weights {facts['weights']}",

@@ -21,7 +21,7 @@ from gaponet.eval.tables import by_group, mrad, totals
 from gaponet.eval.verdict import added, verdict
 from gaponet.files import write_text
 from gaponet.methods import method, title
-from gaponet.model.artifact import GapModel, how_trained
+from gaponet.model.artifact import GapModel
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import keeps_robot, kept_robot
@@ -310,7 +310,7 @@ def _training_table(card: dict[str, Any], config: dict[str, Any]) -> Markup:
     r2, shape, ppo, motions = card.get("sensor_r2"), card["model"], config["ppo"], card["motions"]
     rows = [
         ["trained on", f"{len(motions['train'])} motions, {card['hours']:.2f} h, units {', '.join(card['units'])}"],
-        ["trained", how_trained(card)],
+        ["trained", GapModel.how_trained(card)],
         ["payloads", ", ".join(f"{p:g} kg" for p in card["payload_seen"])],
         ["validated on", ", ".join(motions["val"][:6]) + (" …" if len(motions["val"]) > 6 else "")],
         ["observation", f"{shape['history']} past frames, payload {'in' if shape['payload_input'] else 'out'}"],

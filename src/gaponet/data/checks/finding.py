@@ -27,31 +27,36 @@ class Finding:
     values: dict[str, Any] = field(default_factory=dict)
     mend: Mend = field(default_factory=dict)
 
+    @staticmethod
+    def proposal(findings: list[Finding]) -> str:
+        """Lines to add to a logs.toml where the findings say how, and as comments what it cannot mend."""
+        bad = [f for f in findings if f.level in ("warning", "error")]
+        lines = [
+            "# gaponet doctor --fix: a proposal, applied to nothing. Look it over, add it to the logs.toml of these "
+            "logs,",
+            "# import into a new folder and call the doctor again. Joints have the robot's names.",
+            "",
+        ]
+        tables: Mend = {}
+        for finding in bad:
+            lines += [f"# {finding.level}, {finding.check}: {finding.message}"]
+            for table, values in finding.mend.items():
+                tables.setdefault(table, {}).update(values)
+        for table, values in tables.items():
+            lines += [
+                "",
+                f"[{table}]",
+                *(f"{json.dumps(joint)} = {json.dumps(value)}" for joint, value in values.items()),
+            ]
+        if not bad:
+            lines = ["# gaponet doctor --fix: nothing to mend."]
+        return "\n".join(lines) + "\n"
+
 
 def some(motions: list[str]) -> str:
     """Up to three names, each once, and how many more."""
     motions = list(dict.fromkeys(motions))
     return ", ".join(motions[:3]) + (f" and {len(motions) - 3} more" if len(motions) > 3 else "")
-
-
-def proposal(findings: list[Finding]) -> str:
-    """Lines to add to a logs.toml where the findings say how, and as comments what it cannot mend."""
-    bad = [f for f in findings if f.level in ("warning", "error")]
-    lines = [
-        "# gaponet doctor --fix: a proposal, applied to nothing. Look it over, add it to the logs.toml of these logs,",
-        "# import into a new folder and call the doctor again. Joints have the robot's names.",
-        "",
-    ]
-    tables: Mend = {}
-    for finding in bad:
-        lines += [f"# {finding.level}, {finding.check}: {finding.message}"]
-        for table, values in finding.mend.items():
-            tables.setdefault(table, {}).update(values)
-    for table, values in tables.items():
-        lines += ["", f"[{table}]", *(f"{json.dumps(joint)} = {json.dumps(value)}" for joint, value in values.items())]
-    if not bad:
-        lines = ["# gaponet doctor --fix: nothing to mend."]
-    return "\n".join(lines) + "\n"
 
 
 def names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:

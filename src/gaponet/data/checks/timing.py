@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.checks.finding import Finding
-from gaponet.data.signals import Response, following
+from gaponet.data.signals import Response
 from gaponet.data.survey import HERTZ, Survey
 from gaponet.robot import RobotSpec
 
@@ -37,7 +37,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
     found, own = [*_late(every, _operated(every, robot))], _operated(same, robot)
     odd = {f.values["motion"] for f in found}
-    told = following(own, [s.motion not in odd for s in same])
+    told = Response.following(own, [s.motion not in odd for s in same])
     onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
     apart = SURE * _scatter(told.onset - onset)
     if onset < FIRST - step or onset < -max(-FIRST / 3, step / 2, apart):
@@ -83,12 +83,12 @@ def _scatter(away: Array) -> float:
 def _shifts(own: list[Response]) -> Array:
     """By how much each recording follows later than all do, (recordings) s: found together with how all follow, since
     one that is late bends what is found of the others."""
-    more = following(own).whole
+    more = Response.following(own).whole
     found = np.where(np.isfinite(more), 0.0, np.nan)
     for _ in range(ROUNDS if np.isfinite(found).sum() >= FEW else 0):
         away = np.nan_to_num(more - np.nanmedian(more))
         found = found + np.where(np.abs(away) > LATE / 2, away, 0.0)
-        more = following([r.later(-s) for r, s in zip(own, found, strict=True)]).whole
+        more = Response.following([r.later(-s) for r, s in zip(own, found, strict=True)]).whole
     return found + np.nan_to_num(more)
 
 

@@ -53,7 +53,7 @@ class DelayOffset:
 
         Joints are fitted as if alone; their coupling is small beside delay and sag.
         """
-        part = pieces(sequences)
+        part = DelayOffset.pieces(sequences)
         op, names = robot.operated_index, robot.operated
         dt = float(np.median([s.dt for s in part]))
         delays = dt * np.arange(int(MAX_DELAY / dt) + 1)
@@ -75,6 +75,16 @@ class DelayOffset:
             {j: round(float(delays[best[k]]), 6) for k, j in enumerate(names)},
             {j: round(float(offset[best[k], k]), 6) for k, j in enumerate(names)},
         )
+
+    @staticmethod
+    def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FRAMES) -> list[Sequence]:
+        """Cut sequences into pieces that run side by side; evenly thinned to at most `frames` rows."""
+        cut = []
+        for s in sequences:
+            rows = round(seconds / s.dt)
+            for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
+                cut.append(s.rows(slice(start, start + rows)))
+        return cut[:: max(1, round(sum(map(len, cut)) / frames))]
 
 
 class _DelayOffsetCorrector:
@@ -105,13 +115,3 @@ class _DelayOffsetCorrector:
         out = np.array(target, float)
         out[:, self.op] = np.clip(delayed + self.offset, self.range[:, 0], self.range[:, 1])
         return out
-
-
-def pieces(sequences: ListOf[Sequence], seconds: float = PIECE, frames: int = FRAMES) -> list[Sequence]:
-    """Cut sequences into pieces that run side by side; evenly thinned to at most `frames` rows."""
-    cut = []
-    for s in sequences:
-        rows = round(seconds / s.dt)
-        for start in range(0, max(len(s) - rows // 2, 0) + 1, rows):
-            cut.append(s.rows(slice(start, start + rows)))
-    return cut[:: max(1, round(sum(map(len, cut)) / frames))]

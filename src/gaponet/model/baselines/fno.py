@@ -17,24 +17,6 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, dense
 
 
-def dft(count: int, modes: int) -> tuple[Tensor, Tensor]:
-    """Real Fourier transform of `count` samples followed by as many zeros, lowest `modes` frequencies, and its inverse.
-
-    The zeros keep the newest sample from meeting the oldest, as a period would have them do.
-
-    Returns:
-        Forward (2·modes, count), real parts above imaginary ones, and inverse (count, 2·modes).
-    """
-    length = 2 * count
-    k, t = torch.arange(modes, dtype=torch.float64)[:, None], torch.arange(count, dtype=torch.float64)
-    angle = 2 * math.pi * k * t / length
-    forward = torch.cat([angle.cos(), -angle.sin()])
-    # All but the mean and the highest frequency stand for two conjugate ones.
-    twice = torch.where((k == 0) | (2 * k == length), 1.0, 2.0) / length
-    inverse = torch.cat([twice * angle.cos(), -twice * angle.sin()]).T
-    return forward.float(), inverse.contiguous().float()
-
-
 class SpectralConv(nn.Module):
     """Convolution over time: each kept frequency is multiplied by a complex width × width matrix of its own."""
 
@@ -44,7 +26,7 @@ class SpectralConv(nn.Module):
     def __init__(self, count: int, width: int, modes: int) -> None:
         super().__init__()
         modes = min(modes, count + 1)
-        forward, inverse = dft(count, modes)
+        forward, inverse = SpectralConv.dft(count, modes)
         self.register_buffer("forward_dft", forward, persistent=False)
         self.register_buffer("inverse_dft", inverse, persistent=False)
         self.weight = nn.Parameter(torch.randn(2, modes, width, width) / width)  # real, imaginary
@@ -56,6 +38,24 @@ class SpectralConv(nn.Module):
         a, b = self.weight[0], self.weight[1]
         product = torch.cat([real @ a - imaginary @ b, real @ b + imaginary @ a])
         return self.inverse_dft @ product.transpose(0, 1)
+
+    @staticmethod
+    def dft(count: int, modes: int) -> tuple[Tensor, Tensor]:
+        """Real Fourier transform of `count` samples and as many zeros, lowest `modes` frequencies, and its inverse.
+
+        The zeros keep the newest sample from meeting the oldest, as a period would have them do.
+
+        Returns:
+            Forward (2·modes, count), real parts above imaginary ones, and inverse (count, 2·modes).
+        """
+        length = 2 * count
+        k, t = torch.arange(modes, dtype=torch.float64)[:, None], torch.arange(count, dtype=torch.float64)
+        angle = 2 * math.pi * k * t / length
+        forward = torch.cat([angle.cos(), -angle.sin()])
+        # All but the mean and the highest frequency stand for two conjugate ones.
+        twice = torch.where((k == 0) | (2 * k == length), 1.0, 2.0) / length
+        inverse = torch.cat([twice * angle.cos(), -twice * angle.sin()]).T
+        return forward.float(), inverse.contiguous().float()
 
 
 class DeltaFNO(DeltaNet):

@@ -22,24 +22,24 @@ class DeltaMLP(DeltaNet):
     def correct(self, prepared: Tensor) -> Tensor:
         return self.bounded(self.net(prepared))
 
+    @staticmethod
+    def matched_hidden(
+        hidden: Sequence[int], parameters: int, build: Callable[[tuple[int, ...]], nn.Module]
+    ) -> tuple[int, ...]:
+        """The widths scaled so that what `build` makes of them has as near to `parameters` parameters as they allow."""
+        largest = max(hidden)
 
-def matched_hidden(
-    hidden: Sequence[int], parameters: int, build: Callable[[tuple[int, ...]], nn.Module]
-) -> tuple[int, ...]:
-    """The widths scaled so that what `build` makes of them has as near to `parameters` parameters as they allow."""
-    largest = max(hidden)
+        def scaled(width: int) -> tuple[int, ...]:
+            return tuple(max(1, round(w * width / largest)) for w in hidden)
 
-    def scaled(width: int) -> tuple[int, ...]:
-        return tuple(max(1, round(w * width / largest)) for w in hidden)
+        def miss(width: int) -> int:
+            with torch.device("meta"):  # shapes only
+                return size(build(scaled(width))) - parameters
 
-    def miss(width: int) -> int:
-        with torch.device("meta"):  # shapes only
-            return size(build(scaled(width))) - parameters
-
-    low, high = 1, 1
-    while miss(high) < 0:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if miss(middle) < 0 else (low, middle)
-    return scaled(min((low, high), key=lambda width: abs(miss(width))))
+        low, high = 1, 1
+        while miss(high) < 0:
+            low, high = high, 2 * high
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (middle, high) if miss(middle) < 0 else (low, middle)
+        return scaled(min((low, high), key=lambda width: abs(miss(width))))
