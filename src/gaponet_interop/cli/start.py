@@ -20,6 +20,7 @@ from gaponet.cli.options import Flag, Folder, Json
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.files import write_text, writing
+from gaponet.parts import named, offered
 from gaponet.robot import RobotSpec, as_option, available, load_robot
 
 if TYPE_CHECKING:
@@ -92,6 +93,8 @@ def start(
         dry_run: Say what was understood and which commands would run, and write nothing.
         anyway: Go on where the doctor found errors in the logs.
     """
+    if prepare := offered("PROVIDES").get("OpenGL"):
+        named(prepare)()  # before MuJoCo is imported, which the report's picture would be too late for
     from gaponet_interop.setup.new import Wanted
 
     screen, told = Out(json), out / "logs.toml"
