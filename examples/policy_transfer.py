@@ -5,7 +5,7 @@
 
 A VIRTUAL robot plays excitation, `gaponet identify` makes a robot folder of the recordings, and a small network learns
 by PPO to make the arm follow motions: in the simulator as its file says, in the identified one, and in sixteen of those
-that differ by the standard errors of identification (gaponet_interop.engine.rollout.drawn_robots). All are played on
+that differ by what identification does not know (gaponet_interop.engine.rollout.drawn_robots). All are played on
 the VIRTUAL robot, on motions that nothing has learnt from. Last, `gaponet replay` is asked, before the robot is, what
 it will do under the targets of the nominal policy's own rollout.
 """
@@ -26,7 +26,6 @@ from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.eval.candidate import read_origin
 from gaponet.robot import RobotSpec, load_robot
 from gaponet_interop.engine.rollout import drawn_robots
 
@@ -161,14 +160,12 @@ def main(
     updates, num_envs, seeds = (2, 16, (0,)) if quick else (updates, num_envs, seeds)
     known = identified(work, robot, fleet, unit, quick)
     spec, found = load_robot(robot), load_robot(known)
-    origin = read_origin(known)
-    assert origin is not None
     kinds = ("tour", "limber")
     names = [f"{kind}-all-{v}" for kind in kinds for v in range(1 if quick else 8)]
     task, unseen = (Task(spec, motions(spec, 0.0, seed, names), 1.0) for seed in (LEARN_SEED, TRY_SEED))
     tried = np.zeros(len(unseen.first))
     robots = {
-        "nominal": [spec], "identified": [found], "identified + ranges": drawn_robots(found, origin["std"], DRAWS),
+        "nominal": [spec], "identified": [found], "identified + ranges": drawn_robots(found, DRAWS),
     }  # fmt: skip
     errors: dict[str, list[Array]] = {}
     for seed in seeds:

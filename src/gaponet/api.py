@@ -265,7 +265,6 @@ def identify(
             "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
             "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
             "val_mpjae": {name: float(e.mean()) for name, e in val_errors.items()},
-            "std": found.std,
         })  # fmt: skip
         _keep_known(Path(out), data.sequences(parts["train"]), val, found.covariance, None)
     return Identification(found, val_errors, time.monotonic() - began)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NotRequired
+from typing import Any
 
 from typing_extensions import TypedDict
 
@@ -26,13 +26,12 @@ DATA = "data of the robot that the run was trained for"
 
 class _Origin(TypedDict):
     """What a robot was identified from: dataset (address, or path from the folder), recordings and motions by part,
-    what that left on validation motions, rad, and each joint's standard errors by field."""
+    and what that left on validation motions, rad."""
 
     dataset: str
     parts: RunSplit
     motions: dict[str, tuple[str, ...]]
     val_mpjae: dict[str, float]
-    std: NotRequired[dict[str, dict[str, float | None]]]
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from gaponet import api
 from gaponet.cli.options import Folder, Json
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
-from gaponet.eval.candidate import read_origin
+from gaponet.eval.knowledge import Knowledge
 from gaponet.eval.tables import mrad
 from gaponet.files import whole, write_text
 from gaponet.parts import take
@@ -36,7 +36,7 @@ def replay(
 
     The rollout is a log of your simulator, targets as commands, and states, in any format that gaponet import reads.
     Its targets are played as they stand; a policy that looks at the state would have answered what differs. The band
-    holds nine tenths of every validation motion of the robot, and what its servos' standard errors do to this motion.
+    holds nine tenths of every validation motion of the robot, and what is not known of its servos does to this motion.
 
     Args:
         logs: File or folder of rollouts.
@@ -52,14 +52,14 @@ def replay(
 
     screen, spec = Out(json), load_robot(robot)
     draw = take("PROVIDES", "figure of a replay", "drawing") if figure else None
-    known, std = _known(screen, robot, data, spec)
+    known, drawn = _known(screen, robot, data, spec)
     with tempfile.TemporaryDirectory() as place:
         _, _, guessed = read_first(logs, spec, described)
         if guessed:
             write_text(described := Path(place) / "logs.toml", guessed)
         report = api.import_logs(logs, spec, Path(place) / "data", "rollout", payload_mass, logs=described)
         rollouts = report.dataset.sequences(report.entries)
-    found = answers(spec, rollouts, known, std)
+    found = answers(spec, rollouts, known, drawn)
     joints = summary(found, spec.operated)
     differ = sorted((j for j, s in joints.items() if s["inside"] < SHARE), key=lambda j: joints[j]["inside"])
     _tell(screen, robot, len(found), joints, differ)
@@ -68,22 +68,24 @@ def replay(
     if draw and figure:
         draw(found, spec.operated, figure)
     screen.result({"robot": spec.name, "rollouts": [a.name for a in found], "joints": joints, "differ": differ,
-                   "band": {"share": SHARE, "standard_errors": std is not None}})  # fmt: skip
+                   "band": {"share": SHARE, "drawn": len(drawn)}})  # fmt: skip
 
 
-def _known(screen: Out, folder: Path, data: str | None, robot: RobotSpec) -> tuple[np.ndarray, Any]:
-    """How far the robot is from its recordings, (n,) rad, and the standard errors of its servos where they are kept."""
+def _known(screen: Out, folder: Path, data: str | None, robot: RobotSpec) -> tuple[np.ndarray, list[RobotSpec]]:
+    """How far the robot is from its recordings, (n,) rad, and robots that it may be as well where that is kept."""
     from gaponet_interop.engine.forms import recordings_of
-    from gaponet_interop.engine.rollout import validation_error
+    from gaponet_interop.engine.rollout import drawn_robots, validation_error
 
-    origin, recordings = read_origin(folder), recordings_of(folder, data, robot)
-    std = None if origin is None else origin.get("std")
+    kept, recordings = Knowledge.load(robot), recordings_of(folder, data, robot)
+    drawn = drawn_robots(robot) if kept is not None else []
     if recordings is not None:
-        return validation_error(robot, recordings[1]), std
-    if origin is None:
+        return validation_error(robot, recordings[1]), drawn
+    if kept is None:
         raise UsageError(f"{folder}: nothing says how far it is from its robot; give --data, or what identify wrote")
-    screen.say("  its recordings are gone: twice their mean error is each joint's band; or --data", "note", "cyan")
-    return np.full(len(robot.operated), 2.0 * origin["val_mpjae"]["identified"]), std
+    screen.say(
+        "  its recordings are gone: the band is what they left when it was identified; or --data", "note", "cyan"
+    )
+    return np.array([kept.joints[j].band for j in robot.operated]), drawn
 
 
 def _tell(screen: Out, robot: Path, count: int, joints: dict[str, dict[str, Any]], differ: list[str]) -> None:

@@ -53,7 +53,7 @@ def torque(dataset: Source, out: Path, current: Flag = False, robot: Robot = Non
         raise NoGainError(f"nothing is written: half a second on {mrad(after)} mrad, the file's {mrad(before)}")
     save_robot(found.robot, out)
     write_json(out / ORIGIN, {
-        "dataset": str(data.path.resolve()), "std": found.std,
+        "dataset": str(data.path.resolve()),
         "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
         "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
         "val_mpjae": {"nominal": before, "identified": after},

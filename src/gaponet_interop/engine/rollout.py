@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any
@@ -11,14 +10,13 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.robot import FITTED, RobotSpec
+from gaponet.robot import RobotSpec
 from gaponet.sim.replay import replay
+from gaponet_interop.engine.ranges import ranges
 
 SHARE = 0.9  # of recorded rows that a band holds
 WIDTH = 1.645  # standard errors on either side that hold as much
 DRAWS = 16  # robots
-SIGNED = ("offset", "zero")
-Std = Mapping[str, Mapping[str, float | None]]  # joint → field → standard error
 
 
 @dataclass(frozen=True)
@@ -47,27 +45,17 @@ class Answer:
         return np.asarray(np.abs(self.rollout - self.robot) <= self.half)
 
 
-def drawn_robots(robot: RobotSpec, std: Std, draws: int = DRAWS, seed: int = 0) -> list[RobotSpec]:
-    """Robots whose servos differ by their standard errors, joint by joint and field by field.
+def drawn_robots(robot: RobotSpec, draws: int = DRAWS, seed: int = 0) -> list[RobotSpec]:
+    """Robots that differ by what is not known of this one today, whole servos at a time (engine/ranges.py).
 
-    Fields are drawn one by one though a fit knows some of them as a set alone (kp and friction): a wide range, for
-    training as for a band. What the recordings do not determine, with an error beyond its value, moves by its value.
+    Raises:
+        UsageError: Its folder keeps values alone.
     """
-    rng, made = np.random.default_rng(seed), []
-    for _ in range(draws):
-        servos: dict[str, dict[str, float]] = {}
-        for joint, errors in std.items():
-            i, servo = robot.joint_names.index(joint), servos.setdefault(joint, {})
-            for name in ("kp", "kd", *FITTED):
-                value, error = float(np.broadcast_to(getattr(robot, name), robot.kp.shape)[i]), errors.get(name)
-                if not error or not np.isfinite(value):
-                    continue
-                if name in SIGNED:
-                    servo[name] = value + error * rng.standard_normal()
-                else:
-                    servo[name] = value * float(np.exp(min(error / max(value, 1e-12), 1.0) * rng.standard_normal()))
-        made.append(robot.with_servos({j: s for j, s in servos.items() if s}))
-    return made
+    units = ranges(robot, samples=draws, seed=seed).units
+    return [
+        robot.with_servos({j: {f: float(v[k, i]) for f, v in units.items()} for i, j in enumerate(robot.operated)})
+        for k in range(draws)
+    ]
 
 
 def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
@@ -81,20 +69,20 @@ def validation_error(robot: RobotSpec, recordings: ListOf[Sequence]) -> Array:
     return np.asarray(np.max([np.quantile(e, SHARE, axis=0) for e in errors], axis=0))
 
 
-def answers(robot: RobotSpec, rollouts: ListOf[Sequence], known: Array, std: Std | None = None) -> list[Answer]:
+def answers(robot: RobotSpec, rollouts: ListOf[Sequence], known: Array, drawn: ListOf[RobotSpec] = ()) -> list[Answer]:
     """Play the targets of rollouts on the robot from their first states.
 
     Args:
         robot: Identified.
         rollouts: With the targets as ctrl and the simulator's states.
         known: (n,) rad, as of `validation_error`: how far the robot was from its own recordings.
-        std: Standard errors of its servos; what they do here is added to the band.
+        drawn: Robots that it may be as well (`drawn_robots`); how far they go from it here is added to the band.
     """
     op = robot.operated_index
     played = [t.qpos[:, op] for t in replay(rollouts, robot, lock_idle=True)]
     spread = [np.zeros_like(q) for q in played]
-    if std:
-        others = [replay(rollouts, other, lock_idle=True) for other in drawn_robots(robot, std)]
+    if drawn:
+        others = [replay(rollouts, other, lock_idle=True) for other in drawn]
         spread = [
             WIDTH * np.sqrt(np.mean([(o[k].qpos[:, op] - q) ** 2 for o in others], axis=0))
             for k, q in enumerate(played)

@@ -8,8 +8,7 @@ from arm import commands, record, recordings, write_arm
 
 from gaponet.cli.main import main
 from gaponet.robot_folder import save_robot
-from gaponet.sim.replay import replay
-from gaponet_interop.engine.rollout import answers, drawn_robots, summary, validation_error
+from gaponet_interop.engine.rollout import answers, summary, validation_error
 
 REAL = {"kp": 0.7, "delay": 2}  # of nominal, control periods
 FOUND = {"kp": 14.0, "delay": 0.04}
@@ -74,22 +73,11 @@ def test_a_band_holds_nine_tenths_of_what_a_robot_does_that_was_identified_a_lit
     assert all(1e-4 < s["band"] < 0.01 for s in found.values())
 
 
-def test_standard_errors_widen_a_band_where_motion_shows_them(arm):
+def test_what_is_not_known_widens_a_band_where_motion_shows_it(arm):
     still, moving = (record(arm, ctrl, "x") for ctrl in (np.zeros((100, 2)), commands(100, 1)))
-    std = {"elbow": {"delay": 0.01, "kp": 0.0}}
     known, robot = 1e-3, arm.with_servos({"elbow": {"delay": 0.02}})
-    first, second = answers(robot, [still, moving], np.full(2, known), std)
+    drawn = [robot.with_servos({"elbow": {"delay": delay}}) for delay in (0.01, 0.03)]
+    first, second = answers(robot, [still, moving], np.full(2, known), drawn)
     assert first.half.max() < 1.5 * known
     assert second.half[:, 1].max() > 3 * known
     assert second.half[:, 0].max() < 1.5 * known
-
-
-def test_drawn_robots_differ_by_their_errors_and_stay_possible(arm):
-    robot = arm.with_servos({"elbow": {"delay": 0.01, "offset": 0.02}})
-    made = drawn_robots(robot, {"elbow": {"kp": 2.0, "delay": 9.0, "offset": 0.05, "armature": None}}, 200)
-    kp, delay, offset = (np.array([getattr(r, f)[1] for r in made]) for f in ("kp", "delay", "offset"))
-    assert kp.std() == pytest.approx(2.0, rel=0.2)
-    assert (delay > 0).all()
-    assert offset.mean() == pytest.approx(0.02, abs=0.015)
-    assert all(r.kp[0] == 20.0 for r in made)
-    assert len(replay([record(arm, commands(20, 0), "x")], made[0])) == 1
