@@ -126,7 +126,7 @@ def floor(question: Question) -> float:
     """Mean |difference| in how two recordings of one command, unit and payload follow it, rad; nan without any."""
     groups: dict[tuple[object, ...], list[Sequence]] = {}
     for s, motion in zip(question.test, question.motion, strict=True):
-        groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded), []).append(s)
+        groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded, s.meta.kp), []).append(s)
     pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
     least = min((command for command, _ in pairs), default=0.0)
     apart = [d for command, d in pairs if command <= max(least, SAME_COMMAND)]
