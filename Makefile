@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
+.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
 
 setup: $(VENV)/.done
 
@@ -30,6 +30,10 @@ demo: setup
 JOBS ?= 2
 test: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# Proofs of half a minute and more whose facts have quick tests too: the tutorial on policies, from recordings to a robot.
+slow: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow
 
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup

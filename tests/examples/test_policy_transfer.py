@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 FILE = Path(__file__).parents[2] / "examples" / "policy_transfer.py"
 
 
+@pytest.mark.slow  # tests/interop/cli/test_replay.py has what replay says
 def test_the_tutorial_ends_in_a_table_and_in_what_replay_had_forecast(tmp_path):
     said = subprocess.run([sys.executable, FILE, tmp_path, "--quick"], capture_output=True, text=True, check=True)
     assert "WARNING" not in said.stderr + said.stdout  # of MuJoCo about a state that is no number
