@@ -113,6 +113,19 @@ def seen(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
     return dict(zip(robot.operated, np.stack(rows, axis=-1), strict=True))
 
 
+# Standard deviations on the axes before any log; of what is no logarithm at least the value itself.
+BELIEVED = {
+    "kp": 0.5, "stribeck_speed": 1.0, "damping": 0.05, "frictionloss": 0.02, "armature": 2e-4, "offset": 0.03,
+    "delay": 0.02, "stribeck": 0.01, "friction_motor": 0.1, "friction_external": 0.1, "min_torque": 0.003,
+}  # fmt: skip
+
+
+def believed(fields: ListOf[str], x: Array) -> Array:
+    """How far values (…, P) may be off before any log says so, standard deviations on the axes."""
+    least = np.array([BELIEVED[f] for f in fields])
+    return np.where(np.isin(fields, LOGARITHM), least, np.maximum(least, np.abs(x)))
+
+
 def values_of(fields: ListOf[str], x: Array) -> dict[str, Array]:
     """From the axes (…, P) to field → (…) in SI."""
     found = {f: np.exp(x[..., i]) if f in LOGARITHM else x[..., i] for i, f in enumerate(fields)}

@@ -93,7 +93,7 @@ def _randomization(
         screen.say(f"  {note}", "note", "cyan")
     if made.unknown:
         told = "; ".join(made.unknown)
-        screen.say(f"  not determined by any log, and left at their values: {told}", "warning", "yellow")
+        screen.say(f"  no log determines these, drawn as wide as believed before: {told}", "warning", "yellow")
     screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
     screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
 

@@ -18,7 +18,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.json_file import write_json
 from gaponet.errors import UsageError
-from gaponet.eval.knowledge import Knowledge, seen, values_of
+from gaponet.eval.knowledge import Knowledge, believed, seen, values_of
 from gaponet.files import write_text, writing
 from gaponet.robot import RobotSpec, load_robot
 from gaponet_interop.engine import unit_of_mujoco
@@ -29,7 +29,7 @@ Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
 KIND = "engine"
 FILE = "randomization.json"
 DRAWN, RANGE = 4096, (5, 95)  # for the ranges, per cent
-LOST = 3.0  # standard deviation on an axis from which nobody knows a number: it stays
+LOST = 0.8  # of what is believed before any log: an error as large says that no log knows the number
 SIGNED = ("offset",)
 FEWEST = 3  # robots of a type
 
@@ -74,9 +74,7 @@ def ranges(
         apart = (each - middle) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
         what = "days" if scope == "any-day" else "robots"
         notes.append(f"from {len(each)} {what}: how far they differ is known to a factor of {_factor(len(each)):.1f}")
-    spread = np.einsum("njj->nj", covariance)
-    lost = spread > LOST**2
-    covariance = np.where(lost[:, :, None] | lost[:, None, :], 0.0, covariance)
+    lost = np.sqrt(np.einsum("njj->nj", covariance)) > LOST * believed(fields, now)
     rng, count = np.random.default_rng(seed), max(DRAWN, samples)
     x = middle + np.einsum("sd,dnp->snp", rng.standard_normal((count, len(apart))), apart)
     for i in range(len(joints)):

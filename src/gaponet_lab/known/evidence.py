@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.eval.knowledge import JointKnown, Knowledge, Source, seen
+from gaponet.eval.knowledge import JointKnown, Knowledge, Source, believed, seen
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sim.free_runs import cut
@@ -118,7 +118,8 @@ def evidence(
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
     weight = 1 / np.sqrt(1 + here**2)
     pulls, window = clustered(jac * (weight * here)[..., None], runs.window)
-    normals, _ = clustered(jac[..., :, None] * (weight[..., None] * jac)[..., None, :], runs.window)
+    each = ((j[None, :, :, None], (w[:, None] * j)[None, :, None, :]) for j, w in zip(jac, weight, strict=True))
+    normals = np.concatenate([clustered(a * b, runs.window)[0] for a, b in each])  # a joint at a time, for memory
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
     own = dict.fromkeys(names)
     of = np.array([list(own).index(name) for name in names])
@@ -169,6 +170,8 @@ def known(
             names, whole = covariances[joint]
             at = np.array([names.index(f) for f in fields])
             own = whole[np.ix_(at, at)]
+        if not before:
+            own = inverted(inverted(own) + np.diag(believed(fields, values[joint]) ** -2))
         normal = says.normals[i].sum(axis=0)[:-1, :-1]
         predicted = SOFT * float(np.sqrt(max(np.trace(own @ normal), 0.0) / max(says.rows[i], 1)))
         error = np.abs(left[:, i])

@@ -68,13 +68,13 @@ def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
     assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
 
 
-def test_what_no_log_determines_stays_and_is_said(arm, tmp_path, capsys):
-    folder = written(arm, tmp_path / "known", errors=np.where(np.arange(6) == 3, 1e3, ERRORS))
+def test_what_no_log_determines_is_said(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known", errors=np.where(np.arange(6) == 3, 0.02 / 16, ERRORS))
     code, said = exported(capsys, folder)
     assert (code, said["unknown"]) == (0, ["shoulder: armature", "elbow: armature"])
     low, value, high = said["ranges"]["elbow"]["armature"]
-    assert high / low == pytest.approx(np.exp(2 * 1.645 * 0.05), rel=0.02)  # over kp it does not move
-    assert low < value < high
+    assert low == 0
+    assert value < high < 4 * value
 
 
 def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):

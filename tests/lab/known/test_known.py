@@ -76,6 +76,13 @@ def test_a_folder_says_how_sure_it_is_and_from_which_logs(arm, folder):
         assert mine.joints[joint].left < 2e-3
 
 
+def test_what_logs_do_not_show_is_as_sure_as_before_them(arm):
+    """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
+    still = [replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)]
+    mine = known(arm, still, [], nthread=1)
+    assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
+
+
 def test_more_seconds_make_it_surer_and_are_told(arm, folder):
     robot = load_robot(folder)
     mine = Knowledge.load(robot)
