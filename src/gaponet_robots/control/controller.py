@@ -125,7 +125,7 @@ class Controller:
         self._handed, self._passed, self._weighed = 0.0, 0.0, False  # weight, and s on the way, in blend_in
         self._soft = False  # whether a robot that cannot brake is lowered while it damps
         self._loose = False  # whether nobody has confirmed that it is damped
-        self._delta = np.zeros(len(self.joints))
+        self._delta, self._followed = np.zeros(len(self.joints)), -np.inf
         self.plan: Plan | None = None  # may be given until it runs: its motion is played
         self._planner = planner
         if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
@@ -263,6 +263,9 @@ class Controller:
             self.following.rest()
             return None
         handed = self._handed if self.driver.at_end == "hand_over" else 1.0
+        if state.time <= self._followed:  # heard before: it says nothing new of where the joints went
+            return None
+        self._followed = state.time
         limit = self.limits.effort / self.safety.torque_share
         asked = self._found + handed * (self._asked - self._found)
         load = lambda: static_torque(self._laden, state.qpos[None])[0, self.joints] / limit  # noqa: E731
@@ -368,11 +371,7 @@ class Controller:
         return None
 
     def _look(self, search: Search[_T]) -> _T | None:
-        """Go on looking for a share of this period: what was found; None where it is not over.
-
-        Raises:
-            UsageError: There is none.
-        """
+        """Go on looking for a share of this period: what was found; None where it is not over; UsageError for none."""
         until = self.clock.now() + LOOK * self.dt
         try:
             while self.clock.now() <= until:
