@@ -54,22 +54,11 @@ def gap_by_step(
     nominal = robot.before_identification
     entries, unseen = choose([one.folder], dataset, motions)
     sequences = dataset.sequences(entries)
-    steps: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
-    if one.model is not None:
-        fitted = DelayOffset.read(one.folder)
-        only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
-        steps += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
-    found = causes(robot)
-    steps += [(cause, physics, None) for cause, physics in found]
-    if one.model is not None:
-        steps.append((one.method, robot, one.corrector()))
-    done = {}
-    for name, physics, corrector in steps:
+    found, done = causes(robot), {}
+    for name, physics, corrector in _steps(one, found):
         told = noted(progress, name)
         twins = replay(sequences, physics, corrector, lock_idle=True, progress=told, creeps=name == "friction")
         done[name] = runs(sequences, [t.qpos for t in twins], robot)
-    payloads = sorted({s.meta.payload_mass for s in sequences})
-    columns = {j: [i] for i, j in enumerate(robot.operated)}
     units = {s.meta.unit_id for s in sequences}
     others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
     floors = floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
@@ -84,18 +73,16 @@ def gap_by_step(
         "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
         "by_joint": {
             j: {
-                "left": {n: metrics(part, c)["mpjae"] for n, part in done.items()},
-                "removed": removed(done, c),
-                "unexplained": _above(metrics(done[last], c)["mpjae"], floors[j]["both"]),
+                "left": {n: metrics(part, [i])["mpjae"] for n, part in done.items()},
+                "removed": removed(done, [i]),
+                "unexplained": _above(metrics(done[last], [i])["mpjae"], floors[j]["both"]),
                 "floor": floors[j],
             }
-            for j, c in columns.items()
+            for i, j in enumerate(robot.operated)
         },
         "by_payload": {
-            f"{p:g}": {
-                n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()
-            }
-            for p in payloads
+            f"{p:g}": {n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()}
+            for p in sorted({s.meta.payload_mass for s in sequences})
         },
         "floor": floors["all"],
         "virtual": any(s.meta.virtual for s in sequences),
@@ -108,6 +95,19 @@ def gap_by_step(
         "dataset": dataset.path.name,
         "robot": robot.name,
     }  # fmt: skip
+
+
+def _steps(one: Candidate, found: list[tuple[str, RobotSpec]]) -> list[tuple[str, RobotSpec, Corrector | None]]:
+    """Name, simulator and correction of each step, from the nominal simulator over the causes to the model."""
+    nominal = one.robot.before_identification
+    start: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
+    middle: list[tuple[str, RobotSpec, Corrector | None]] = [(cause, physics, None) for cause, physics in found]
+    if one.model is None:
+        return start + middle
+    fitted = DelayOffset.read(one.folder)
+    only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
+    start += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
+    return [*start, *middle, (one.method, one.robot, one.corrector())]
 
 
 # What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
