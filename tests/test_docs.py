@@ -75,7 +75,7 @@ def test_the_architecture_page_names_every_folder_once_and_each_step_of_the_walk
     assert sorted({*rows, "cli"}) == FOLDERS
     for walk in page.split("\n## ")[3:]:
         steps = re.findall(r"^\d\. (?:.|\n(?!\d\. |\n))+", walk, re.MULTILINE)
-        assert len(steps) >= 7
+        assert len(steps) >= 5
         files = [f for step in steps for f in set(re.findall(r"`([a-z_]+/[a-z0-9_/]+\.py)`", step))]
         again = {f for f in files if files.count(f) > 1} - {"control/safety.py"}  # judges the state, then the command
         assert not again
