@@ -82,9 +82,9 @@ def learners(
         f"… with mini-batches of {ours:,}": (batched(env, config, ours), batch),
     }
     if config.model.kind != "mlp":
-        hidden = DeltaMLP.matched_hidden(
-            config.model, env.num_actions, size(build_network(config.model, env.num_actions))
-        )
+        n = env.num_actions
+        weights = size(build_network(config.model, n))
+        hidden = DeltaMLP.matched_hidden(config.model.mlp_hidden, weights, lambda w: DeltaMLP(config.model, n, w))
         models["… and an MLP of as many parameters"] = batched(env, config, ours, hidden), batch
     single, samples, close = separate(robot, config, recordings(robot, 8))
     models["stable-baselines3, SubprocVecEnv"] = single, samples

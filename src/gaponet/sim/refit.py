@@ -36,7 +36,7 @@ MAX_MASS = 20.0  # kg
 
 
 @dataclass(frozen=True)
-class Refitted:
+class _Refitted:
     """The fitted robot and what is known about the fit.
 
     Attributes:
@@ -60,7 +60,7 @@ def refit(
     corrector: Corrector | None = None,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
     believed: bool = True,
-) -> Refitted:
+) -> _Refitted:
     """Fit FIELDS of all operated joints at once.
 
     Args:
@@ -97,7 +97,7 @@ def refit(
     )  # fmt: skip
     before, after = (problem.rms(p) for p in (problem.own(float(np.mean(payloads))), x[0, 0]))
     mass = {"payload_mass": float(x[0, 0, -1]), "payload_std": problem.jackknife(x)} if unknown_payload else {}
-    return Refitted(problem.robot_of(x[0, 0]), before, after, **mass)
+    return _Refitted(problem.robot_of(x[0, 0]), before, after, **mass)
 
 
 class _Problem:
