@@ -6,7 +6,9 @@ from arm import TOML, XML, commands
 from motion_files import write_motion
 
 from gaponet.cli.main import main
+from gaponet.errors import UsageError
 from gaponet.robot import load_robot
+from gaponet_robots.control import publisher
 from gaponet_robots.control.clock import SimulatedClock
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.phases import ControlConfig
@@ -39,6 +41,14 @@ def test_a_dry_run_goes_through_the_motion_and_sends_nothing(arm):
     assert sent["shoulder"]["lowest_rad"] <= MOTION.ctrl[:, 0].min() + 1e-9
     assert sent["elbow"]["highest_rad"] >= MOTION.ctrl[:, 1].max() - 1e-9
     assert 0 < sent["elbow"]["torque_nm"] <= controller.limits.effort[1]
+
+
+def test_a_dry_run_beside_a_run_of_the_same_robot_is_refused(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(publisher, "LOCKS", tmp_path)
+    inner = Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), SimulatedClock())
+    inner.address = "a port"
+    with publisher.sole_publisher("a port"), pytest.raises(UsageError, match="another process commands"):
+        Controller(DryRun(inner), arm, clock=SimulatedClock()).run(play(MOTION, 0.02))
 
 
 def test_a_dry_run_on_the_command_line_says_what_would_be_sent(arm, tmp_path, capsys):
