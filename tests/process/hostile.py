@@ -102,12 +102,12 @@ def picture(folder: Path) -> None:
 
 
 def hull(folder: Path) -> None:
-    """A mesh of points on a sphere, all of them corners of its hull."""
+    """A mesh of points on a sphere, all of them corners of its hull: dear, but a valid one, 3 s for its 2.5 MB."""
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(300_000, 3))
+    points = rng.normal(size=(150_000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     (folder / "arm").mkdir(parents=True)
-    triangles = np.zeros((100_000, 12), "<f4")
+    triangles = np.zeros((50_000, 12), "<f4")
     triangles[:, 3:] = points.reshape(-1, 9)
     content = bytes(80) + struct.pack("<I", len(triangles)) + b"".join(t.tobytes() + b"\0\0" for t in triangles)
     mjcf("<worldbody>", '<asset><mesh name="m" file="m.stl"/></asset><worldbody><geom type="mesh" mesh="m"/>')(folder)
@@ -453,9 +453,10 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """One line, soon on a machine of one's own, and small."""
+        """One line, or taken without a word; soon on a machine of one's own, and small."""
         last = [line for line in self.said.splitlines() if not line.startswith(("reading", "checking", "downloading"))]
-        return self.code == 2 and len(last) == 1 and self.computing < SECONDS and self.memory < MEMORY
+        said = (self.code == 2 and len(last) == 1) or (self.code == 0 and not last)
+        return said and self.computing < SECONDS and self.memory < MEMORY
 
 
 def tried(name: str, folder: Path) -> Outcome:
