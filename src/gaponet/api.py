@@ -6,8 +6,11 @@ Datasets, runs and robots are given as paths or as what these functions return. 
 from __future__ import annotations
 
 import os
+import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -468,8 +471,6 @@ def calibrate_robot(
         UsageError: The unit is not named.
         NoGainError: The fit does not follow the recordings better than the robot as it was known; nothing is written.
     """
-    import tempfile
-
     from gaponet.eval.knowledge import Knowledge
     from gaponet.files import write_text, writing
     from gaponet.robot_folder import ORIGIN, save_robot
@@ -479,17 +480,7 @@ def calibrate_robot(
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
     before_known = Knowledge.load(spec)
-    with tempfile.TemporaryDirectory() as place, writing(Path(out), "robot"):
-        if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
-            import_logs(source, spec, Path(place) / "data", unit or None, payload_mass)
-            data = Dataset(Path(place) / "data")
-        else:
-            data, _ = _opened(source, spec)
-        data.require_robot(spec)
-        units = sorted({e.meta.unit_id for e in data.entries})
-        if unit not in units and (unit or len(units) != 1):
-            raise UsageError(f"--unit {unit or '(none)'}: {source} holds units {', '.join(units)}; name one")
-        sequences = data.sequences([e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])])
+    with writing(Path(out), "robot"), unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences):
         believed = all(s.meta.known_gains[1] is not None for s in sequences)
         with bar("calibrating") as update:
             found = refit(
@@ -510,7 +501,42 @@ def calibrate_robot(
         if (spec.folder / ORIGIN).is_file():  # which motions identification saw is still to be known
             write_text(Path(out) / ORIGIN, (spec.folder / ORIGIN).read_text(encoding="utf-8"))
         _keep_known(Path(out), sequences, [], {}, before_known)
-    return Calibrated(found.robot, unit or units[0], errors, found.payload_mass, found.payload_std)
+    return Calibrated(found.robot, unit, errors, found.payload_mass, found.payload_std)
+
+
+@contextmanager
+def unit_recordings(
+    source: Dataset | Place,
+    robot: RobotSpec,
+    unit: str = "",
+    motions: tuple[str, ...] = (),
+    payload_mass: float | None = None,
+) -> Iterator[tuple[str, list[Sequence]]]:
+    """One unit's recordings from a dataset, or from logs that are imported for as long as they are needed.
+
+    Args:
+        source: A dataset, or logs that gaponet import reads.
+        unit: Which one, where there are several.
+        motions: Only these.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+
+    Yields:
+        The unit's id and its recordings.
+
+    Raises:
+        UsageError: The unit is not there, or there are several and none is named.
+    """
+    with tempfile.TemporaryDirectory() as place:
+        if isinstance(source, (str, Path)) and Path(source).exists() and not (Path(source) / "dataset.json").is_file():
+            data = import_logs(source, robot, Path(place) / "data", unit or None, payload_mass).dataset
+        else:
+            data, _ = _opened(source, robot)
+        data.require_robot(robot)
+        units = sorted({e.meta.unit_id for e in data.entries})
+        if unit not in units and (unit or len(units) != 1):
+            raise UsageError(f"--unit {unit or '(none)'}: {source} holds units {', '.join(units)}; name one")
+        unit = unit or units[0]
+        yield unit, data.sequences([e for e in data.select(motions) if e.meta.unit_id == unit])
 
 
 def _opened(

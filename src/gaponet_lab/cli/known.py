@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,27 +94,16 @@ def check(
         payload_mass: kg in each hand, of logs whose format does not state it.
         threads: 0 for all cores.
     """
-    from gaponet.api import import_logs
-    from gaponet.data.store import Dataset, open_dataset
+    from gaponet.api import unit_recordings
     from gaponet_lab.known.drift import drift
 
     screen = Out(json)
     spec, known = _opened(robot)
-    with tempfile.TemporaryDirectory() as place:
-        if Path(logs).exists() and not (Path(logs) / "dataset.json").is_file():
-            import_logs(logs, spec, Path(place) / "data", unit or None, payload_mass)
-            data = Dataset(Path(place) / "data")
-        else:
-            data, _ = open_dataset(logs, spec)
-        data.require_robot(spec)
-        units = sorted({e.meta.unit_id for e in data.entries})
-        if unit not in units and (unit or len(units) != 1):
-            raise UsageError(f"--unit {unit or '(none)'}: {logs} holds units {', '.join(units)}; name one")
-        entries = [e for e in data.select(motions) if e.meta.unit_id == (unit or units[0])]
-        found = drift(spec, known, data.sequences(entries), threads)
+    with unit_recordings(logs, spec, unit, motions, payload_mass) as (_, sequences):
+        found = drift(spec, known, sequences, threads)
     named = {m.joint for m in found.moved}
     screen.table(
-        f"{len(entries)} recordings, {found.seconds:.0f} s: what changed most, in standard deviations",
+        f"{len(sequences)} recordings, {found.seconds:.0f} s: what changed most, in standard deviations",
         ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
         [
             _row(m, known, m.joint in named)
@@ -127,7 +115,7 @@ def check(
         screen.say(f"  {what}", "warning", "yellow")
     screen.say(f"{found.verdict}: {found.advice}")
     screen.result({
-        "verdict": found.verdict, "advice": found.advice, "recordings": len(entries), "seconds": found.seconds,
+        "verdict": found.verdict, "advice": found.advice, "recordings": len(sequences), "seconds": found.seconds,
         "moved": [_plain(m) for m in found.moved], "largest": {j: _plain(m) for j, m in found.largest.items()},
         "against": [vars(a) for a in found.against], "threshold": found.threshold,
     })  # fmt: skip

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gaponet.errors import UsageError
-from gaponet.model.baselines.fno import SpectralConv
+from gaponet.model.baselines.fno import _SpectralConv
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.layers import size
@@ -75,21 +75,21 @@ def test_heads_share_the_width():
 
 def test_all_frequencies_give_the_samples_back():
     for count in (2, 5, 9):
-        forward, inverse = SpectralConv.dft(count, count + 1)
+        forward, inverse = _SpectralConv.dft(count, count + 1)
         assert torch.allclose(inverse @ forward, torch.eye(count), atol=1e-5)
 
 
 def test_the_matrices_are_the_fourier_transform_of_a_padded_signal():
     signal = torch.randn(5)
     expected = torch.fft.rfft(signal, 10)[:4]
-    answer = SpectralConv.dft(5, 4)[0] @ signal
+    answer = _SpectralConv.dft(5, 4)[0] @ signal
     assert torch.allclose(answer[:4], expected.real, atol=1e-5)
     assert torch.allclose(answer[4:], expected.imag, atol=1e-5)
 
 
 def test_a_spectral_layer_multiplies_frequencies_by_complex_matrices():
     torch.manual_seed(0)
-    layer, data = SpectralConv(5, 3, 4), torch.randn(2, 5, 3)
+    layer, data = _SpectralConv(5, 3, 4), torch.randn(2, 5, 3)
     weight = torch.complex(layer.weight[0], layer.weight[1])
     spectrum = torch.zeros(2, 6, 3, dtype=torch.complex64)
     spectrum[:, :4] = torch.einsum("bki,kio->bko", torch.fft.rfft(data, 10, dim=1)[:, :4], weight)

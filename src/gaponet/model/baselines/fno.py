@@ -17,7 +17,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, dense
 
 
-class SpectralConv(nn.Module):
+class _SpectralConv(nn.Module):
     """Convolution over time: each kept frequency is multiplied by a complex width × width matrix of its own."""
 
     forward_dft: Tensor
@@ -26,7 +26,7 @@ class SpectralConv(nn.Module):
     def __init__(self, count: int, width: int, modes: int) -> None:
         super().__init__()
         modes = min(modes, count + 1)
-        forward, inverse = SpectralConv.dft(count, modes)
+        forward, inverse = _SpectralConv.dft(count, modes)
         self.register_buffer("forward_dft", forward, persistent=False)
         self.register_buffer("inverse_dft", inverse, persistent=False)
         self.weight = nn.Parameter(torch.randn(2, modes, width, width) / width)  # real, imaginary
@@ -66,7 +66,7 @@ class DeltaFNO(DeltaNet):
         width = config.fno_width
         self.tokens = Tokens(self.features, config, width)
         layers = range(config.fno_layers)
-        self.spectral = nn.ModuleList(SpectralConv(self.tokens.count, width, config.fno_modes) for _ in layers)
+        self.spectral = nn.ModuleList(_SpectralConv(self.tokens.count, width, config.fno_modes) for _ in layers)
         self.pointwise = nn.ModuleList(nn.Linear(width, width) for _ in layers)
         self.head = dense(width, (4 * width,), n, zero=True)
 
