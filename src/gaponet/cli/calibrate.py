@@ -18,9 +18,12 @@ from gaponet.errors import UsageError
 from gaponet.eval.tables import mrad
 from gaponet.robot import RobotSpec, as_option
 
-Known = Annotated[Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.")]
+Known = Annotated[
+    Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN")
+]
 Logs = Annotated[
-    tyro.conf.Positional[str], tyro.conf.arg(help="Dataset folder or address; for a robot folder logs as well.")
+    tyro.conf.Positional[str],
+    tyro.conf.arg(help="Dataset folder or address; for a robot folder logs as well.", metavar="LOGS"),
 ]
 
 
@@ -37,7 +40,7 @@ def calibrate(
     mixed_gains: Flag = False,
     json: Json = False,
 ) -> None:
-    """Fit what is particular to one unit (gain, damping, friction, zero, delay) from a short log.
+    """Bring an identified robot to another unit or day: short logs.
 
     A robot folder in, a robot folder out: gaponet calibrate ./my_robot LOGS --out ./my_robot_today. Of a run the
     trained model stays as it is; gaponet eval then shows the unit without and with its calibration.

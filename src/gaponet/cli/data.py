@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.cli.options import Data, Folder, Json, Robot, Source
+from gaponet.cli.options import Data, Json, Logs, Robot, Source
 from gaponet.cli.out import Out
 from gaponet.data.checks.finding import some
 from gaponet.data.store import Dataset, open_dataset
@@ -147,7 +147,7 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
 
 
 def _labels(
-    logs: Folder,
+    logs: Logs,
     robot: str,
     out: Path,
     payloads: tuple[float, ...],
@@ -202,7 +202,7 @@ Action = (
 
 
 def data(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
-    """What a dataset holds: its card, splits, pictures and export; what of it is removed; labels that logs lack."""
+    """A dataset's card, splits, pictures, export and removal."""
 
 
 def _show_card(out: Out, made: dict[str, Any]) -> None:

@@ -25,7 +25,7 @@ def gap(
     dataset: Source, run: Path | None = None, motions: Motions = (), robot: Robot = None, executor: str = LOCAL,
     json: Json = False,
 ) -> None:  # fmt: skip
-    """How far the simulator is from the robot, by joint, payload and horizon; of an identified robot also by causes.
+    """How far is the simulator from the robot, by joint and payload?
 
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
 

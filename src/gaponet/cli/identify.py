@@ -60,7 +60,9 @@ def identify(
     holdout_units: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
-    """Fit gains, damping, friction, armature, zero offsets and delays to the training motions.
+    """Fit the simulator's servos to logs: a robot folder.
+
+    Gains, damping, friction, armature, zero offsets and delays are fitted to the training motions.
 
     The result is a robot folder: use it with --robot, with a slash: gaponet gap DATASET --robot ./OUT. What the robot's
     file says of gains is where the fit starts; those that recordings state are believed. Where nothing does better than

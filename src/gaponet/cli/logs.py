@@ -9,7 +9,7 @@ import numpy as np
 import tyro
 
 from gaponet import api
-from gaponet.cli.options import Flag, Folder, Json, Source, like
+from gaponet.cli.options import Flag, Json, Logs, Source, like
 from gaponet.cli.out import Out
 from gaponet.data.checks.finding import some
 from gaponet.data.signals import FAST
@@ -29,7 +29,7 @@ MAX_ROWS = 60
 
 @like(api.import_logs)
 def import_logs(
-    src: Folder,
+    src: Logs,
     robot: str,
     out: Path | None = None,
     unit_id: str | None = None,
@@ -51,7 +51,9 @@ def import_logs(
     guess: bool = False,
     json: Json = False,
 ) -> None:
-    """Read logs of a robot into a dataset: a bad one refuses them all. The same command again adds what is missing.
+    """Read a robot's logs into a dataset; the same call adds what is new.
+
+    A bad log refuses them all (--skip-bad leaves it out instead).
 
     Args:
         robot: Robot name or folder.
@@ -97,7 +99,7 @@ def import_logs(
 def doctor(
     dataset: Source, robot: str | None = None, fix: Flag = False, figures: Path | None = None, json: Json = False
 ) -> None:
-    """Check a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, payload.
+    """Check a dataset: order, signs, units, rates, gaps, lag, payload.
 
     Args:
         robot: Robot name or folder, if not the one that the dataset keeps.

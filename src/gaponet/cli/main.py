@@ -21,12 +21,13 @@ from gaponet.text import plain
 
 # Task → commands; those of parts that are not installed are left out, and what somebody else's part brings comes last.
 TASKS = {
+    "Start here": ("start", "demo"),
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
     "Is it closed?": ("eval", "check", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
-    "Try it, time it, share it": ("start", "demo", "bench", "push", "pull"),
+    "Share it, time it": ("push", "pull", "bench"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 CORE = {
@@ -36,7 +37,6 @@ CORE = {
     "eval": "gaponet.cli.train:evaluate",
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."
-WIDTH = 100  # letters of a command's purpose
 
 
 def commands() -> dict[str, str]:
@@ -123,15 +123,13 @@ def _overview() -> str:
 
 
 def _purpose(module: str, function: str) -> str:
-    """The first sentences of a command's docstring that a line has room for."""
+    """The first sentence of a command's docstring."""
     spec = find_spec(module)
     assert spec
     assert spec.origin
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     found = next(n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == function)
-    first = " ".join((ast.get_docstring(found) or "").split("\n\n")[0].split())
-    head = first[:WIDTH]
-    return first if head == first else head[: max(map(head.rfind, (". ", "; ", ": ")))]
+    return (ast.get_docstring(found) or "").splitlines()[0]
 
 
 def _say(text: str) -> int:

@@ -12,17 +12,25 @@ import tyro
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 Folder = tyro.conf.Positional[Path]
+Logs = Annotated[Folder, tyro.conf.arg(metavar="LOGS")]
+Model = Annotated[Folder, tyro.conf.arg(metavar="MODEL")]
 Flag = tyro.conf.FlagCreatePairsOff[bool]
-Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.")]
+Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.", metavar="DATASET")]
 Source = Annotated[
     tyro.conf.Positional[str],
-    tyro.conf.arg(help="Dataset folder, or the address (s3://, gs://, file://) of one that was pushed."),
+    tyro.conf.arg(
+        help="Dataset folder, or the address (s3://, gs://, file://) of one that was pushed.", metavar="DATASET"
+    ),
 ]
-Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.")]
-Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.")]
+Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]
+Known = Annotated[
+    Folder,
+    tyro.conf.arg(help="Robot folder of gaponet identify, or run folder of gaponet train.", metavar="ROBOT|RUN"),
+]
 Motions = Annotated[tuple[str, ...], tyro.conf.arg(help="Only these.")]
 Robot = Annotated[
-    str | None, tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.")
+    str | None,
+    tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.", metavar="ROBOT"),
 ]
 Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
 

@@ -31,7 +31,7 @@ def train(
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TrainConfig(),  # noqa: B008
     json: Json = False,
 ) -> None:
-    """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
+    """Train a network on top of an identified robot.
 
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
@@ -69,7 +69,7 @@ def evaluate(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Step simulators through logs they never saw: nominal, identified, and with a run's shipped model on top."""
+    """Measure robots and runs on motions that they never saw."""
     out = Out(json)
     evaluation = api.evaluate(run, dataset, also, motions, robot)
     if not evaluation.result["unseen"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as text
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -17,14 +18,14 @@ FILE, STEP = "policy_postprocessor.json", "gaponet_correct"
 
 
 def attach(
-    policy: Folder,
+    policy: Annotated[Folder, tyro.conf.arg(metavar="POLICY")],
     holder: tyro.conf.Positional[Path | None] = None,
     payload_mass: float = 0.0,
     dynamics: Flag = False,
     off: Flag = False,
     json: Json = False,
 ) -> None:
-    """Put the correction by an identified robot or a run behind a LeRobot policy: its postprocessor's last step.
+    """Put the correction behind a LeRobot policy.
 
     What it had before is replaced. LeRobot's commands find the step through the plug-in lerobot_robot_gaponet.
 

@@ -16,7 +16,7 @@ from gaponet.robot_folder import KEPT, keeps_robot
 if TYPE_CHECKING:
     from gaponet_interop.engine.ranges import Engine, Scope
 
-Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.")]
+Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")]
 
 
 def export(
@@ -32,7 +32,7 @@ def export(
     units: tuple[Path, ...] = (),
     json: Json = False,
 ) -> None:
-    """Write an identified robot for another engine, or a run's network for another program.
+    """Write an identified robot or a network for another program.
 
     Args:
         to: Of a robot or of a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs

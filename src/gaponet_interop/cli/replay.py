@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet import api
-from gaponet.cli.options import Folder, Json
+from gaponet.cli.options import Json, Logs
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.knowledge import Knowledge
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def replay(
-    logs: Folder,
+    logs: Logs,
     robot: Path,
     data: str | None = None,
     described: Path | None = None,
@@ -32,7 +32,7 @@ def replay(
     figure: Path | None = None,
     json: Json = False,
 ) -> None:
-    """Will a policy transfer: what would this robot have done under the targets of a rollout, with a band.
+    """Will a policy transfer? What the robot would do in its rollout.
 
     The rollout is a log of your simulator, targets as commands, and states, in any format that gaponet import reads.
     Its targets are played as they stand; a policy that looks at the state would have answered what differs. The band

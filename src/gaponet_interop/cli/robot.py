@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from gaponet.cli.options import Flag, Folder, Json
+from gaponet.cli.options import Flag, Json, Model
 from gaponet.cli.out import Out
 from gaponet.data.store import open_dataset
 from gaponet.errors import UsageError
@@ -79,7 +79,7 @@ def check(
 
 
 def new(
-    model: Folder,
+    model: Model,
     out: Path,
     joints: tuple[str, ...] = (),
     operated: tuple[str, ...] = (),
@@ -210,4 +210,4 @@ Action = (
 
 
 def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
-    """Make a robot folder from a vendor's model, check one, list the package's, or listen to one."""
+    """Make a robot folder from a vendor's model, or check one."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -10,12 +10,12 @@ from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet_interop.share import move
 
+Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
+
 
 @like(move.push)
-def push(
-    path: Folder, address: tyro.conf.Positional[str], private: Flag = False, replace: Flag = False, json: Json = False
-) -> None:
-    """Put a dataset or a run onto the Hugging Face Hub or into a bucket, with its card; sends what is not there."""
+def push(path: Folder, address: Address, private: Flag = False, replace: Flag = False, json: Json = False) -> None:
+    """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
     screen = Out(json)
     moved = move.push(path, address, private, replace)
     screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {address}", moved.kind)
@@ -24,8 +24,8 @@ def push(
 
 
 @like(move.pull)
-def pull(address: tyro.conf.Positional[str], out: tyro.conf.Positional[Path], json: Json = False) -> None:
-    """Fetch a dataset or a run that was pushed; every file and every sequence is checked by its hash."""
+def pull(address: Address, out: Folder, json: Json = False) -> None:
+    """Fetch a dataset or a run, every file checked by its hash."""
     screen = Out(json)
     moved = move.pull(address, out)
     screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB; all hashes are right: {out}", moved.kind)

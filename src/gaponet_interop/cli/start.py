@@ -16,7 +16,7 @@ import numpy as np
 from gaponet import api
 from gaponet.cli.logs import show_diagnosis
 from gaponet.cli.main import commands, main
-from gaponet.cli.options import Flag, Folder, Json
+from gaponet.cli.options import Flag, Json, Logs, Model
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.files import write_text, writing
@@ -59,8 +59,8 @@ class Understood:
 
 
 def start(
-    model: Folder,
-    logs: Folder,
+    model: Model,
+    logs: Logs,
     out: Path = Path("started"),
     unit_id: str = "lab",
     payload_mass: float = 0.0,
@@ -74,7 +74,7 @@ def start(
     anyway: Flag = False,
     json: Json = False,
 ) -> None:
-    """From a model file and a folder of logs to an identified robot, its export and a report; prints every command.
+    """All of it in one command: model file and logs in, report out.
 
     What ran stands in OUT/commands.sh. The same command again goes on where it was interrupted, or stopped to ask.
 

@@ -29,7 +29,7 @@ SPLIT = 3  # motions, from which some are kept for judging; parts of fewer fit a
 
 @writes("robot")
 def torque(dataset: Source, out: Path, current: Flag = False, robot: Robot = None, json: Json = False) -> None:
-    """Fit friction, inertia and delay of a robot that is driven by torque or current, the torque as the input.
+    """Fit friction, inertia and delay of a torque-driven robot.
 
     Recordings need torque (tau) of every operated joint; where no position was commanded, logs.toml says the position's
     column for ctrl too. What is found is judged on recordings that were not fitted: how far the simulator is from the

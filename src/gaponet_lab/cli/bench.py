@@ -31,7 +31,7 @@ def bench(
     adversary: Literal["", "labels", "late", "all_late", "joints"] = "",
     json: Json = False,
 ) -> None:
-    """Measure speed; or, with real, how near methods come to the public recordings of real robots.
+    """Measure speed, or methods on public recordings of real robots.
 
     Args:
         what: sim: replay and environment. train: inference, collection, update, and PPO as a whole. latency: one

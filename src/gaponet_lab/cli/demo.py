@@ -31,7 +31,7 @@ def demo(
     network: str = "40s",
     json: Json = False,
 ) -> None:
-    """Show the whole way in minutes: on your logs, or on embedded VIRTUAL robots where there are none.
+    """See all of it in minutes, on VIRTUAL robots or on your logs.
 
     Args:
         data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.

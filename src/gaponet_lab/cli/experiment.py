@@ -123,7 +123,7 @@ def _command(kind: type[Any]) -> Any:
 
 
 def experiment(action: None) -> None:
-    """Experiments with a question each: tables, figures and sentences in OUT, one report.html over all."""
+    """Run a study: compare models, leave units out, track, deliver."""
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.

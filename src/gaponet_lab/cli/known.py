@@ -17,16 +17,17 @@ from gaponet.robot import RobotSpec, load_robot
 if TYPE_CHECKING:
     from gaponet_lab.known.drift import Moved
 
-Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet calibrate.")]
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet calibrate.", metavar="ROBOT")]
 Logs = Annotated[
-    tyro.conf.Positional[str], tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.")
+    tyro.conf.Positional[str],
+    tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.", metavar="LOGS"),
 ]
 WIDE = 4  # columns of a table
 MEND = "identify or calibrate it again with this gaponet, which keeps it"
 
 
 def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
-    """What is known of a robot: values, how sure they are, which are known only together, and from which logs.
+    """What is known of an identified robot, and how surely.
 
     Args:
         out: Picture to write, .png or .svg.
@@ -85,7 +86,7 @@ def check(
     threads: int = 0,
     json: Json = False,
 ) -> None:
-    """Is this still the robot that was identified? By joint, which number moved, by how much, and what to do.
+    """Is this still the robot that was identified? What moved?
 
     The exit code is 0 where it is, 1 where it is not, 2 where that cannot be told.
 

@@ -15,7 +15,7 @@ from gaponet_lab.view.portrait import portrait, prepare
 def report(
     run: Known, dataset: Path | None = None, also: tuple[Path, ...] = (), robot: Robot = None, json: Json = False
 ) -> None:
-    """Write one self-contained offline HTML page about an identified robot or a run.
+    """Write one offline HTML page about an identified robot or a run.
 
     Args:
         dataset: Dataset folder to evaluate on; default the one of the last evaluation, where it still is.

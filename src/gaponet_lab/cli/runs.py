@@ -18,7 +18,7 @@ def runs(
     folder: Folder = Path("."),
     json: Json = False,
 ) -> None:
-    """List the training runs below a folder with their held-out numbers, best first.
+    """List the training runs below a folder, best first.
 
     Args:
         folder: Where to look; run folders may lie at any depth.

@@ -42,7 +42,7 @@ def view(
     robot: Robot = None,
     json: Json = False,
 ) -> None:
-    """Watch one recording: target, nominal, identified and corrected simulator, robot. --render, --web need no display.
+    """Watch a recording beside its simulations: window, browser, film.
 
     Args:
         model: Robot folders of gaponet identify and run folders of gaponet train; each gives a copy of the robot.
@@ -50,8 +50,8 @@ def view(
         unit: Which unit's recording, where there are several.
         payload_mass: Which payload's recording, kg.
         show: Copies from left to right; aligned stands for the identified robot and every --model.
-        render: Write a .gif, .mp4 or .png instead (the .png shows the moment of the largest nominal error).
-        web: Serve the scene to a browser instead; needs gaponet[view].
+        render: Write a .gif, .mp4 or .png instead, without a display (.png: the moment of the largest nominal error).
+        web: Serve the scene to a browser instead, without a display; needs gaponet[view].
         port: Port of --web.
         start: s into the recording; default: where most happens.
         duration: s of the recording.

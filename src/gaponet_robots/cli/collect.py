@@ -22,7 +22,7 @@ def collect(
     executor: str = "local",
     json: Json = False,
 ) -> None:
-    """Record motions × payloads × VIRTUAL units × rates × repetitions into a dataset, with their twins.
+    """Record motions of VIRTUAL robots into a dataset.
 
     Run again after an interruption: what is there is kept, what is missing is recorded, and the result is the same.
 

@@ -20,7 +20,7 @@ def excite(
     seed: int = 0,
     json: Json = False,
 ) -> None:
-    """No data yet? Write the motions to play on a robot, and the sheet to fill in: how long, which gains and payloads.
+    """No data yet? Write motions to play on a robot, and how.
 
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.

@@ -24,7 +24,7 @@ def record(
     asked: Annotated[Asked, tyro.conf.arg(name="")] = Asked(),  # noqa: B008
     json: Json = False,
 ) -> None:
-    """Play a motion uncorrected and add what the robot did to a dataset, with unit, payload and gains.
+    """Play a motion uncorrected and keep what the robot did.
 
     Args:
         motion: Motions' names or files, played one after the other.

@@ -131,7 +131,9 @@ def run(
     asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
     json: Json = False,
 ) -> None:
-    """Play a motion, or live targets, on a robot. Any key, Ctrl-C or SIGTERM stops it within one control period.
+    """Play a motion or live targets on a robot; any key stops it.
+
+    Ctrl-C and SIGTERM do as well, within one control period.
 
     Args:
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.

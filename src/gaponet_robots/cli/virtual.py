@@ -40,7 +40,7 @@ def virtual(
     calibration: Path | None = None,
     frame: float | None = None,
 ) -> None:
-    """Be a VIRTUAL robot behind the real bus until interrupted, for run and record in another terminal.
+    """Be a VIRTUAL robot behind the real bus, for run and record.
 
     Args:
         action: serve.
