@@ -222,7 +222,7 @@ def identify(
         robot: Where to start, if not from the one that the dataset keeps.
         units: Only these, pooled: one set of parameters for all of them; default: every unit not held out.
         holdout_units: Units to leave out, as in training.
-        terms: Of the servo's law; each is kept where validation motions say so.
+        terms: Which terms of the servo's law; each is kept where validation motions say so.
         table: Look for a table under the robot's tips ([[tip]] in robot.toml); kept in the same way.
         shared: Give joints with one type of servo ([[servo]] in robot.toml) one law; what it costs is said.
         threads: 0 for all cores.
@@ -430,8 +430,8 @@ class Calibrated:
     """A robot folder that was fitted to one unit.
 
     Attributes:
-        robot: With the unit's servos; its nominal robot is the given one's.
-        unit: Whose recordings they were.
+        robot: The robot with the unit's servos; its nominal robot is the given one's.
+        unit: The unit whose recordings they were.
         errors: Mean |error| of each whole recording, (recordings,) rad: before, after.
         payload_mass, payload_std: kg in each hand that carries, and its standard error, where it was asked for.
     """

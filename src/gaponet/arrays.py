@@ -34,7 +34,7 @@ def copy_of(x: Any) -> Any:
 
 
 def host(x: Any) -> Array:
-    """As numpy; of a tensor on a GPU a copy."""
+    """The same in numpy; a copy of a tensor on a GPU."""
     return x if isinstance(x, np.ndarray) else x.cpu().numpy()
 
 

@@ -144,8 +144,8 @@ def opened(where: str | Executor, workers: int, threads: int, folder: Path) -> I
     Args:
         where: local; ray or dask, with :ADDRESS of a cluster; submitit, with :KEY=VALUE,… for it; or an executor.
         workers: Jobs at a time; 0 for as many as there are cores.
-        threads: Of one job.
-        folder: Of the user's, seen by all workers, for submitit's files.
+        threads: How many one job takes.
+        folder: A folder of the user's, seen by all workers, for submitit's files.
 
     Raises:
         UsageError: No such executor, or no cluster there.

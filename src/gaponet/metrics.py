@@ -21,8 +21,9 @@ HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
 
 
 def standard_error(values: Array) -> float:
-    """Of the mean of values that belong to motions; nan for a single one. For a difference of methods give their
-    differences motion by motion (paired)."""
+    """The standard error of the mean of values that belong to motions; nan for a single one.
+
+    For a difference of methods give their differences motion by motion (paired)."""
     values = np.asarray(values)
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
 
@@ -85,7 +86,7 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
 
 
 def _recorded(run: Run, columns: list[int] | None) -> list[int] | None:
-    """Of these columns, those that the recording holds."""
+    """Those of these columns that the recording holds."""
     if run.recorded is None:
         return columns
     return [i for i in run.recorded if columns is None or i in columns]

@@ -58,9 +58,9 @@ class RobotSpec:
         timestep: Physics step at that control period, s; dt / timestep is an exact integer.
         damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
             where the MJCF's stands.
-        delay: From command to servo, (n), s.
+        delay: Time from command to servo, (n), s.
         offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
-        zero: Of the encoder: the MJCF's angle is reading + zero, (n), rad.
+        zero: The encoder's: the MJCF's angle is reading + zero, (n), rad.
         stop_low, stop_high: Joint stops that replace the MJCF's range, (n), rad; NaN where the MJCF's stands.
         stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
             is left, rad/s.
@@ -138,7 +138,7 @@ class RobotSpec:
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """With its files: another process may be on a machine that has not this folder."""
+        """The robot with its files: another process may be on a machine that has not this folder."""
         files = [self.mjcf, *self.folder.glob("*.toml")]
         return vars(self) | {"files": {file.name: file.read_bytes() for file in files if file.is_file()}}
 
@@ -319,7 +319,7 @@ def _folder(name_or_path: str | Path) -> Path:
 
 
 def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
-    """Of each joint."""
+    """One number of each joint."""
     known: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
     for joint in table.joint:
         if joint.servo not in known:

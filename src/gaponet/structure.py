@@ -75,7 +75,7 @@ def validated(
         more: Keep fields that a TypedDict does not name, instead of refusing them.
 
     Raises:
-        error: With file, field, what is wrong with it, and the hint.
+        error: The error to raise, with file, field, what is wrong with it, and the hint.
     """
     try:
         text = to_json(data, inf_nan_mode="constants")

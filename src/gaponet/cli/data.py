@@ -161,7 +161,7 @@ def _labels(
         logs: File or folder of logs.
         robot: Robot name or folder.
         out: Folder for logs.toml and labels.csv, which gaponet import LOGS --logs OUT/logs.toml takes.
-        payloads: Those that were in the room, kg.
+        payloads: The masses that were in the room, kg.
         units: How many robots there were.
         rate: Hz, of logs without a clock.
     """

@@ -69,7 +69,7 @@ def identify(
     the robot as it is, nothing is written and the exit status is 2.
 
     Args:
-        terms: Of the servo's law; each is kept where validation motions say so, by more than its standard error.
+        terms: Terms of the servo's law; each is kept where validation motions say so, by more than its standard error.
         details: Say of every joint what these logs do not determine.
     """
     screen = Out(json)

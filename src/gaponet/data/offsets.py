@@ -99,7 +99,7 @@ class UnitOffsets:
         """Fit the offsets of the operated joints.
 
         Args:
-            robot: Whose gains carry the load.
+            robot: The robot whose gains carry the load.
         """
         n = len(robot.joint_names)
         every = Holds.joined(list(holds.values()), n)

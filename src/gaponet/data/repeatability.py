@@ -27,7 +27,7 @@ class _Repeated:
     moved: Array
     """Which joints were commanded to move, (n)."""
     variance: dict[str, Array]
-    """Of each channel over repetitions, averaged over rows, (n)."""
+    """The variance of each channel over repetitions, averaged over rows, (n)."""
 
 
 class Repetitions:
@@ -63,7 +63,7 @@ class Repetitions:
             self._squares[name] = self._squares[name][:rows] + step * (value - self._mean[name])
 
     def result(self) -> _Repeated:
-        """Of two repetitions or more."""
+        """What two repetitions or more say."""
         variance = {c: squares.mean(axis=0) / (self.count - 1) for c, squares in self._squares.items()}
         return _Repeated(self.count, self.others, np.ptp(self._ctrl, axis=0) > MOVED, variance)
 

@@ -139,9 +139,9 @@ class Response:
     """Correlations of one recording in PARTS parts, n joints, at lags of `step` s.
 
     Attributes:
-        own: Of the command with itself, lags 0 … BEFORE + AFTER, (PARTS, n, L).
-        cross: Of the command with the state, so much later: −BEFORE … AFTER, (PARTS, n, L).
-        power: Of the state, (PARTS, n).
+        own: Correlations of the command with itself, lags 0 … BEFORE + AFTER, (PARTS, n, L).
+        cross: Correlations of the command with the state, so much later: −BEFORE … AFTER, (PARTS, n, L).
+        power: The power of the state, (PARTS, n).
         duration: s.
     """
 
@@ -152,14 +152,14 @@ class Response:
     duration: float
 
     def later(self, seconds: float) -> Response:
-        """As if the state had been read so much later; unknown is as it was."""
+        """The same as if the state had been read so much later; what is not known stays so."""
         lags = np.arange(self.cross.shape[-1]) * self.step
         moved = [np.interp(lags - np.nan_to_num(seconds), lags, x) for x in self.cross.reshape(-1, len(lags))]
         return replace(self, cross=np.reshape(moved, self.cross.shape).astype(np.float32))
 
     @classmethod
     def of(cls, ctrl: Array, qpos: Array, dt: float) -> Response:
-        """Of ctrl and qpos (T, n)."""
+        """Correlations of ctrl and qpos (T, n)."""
         every = max(1, round(STEP / dt))
         step = every * dt
         before, lags = round(BEFORE / step), round(BEFORE / step) + round(AFTER / step) + 1
@@ -231,7 +231,7 @@ class _Following:
     Attributes:
         onset: Time after which a joint has made a twentieth of the way, (n) s; NaN where it does not follow, or is
             told to move so smoothly that this is not known.
-        shifts: By how much each part of each recording follows later than all, (recordings, PARTS) s; whole: all parts
+        shifts: How much later each part of each recording follows than all, (recordings, PARTS) s; whole: all parts
             of each together, (recordings).
     """
 

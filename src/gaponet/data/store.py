@@ -84,7 +84,7 @@ class Dataset:
     """A dataset folder opened for reading and appending. Opening reads the journal only, no samples."""
 
     address = ""
-    """Of one that lies in a bucket (share/stream.py): what opens it again."""
+    """What opens one again that lies in a bucket (share/stream.py)."""
 
     def __init__(self, path: str | Path) -> None:
         """Open an existing folder.
@@ -154,7 +154,7 @@ class Dataset:
 
     @contextmanager
     def making_twins(self) -> Iterator[None]:
-        """As `writing`; twins of a folder that can only be read go into a temporary one, and with this object."""
+        """The same as `writing`; twins of a folder that can only be read go into a temporary one, and this object."""
         if not self.read_only:
             with self.writing():
                 yield
@@ -395,7 +395,7 @@ def open_dataset(
     Args:
         dataset: Folder; or the address (s3://, gs://, file://) of one that was pushed, which is read where it lies.
         robot: Another robot than the one that the dataset keeps.
-        run: Whose robot is taken where the dataset keeps none.
+        run: The run whose robot is taken where the dataset keeps none.
 
     Raises:
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.

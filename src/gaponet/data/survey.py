@@ -51,7 +51,7 @@ class Survey:
 
     Attributes:
         samples: Hash of command and state alone, whatever unit or payload they are filed under.
-        rate_hz, jitter_ms, longest_gap_ms: By the state's own timestamps; jitter is the largest deviation from median.
+        rate_hz, jitter_ms, longest_gap_ms: From the state's own timestamps; jitter: the largest deviation from median.
         ctrl_limits, qpos_limits: (n, 2), least and greatest, rad.
         speed: signals.fast_speed of the command, (n), rad/s.
         delay: (n) s, NaN where the motion does not say.
@@ -301,7 +301,7 @@ def _stopped(ctrl: Array, qpos: Array, dt: float) -> Array:
 
 
 def _step(qpos: Array) -> Array:
-    """Of which all positions are multiples but for a constant, where a few dozen numbers are all there are."""
+    """The step of which all positions are multiples but for a constant, where a few dozen numbers are all there are."""
     found = np.zeros(qpos.shape[1])
     for j, column in enumerate(qpos.T):
         levels = np.unique(column.astype(float))

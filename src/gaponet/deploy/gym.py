@@ -91,7 +91,7 @@ def tracking(
         model: Run or artifact that aligns; without one the robot is played as it is.
         motions: Names of motions (gaponet_robots.motion.library); default all.
         payload_mass: kg in each hand.
-        options: Of TrackingEnv.
+        options: What TrackingEnv takes.
     """
     spec = load_robot(robot)
     library = take("PROVIDES", "motions", "a library of motions")(spec, max_payload=payload_mass)

@@ -55,7 +55,7 @@ class Transfer:
         """
         Args:
             reference: How the robot moves.
-            inverse: Of the target, for the same joints.
+            inverse: The target's inverse dynamics, for the same joints.
             conditions: The reference's payloads and the control period.
             locked: Joints that the reference has clamped at home.
             nthread: Threads of the reference, 0 for all cores.

@@ -141,7 +141,7 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
 
 
 def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
-    """By how much each step lowers the error, and its standard error over motions, rad."""
+    """How far each step lowers the error, and its standard error over motions, rad."""
     c = slice(None) if columns is None else columns
     errors = {name: np.array([np.abs(r.error[:, c]).mean() for r in part]) for name, part in done.items()}
     less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}

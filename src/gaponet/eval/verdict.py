@@ -86,7 +86,7 @@ def next_step(methods: Scores, dataset: str, folder: Path | None = None, reporte
     """The command that fits: identify where nothing was identified, export where a network adds nothing, else report.
 
     Args:
-        folder: Of the identified robot, or the run.
+        folder: The identified robot's, or the run's.
         reported: The report is there; a run's model is exported.
     """
     networks = [own for own in methods if own.removeprefix(IDENTIFIED) in LEARNED]

@@ -78,7 +78,7 @@ class Calibration:
             model: Its correction is applied while fitting.
             sequences: Recordings of one unit; windows of 8 s are taken from them evenly.
             unknown_payload: Fit the payload's mass too; all recordings carry the same, whatever they say.
-            progress: As refit's.
+            progress: The same as refit's.
         """
         unit = _one_unit(sequences)
         found = refit(sequences, simulator, seconds, unknown_payload, model.corrector(simulator), progress)

@@ -41,7 +41,7 @@ class FreeRuns:
     """Windows of recordings, n operated joints of a robot; rows in which something may be touched are passed over.
 
     Attributes:
-        window: Of each row that counts, (rows,).
+        window: Which window each row that counts is of, (rows,).
         recorded: Whether a row says something of a joint, (n, rows).
         rows: How many do, of each joint, (n,).
     """

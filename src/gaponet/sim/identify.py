@@ -81,7 +81,7 @@ class Tried:
 
     @property
     def gain(self) -> tuple[float, float]:
-        """By how much the mean fell, and its standard error over motions (paired), rad."""
+        """The fall of the mean, and its standard error over motions (paired), rad."""
         less = self.before - self.after
         return float(less.mean()), standard_error(less)
 
@@ -183,7 +183,7 @@ def identify(
         robot: Where to start from; its payloads' masses are taken as true, its gains where recordings state them.
         validation: Recordings that judge; without them the fitted windows do.
         windows: Free runs of 8 s, taken evenly from the recordings.
-        terms: Of the servo's law, from TERMS, in the order in which they are tried.
+        terms: Which terms of the servo's law, from TERMS, in the order in which they are tried.
         table: Look for a table under the robot's tips.
         shared: In the end give joints with one type of servo (robot.servos) one law.
         nthread: Threads, 0 for all cores.
@@ -321,12 +321,12 @@ class _Limbs:
         self.at = np.array([[*limb, *[-1] * (most - len(limb))] for limb in limbs])  # (limbs, most), -1 for no joint
 
     def pack(self, x: Array) -> Array:
-        """Of joints → of limbs; 0 where a limb has fewer."""
+        """Values of joints → of limbs; 0 where a limb has fewer."""
         padded = np.concatenate([x, np.zeros_like(x[..., :1, :])], axis=-2)[..., self.at, :]
         return padded.reshape(*x.shape[:-2], len(self.at), -1)
 
     def unpack(self, x: Array) -> Array:
-        """Of limbs → of joints."""
+        """Values of limbs → of joints."""
         split = x.reshape(*x.shape[:-2], self.at.size, -1)
         return np.asarray(split[..., np.argsort(self.at.ravel(), kind="stable")[(self.at < 0).sum() :], :])
 
@@ -421,7 +421,7 @@ class Fit:
         self.noise = np.maximum(SOFT * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
 
     def errors(self, values: Values, runs: JointRuns | FreeRuns) -> Array:
-        """Of (k, n) values, (k, n, rows), in SOFT; then, two more, how far kp and armature are from the file's."""
+        """Errors of (k, n) values, (k, n, rows), in SOFT; two more: how far kp and armature are from the file's."""
         if isinstance(runs, JointRuns):
             found = runs.errors(values)
             found = found.reshape(*found.shape[:2], -1)

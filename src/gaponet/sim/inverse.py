@@ -66,7 +66,7 @@ class Inertia:
         self.sparse: Array = batch.bind("M")
 
     def matrix(self, num: int) -> Array:
-        """Of the first num simulations, (num, n, n) kg·m²."""
+        """Mass matrices of the first num simulations, (num, n, n) kg·m²."""
         full = np.zeros((num, self.n, self.n))
         values = self.sparse[:num, self.kept]
         full[:, self.row, self.column] = values
@@ -87,7 +87,7 @@ class ClosedForm:
         """
         Args:
             batch: Simulations to compute in, one per robot.
-            model: Of all of them, whatever they carry.
+            model: The model of all of them, whatever they carry.
             joints: n names.
             nstep, timestep: Physics steps per control period, their length in s; (num,) each.
 
@@ -117,7 +117,7 @@ class ClosedForm:
 
     @classmethod
     def of(cls, sim: BatchSim) -> ClosedForm:
-        """Of the simulator of a batch of robots, which must be a batch of its own."""
+        """Inverse dynamics in a batch of robots, which must be a batch of its own."""
         return cls(sim.batch, next(iter(sim.models.values())), sim.joint_names, sim.nstep, sim.timestep)
 
     def stand(self, data: mujoco.MjData) -> None:

@@ -38,7 +38,7 @@ def descend(
     Args:
         x: S starts of n problems of P parameters, (S, n, P), in units in which a change of one is a large one.
         low, high: Bounds, (n, P).
-        errors: Of candidates.
+        errors: The function that gives the errors of candidates.
         iterations: At most; each tries S·(P + 1 + len(SHARES)) candidates.
         progress: Called after each with the least cost of every problem, (n,).
         out_of_time: Asked before each but the first.
@@ -103,7 +103,7 @@ def step(normal: Array, slope: Array, low: Array, high: Array, damping: Array) -
 
 
 def better_half(x: Array, cost: Array) -> Array:
-    """Of every problem the cheaper half of its starts, (S/2, n, P), the cheapest first."""
+    """The cheaper half of every problem's starts, (S/2, n, P), the cheapest first."""
     order = np.argsort(cost, axis=0)[: max(1, len(x) // 2)]
     return np.take_along_axis(x, order[..., None], axis=0)
 

@@ -169,7 +169,7 @@ class _Problem:
         return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-        """As multistart.slopes, of one start."""
+        """The same as multistart.slopes, for one start."""
         here, count = x[0, 0], len(FIELDS) + self.unknown
         field = np.append(np.tile(np.arange(len(FIELDS)), self.n), [count - 1] * self.unknown).astype(int)
         step = np.where(here + STEP > high[0], -STEP, STEP)

@@ -124,9 +124,9 @@ class ServoLaw:
 
     Attributes:
         values: Name of LAW → (nsim, nu); may be written.
-        frictionloss, bias: Of the model, without what is added here, (nsim, nu) N·m; may be written.
-        torque, load: Of the last physics step, (nsim, nu) N·m: the actuators', and what gravity and Coriolis forces
-            take from them. Together with the batch's own state all that the next step follows from.
+        frictionloss, bias: The model's, without what is added here, (nsim, nu) N·m; may be written.
+        torque, load: The actuators' torque in the last physics step, and what gravity and Coriolis forces take from it,
+            (nsim, nu) N·m. Together with the batch's own state all that the next step follows from.
     """
 
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:

@@ -61,7 +61,7 @@ def share(runs: JointRuns, values: Values, places: list[int], armature: float, t
 
     Args:
         runs: Windows of recordings.
-        values: Of every joint's own fit.
+        values: What every joint's own fit found.
         places: Among the operated joints.
         armature: The one that is thought of, kg·m²: delay and damping can stand for much of it.
         tell: Called with the error of each iteration, a root mean square in rad.

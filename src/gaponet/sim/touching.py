@@ -43,7 +43,7 @@ class Touch:
     """What was found about the table.
 
     Attributes:
-        robot: With the table and the zeros, where they explain the recordings better than none; else without.
+        robot: The robot with the table and the zeros, where they explain the recordings better than none; else without.
         kept: Whether they do.
         before, after: Mean |error| without and with, rad, of the windows, (windows,).
         motions: Motions in which a tip comes near.
@@ -152,7 +152,7 @@ def _searched(scene: _Scene, start: Array, measured: bool, progress: Callable[[f
     high = np.array([start[0] + 0.03 * (not measured), FRICTION[1], STIFFNESS[1], *np.full(n, 5 * ZERO)])
 
     def cost(xs: Array) -> Array:
-        """Of tables and zeros, one to a column."""
+        """Costs of tables and zeros, one to a column."""
         return soft(scene.soft_errors(xs.T)) + PRICE * rows * np.square(xs[3:] / ZERO).sum(axis=0)
 
     def tell(intermediate_result: OptimizeResult) -> None:

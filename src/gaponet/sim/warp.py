@@ -159,7 +159,7 @@ class WarpSim:
         return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else values.dtype)
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
-        """As BatchSim.reset; arrays of any kind."""
+        """The same as BatchSim.reset; arrays of any kind."""
         ids = ids if isinstance(ids, slice) else self.array(ids)
         self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
         self._all["qacc_warmstart"][ids] = 0.0
@@ -189,7 +189,7 @@ class WarpSim:
                     self._all[name][rows] = x
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
-        """As BatchSim.step; all are stepped, and those that should not move are put back."""
+        """The same as BatchSim.step; all are stepped, and those that should not move are put back."""
         torch.clamp(self.array(ctrl), self._low, self._high, out=self.ctrl)
         before = {} if ids is None else self.state()
         for worlds, _ in self._in_turn():
@@ -204,7 +204,7 @@ class WarpSim:
                 x[still] = before[name][still]
 
     def state(self) -> dict[str, Tensor]:
-        """As BatchSim.state."""
+        """The same as BatchSim.state."""
         return {name: x.clone() for name, x in self._state().items()}
 
     def set_state(self, state: dict[str, Any]) -> None:

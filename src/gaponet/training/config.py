@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """Of each joint: r = −min(|Δq| / position, cap)."""
+    """The reward of each joint, r = −min(|Δq| / position, cap)."""
 
     position: Annotated[float, Interval(gt=0, le=1e3)] = 0.01
     """Error that costs 1, rad."""

@@ -251,5 +251,5 @@ def _rows_of(x: Any, rows: Any, out: Any = None) -> Any:
 
 
 def _single(x: Any) -> Any:
-    """As float32."""
+    """The same values as float32."""
     return x.astype(np.float32) if isinstance(x, np.ndarray) else x.float()

@@ -41,7 +41,7 @@ class Kept:
     """Whether PPO began from the untrained network, the warm start having been worse than no correction."""
     sensor_r2: Report | None = None
     learner: StateDict | None = None
-    """Of PPO: its critic and optimisers."""
+    """The state of PPO: its critic and optimisers."""
     env: StateDict | None = None
     """State of PPO's environments."""
     warm: StateDict | None = None

@@ -49,7 +49,7 @@ def rank() -> int:
 
 
 def started() -> int:
-    """As which rank torchrun started this process; 0 where it did not."""
+    """The rank that torchrun gave this process; 0 where it did not start it."""
     return int(os.environ["RANK"]) if dist.is_available() and dist.is_torchelastic_launched() else 0
 
 

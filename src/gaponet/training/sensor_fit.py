@@ -31,8 +31,8 @@ def fit_inputs(
     """Before all training: statistics of the inputs from samples x, (N, dim), and on them the sensor predictor.
 
     Args:
-        net: With no statistics yet.
-        env: Whose simulator is asked.
+        net: One that has no statistics yet.
+        env: The environment whose simulator is asked.
 
     Returns:
         Its R² on held-out states; None for a network without one.

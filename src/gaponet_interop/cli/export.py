@@ -35,7 +35,7 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: Of a robot or of a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
+        to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
             no gaponet; isaaclab; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a run: onnx
             (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for mjlab and
             Isaac Lab). Of a robot, randomization: what to randomise in training.
@@ -46,7 +46,7 @@ def export(
             robot's).
         prefix: What that file has before each joint's name.
         payload_mass: kg in each hand.
-        engine: Whose words the ranges are written in, beside units drawn whole (randomization.json).
+        engine: The engine in whose words the ranges are written, beside units drawn whole (randomization.json).
         scope: today: this robot as it was last fitted. any-day: as sessions on several days found it. any-robot: as
             robots of its type differ.
         units: For any-robot: robot folders of the type.

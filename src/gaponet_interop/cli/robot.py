@@ -99,19 +99,19 @@ def new(
     Args:
         model: MJCF or URDF file, as it lies in its repository.
         out: New robot folder.
-        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with an
-            actuator, or all hinges.
-        operated: Of these, the ones to be corrected; default all.
-        kp: Of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later wins.
-            Default: the model's actuators.
+        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with
+            an actuator, or all hinges.
+        operated: Those of them that are to be corrected; default all.
+        kp: The gain of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later
+            wins. Default: the model's actuators.
         kd: Likewise, N·m·s/rad.
         effort_limit: Likewise, N·m.
         mounts: Where payloads go: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: found by name.
         packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
-        rate: Of the commands, Hz.
+        rate: How many commands a second, Hz.
         keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
         contacts: Let links touch as the model says.
-        name: Of the robot. Default: the file's.
+        name: What the robot is called. Default: the file's name.
     """
     prepare, still = (offered("PROVIDES").get(what) for what in ("OpenGL", "picture of models"))
     if prepare:

@@ -38,7 +38,7 @@ class Understood:
     """What a model and a folder of logs say of themselves.
 
     Attributes:
-        robot: Of the model; of a file with its default joints.
+        robot: The model's robot; a file's with its default joints.
         packaged: What to write after --robot where nothing is to be made; "" for a model file.
         log: The first recording.
         recordings: How many there are.
@@ -53,7 +53,7 @@ class Understood:
 
     @property
     def rate(self) -> float:
-        """Of the commands, Hz; in whole ones where it is near."""
+        """The rate of the commands, Hz; whole where it is near that."""
         rate = 1 / float(np.median(np.diff(self.log.channels["ctrl"].time)))
         return float(round(rate)) if abs(rate - round(rate)) < NEAR * rate else rate
 
@@ -84,8 +84,8 @@ def start(
         out: Folder for all that is made.
         unit_id: Which of its kind.
         payload_mass: kg in each hand while recording.
-        joints: Of the model, those that were recorded, by name or pattern; default those that the logs name.
-        kp: Of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's actuators.
+        joints: Those of the model's joints that were recorded, by name or pattern; default those that the logs name.
+        kp: The gain of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's.
         kd: Likewise, N·m·s/rad.
         effort_limit: Likewise, N·m.
         to: Engine to export to.

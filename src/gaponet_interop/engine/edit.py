@@ -148,7 +148,7 @@ def edit_mjcf(
     Args:
         path: The file.
         out: Folder for the copy.
-        robot: Whose table and payload mounts are put in.
+        robot: The robot whose table and payload mounts are put in.
         joints: Name → numbers of its servo (facts.json); joints that are not operated are changed only where the file
             has no servo for them.
         longest: Name → the longest delay that its servo is to hold, s.

@@ -88,7 +88,7 @@ def export_robot(
         source: For mjcf and urdf, a file of the user's own that is edited in a copy; for mjcf by default the robot's.
         prefix: What that file has before each joint's name.
         payload_mass: In each hand, kg.
-        progress: Of the fit without a law, as in identification.
+        progress: The progress of the fit without a law, as identification's.
 
     Raises:
         RobotError: The file cannot be edited.

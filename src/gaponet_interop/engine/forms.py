@@ -57,7 +57,7 @@ def plain_form(
         robot: Identified; its table, zeros and stops are kept.
         recordings: What it was fitted to, or what it answers itself (`own_motions`).
         windows: Free runs of 8 s, as in identification.
-        progress: As in identification.
+        progress: The same as identification's.
     """
     if not robot.has_law:
         return robot

@@ -84,7 +84,7 @@ def play(model: Any, facts: dict[str, Any], motion: dict[str, Any], prefix: str 
 
     Args:
         model: Compiled; its physics step is stretched to divide the recording's period.
-        facts: Of the export.
+        facts: The export's facts.
         motion: One of check.npz: ctrl, qpos, qvel (T, n), dt.
         prefix: What the model has before each joint's name.
         form: "joints": with the law; "plain": the model as it is.

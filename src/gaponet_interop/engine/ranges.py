@@ -57,7 +57,7 @@ def ranges(
             robots of its type differ.
         others: Robot folders of the type, each identified from its own logs.
         samples: How many units.
-        seed: Of the drawing.
+        seed: What the drawing starts from.
 
     Raises:
         UsageError: What the scope needs is not there; the message says what is missing.

@@ -24,7 +24,7 @@ class Answer:
     """One rollout, (T, n) rad over the operated joints.
 
     Attributes:
-        name: Of the rollout.
+        name: The rollout's.
         dt: s.
         target: What the policy asked for.
         rollout: What its simulator did.
@@ -74,7 +74,7 @@ def answers(robot: RobotSpec, rollouts: ListOf[Sequence], known: Array, drawn: L
 
     Args:
         robot: Identified.
-        rollouts: With the targets as ctrl and the simulator's states.
+        rollouts: Sequences with the targets as ctrl and the simulator's states.
         known: (n,) rad, as of `validation_error`: how far the robot was from its own recordings.
         drawn: Robots that it may be as well (`drawn_robots`); how far they go from it here is added to the band.
     """

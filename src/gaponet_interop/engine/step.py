@@ -100,7 +100,7 @@ def largest_difference(module: Any, model: GapModel, num_envs: int = 3) -> float
     """Largest |module − artifact| on random motions, one environment beginning anew half-way, rad.
 
     Args:
-        module: With reset(ids) and module(qpos, qvel, ctrl, payload_mass) → Δa.
+        module: A module with reset(ids) and module(qpos, qvel, ctrl, payload_mass) → Δa.
     """
     rng = np.random.default_rng(0)
     n, loop, worst = len(model.card["joint_names"]), model.loop(num_envs), 0.0

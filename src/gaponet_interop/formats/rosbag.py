@@ -240,7 +240,7 @@ def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]
 
 
 def _numbers(topic: str, m: Any) -> Fields:
-    """Of any message: its arrays of numbers, and a number of each part where it holds a list of parts."""
+    """Numbers of any message: its arrays of numbers, and a number of each part where it holds a list of parts."""
     found: Fields = {}
     texts: list[tuple[str, ...]] = []
     for name in m.__dataclass_fields__:

@@ -44,7 +44,7 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     Args:
         robot: Loaded by load_robot.
         payloads: kg in every mount.
-        postures: Of the logs, (k, n) rad; default random ones within the joint ranges.
+        postures: Postures from the logs, (k, n) rad; default random ones within the joint ranges.
 
     Raises:
         RobotError: It does not compile.

@@ -38,7 +38,7 @@ def drives(
     given: dict[str, tuple[str, ...]],
     file: str,
 ) -> tuple[Drive, ...]:
-    """Of these hinges; given: kp, kd and effort_limit as the user wrote them.
+    """Drives of these hinges; given: kp, kd and effort_limit as the user wrote them.
 
     Raises:
         UsageError: A word is no number or names no joint, or a joint's kp is said nowhere.

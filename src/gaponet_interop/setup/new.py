@@ -32,11 +32,11 @@ class Wanted:
 
     Attributes:
         joints: That are logged; all others are frozen. None: those with an actuator, or all hinges if none has one.
-        operated: Of these, the ones to correct; none: all.
+        operated: Those of them that are to be corrected; none: all.
         kp, kd, effort_limit: "100", or "*wrist*=20"; the later wins. In N·m/rad, N·m·s/rad, N·m.
         mounts: "hand=BODY" or "hand=BODY:x,y,z", m: where payloads go; none: found by name.
         packages: "NAME=FOLDER" of package://NAME.
-        rate: Of the commands, Hz.
+        rate: How many commands a second, Hz.
         keyframe: At which frozen joints stand, and home; "": the first.
         contacts: Keep geoms that touch, and let them.
     """

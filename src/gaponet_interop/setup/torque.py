@@ -50,7 +50,7 @@ class Driven:
     """What was found of the operated joints, (n,).
 
     Attributes:
-        robot: With armature, damping, friction and delay.
+        robot: The robot with armature, damping, friction and delay.
         constant: N·m in one unit of what was recorded; 1 where that was believed.
         bias: N·m that is left on average: gravity that the file does not know, or the sensor's.
         std: Joint → field → standard error.
@@ -75,7 +75,7 @@ def driven(train: ListOf[Sequence], judging: ListOf[Sequence], robot: RobotSpec,
     Args:
         train: Recordings with torque.
         judging: Others; the same list is taken in parts of PART, which fit and judge in turn.
-        robot: Whose file says inertias and gravity; its payloads are taken as true.
+        robot: The robot whose file says inertias and gravity; its payloads are taken as true.
         constant: The torque's unit is not known, as of a current: fit N·m in one of it.
 
     Raises:

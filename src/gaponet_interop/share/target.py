@@ -36,7 +36,7 @@ class Index:
 
     Attributes:
         contents: Hashes of what it is about: of each sequence of a dataset; of a run's network.
-        files: By their path below the place, with slashes.
+        files: The files by their path below the place, with slashes.
     """
 
     format: int

@@ -45,8 +45,8 @@ def bench(
         out: Folder for datasets, table and figure, with real.
         sets: Only these data sets, with real.
         method: A method of your own, FILE.py:FUNCTION, with real; may be repeated.
-        networks: With real: train networks too, for so many control steps each; 0 for none.
-        adversary: With real, what is done to the recordings that are learned from: labels dealt out anew; late, 40 ms
+        networks: Train networks too, with real, for so many control steps each; 0 for none.
+        adversary: What is done, with real, to the recordings that are learned from: labels dealt out anew; late, 40 ms
             of delay added to one in ten, or to all of them and to those asked (all_late); joints in another order.
         rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
     """

@@ -42,9 +42,9 @@ class Moved:
     """A number of a joint that is another one now.
 
     Attributes:
-        field: Of the servo, or play (rad).
+        field: The servo's field, or play (rad).
         by, error: Change on the axes of eval/knowledge.py and its standard error.
-        moves: By how much that moves the joint along these recordings, RMS, rad.
+        moves: How far that moves the joint along these recordings, RMS, rad.
     """
 
     joint: str
@@ -88,8 +88,8 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
     """Compare recordings with what is known of a robot.
 
     Args:
-        robot: Of the folder that keeps the knowledge.
-        sequences: Of the robot that is said to be the same.
+        robot: The robot of the folder that keeps the knowledge.
+        sequences: Recordings of the robot that is said to be the same.
 
     Raises:
         UsageError: The recordings are too short, or move no joint.

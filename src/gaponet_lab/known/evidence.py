@@ -101,7 +101,7 @@ def inverted(normal: Array) -> Array:
 def evidence(
     robot: RobotSpec, sequences: ListOf[Sequence], fields: ListOf[str], windows: int = WINDOWS, nthread: int = 0
 ) -> Evidence:
-    """Of windows of recordings, every joint on its own beside them, at the robot's own values."""
+    """Free runs of windows of recordings, every joint on its own beside them, at the robot's own values."""
     below = touching_below(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
     runs, bounds = JointRuns(parts, robot, below, nthread), Bounds(robot, sequences)
@@ -137,7 +137,7 @@ def known(
     """What is known of a robot after it was fitted to recordings.
 
     Args:
-        robot: With the fitted values.
+        robot: The robot with the fitted values.
         sequences: Recordings of one robot that it was fitted to.
         judges: Recordings that were not; without any those that were.
         covariances: Joint → fields and their covariance on the axes; where one is not given, recordings and what was

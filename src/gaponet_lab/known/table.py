@@ -40,7 +40,7 @@ class Certainty:
         return self.errors[field] / max(LARGE.get(field, abs(self.values[field])), 1e-9)
 
     def cell(self, field: str) -> str:
-        """As people read it."""
+        """The value as people read it."""
         factor = SHOWN[field][1]
         if self.share(field) > UNKNOWN and self.values[field] == 0:
             return "none seen"

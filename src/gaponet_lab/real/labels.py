@@ -38,9 +38,9 @@ class Labelled:
     """One recording.
 
     Attributes:
-        name: As import calls it.
+        name: The name that import gives it.
         joint, command: The joint that moves, and where to, rad.
-        torque: By row, with the command of it, (k,) N·m and rad; gain times error where none was recorded.
+        torque: Each row's torque, with its command, (k,) N·m and rad; gain times error where none was recorded.
         known: kg, where a file's name says it.
         payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
         copy: The name of a recording with the same samples that came before.
@@ -85,7 +85,7 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
 
     Args:
         logs: Name and recording, one moving joint each.
-        payloads: Those that were in the room, kg.
+        payloads: The masses that were in the room, kg.
         units: How many robots there were.
         gain: Joint → N·m/rad, for recordings without torque.
 

@@ -134,7 +134,7 @@ def floor(question: Question) -> float:
 
 
 def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
-    """Of two recordings: by how much their commands differ in the mean, and how they follow them, rad."""
+    """How far the commands of two recordings differ in the mean, and how far their answers do, rad."""
     for a, first in enumerate(group):
         for second in group[a + 1 :]:
             rows = min(len(first), len(second))

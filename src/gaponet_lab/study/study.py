@@ -96,7 +96,7 @@ class Study:
 
     @property
     def threads(self) -> int:
-        """Of one training."""
+        """The numbers of one training."""
         return self.config.threads or 1
 
     @property

@@ -27,7 +27,7 @@ def portrait(robot: RobotSpec, meta: SequenceMeta, dt: float, qpos: Mapping[str,
     Args:
         robot: Joints that are not operated stand at home.
         dt: Period of the rows, s.
-        qpos: By method, "recorded" among them, (T, n operated) rad.
+        qpos: The positions by method, "recorded" among them, (T, n operated) rad.
 
     Raises:
         UsageError: Nothing can be rendered here; says what is missing.

@@ -25,11 +25,11 @@ def excite(
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
         out: Folder for the motion files and sheet.md.
-        minutes: Of motion in all. 10 identify gains, friction and delay and make a first model, 40 make a good one.
+        minutes: How long all motions are together. 10 identify gains, friction and delay, 40 make a good model.
         payloads: kg in each hand; every motion is played with each.
-        rate: Of the commands, Hz.
+        rate: How many commands a second, Hz.
         format: txt (SAGE, 50 Hz), csv (with time) or npz; gaponet run and record play each.
-        seed: Of the motions.
+        seed: What the drawing of motions starts from.
     """
     from gaponet.files import write_text
     from gaponet.robot import load_robot

@@ -103,8 +103,8 @@ class Driver(Protocol):
         """No position command: joints only brake; where the hardware cannot, they sink as their torque is taken away.
 
         Args:
-            weight: As of `write`; goes to 0.
-            share: Of their torque that joints which cannot brake keep; goes from 1 to 0, or is 0 at once.
+            weight: The same as `write`'s; goes to 0.
+            share: The share of their torque that joints which cannot brake keep; goes from 1 to 0, or is 0 at once.
         """
 
     def confirm(self) -> str:

@@ -26,9 +26,9 @@ class Following:
     def __init__(self, names: tuple[str, ...], dt: float, share: float) -> None:
         """
         Args:
-            names: Of the commanded joints, (n).
+            names: The commanded joints', (n).
             dt: Control period, s.
-            share: Of a stride that a joint must go along; 0: nothing is watched.
+            share: The share of a stride that a joint must go along; 0: nothing is watched.
         """
         self.names, self.dt, self.share = names, dt, share
         self.shown = np.zeros(len(names), bool)

@@ -242,7 +242,7 @@ class Watch:
         Args:
             now: s.
             ctrl: The command that holds since the last period, (len(commanded),) rad; None where there is none.
-            late: By how much this period starts late, s.
+            late: How late this period starts, s.
         """
         fault = (
             self.overrun(late)

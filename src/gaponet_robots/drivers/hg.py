@@ -49,7 +49,7 @@ def flatten(fields: Fields, start: int, padded: bool, prefix: str = "") -> tuple
 
     Args:
         start: Offset at which it begins.
-        padded: As C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
+        padded: Pad as C does (structs begin and end at multiples of 4), else as CDR does (only scalars are aligned).
     """
     out: list[tuple[str, str, int, int]] = []
     at = start

@@ -83,7 +83,7 @@ class SO101Driver:
             calibration: JSON file that LeRobot's calibration wrote; default what the servos hold of it.
             timeout: Longest silence of the bus while replies are awaited, s.
             silent: `connect` opens the port and says nothing: for the guard, because a bus has one speaker.
-            torque_limit: Of each servo, for a driver that does not connect, 0.1 %; default full.
+            torque_limit: The limit of each servo, for a driver that does not connect, 0.1 %; default full.
         """
         if set(robot.joint_names) != set(SPEAK):
             raise UsageError(f"the so101 driver is for the joints {', '.join(SPEAK)}; {robot.name} has others")

@@ -63,7 +63,7 @@ class Collision:
     Attributes:
         checked: Whether there are shapes at all.
         clearance: Free space that a command keeps, m.
-        height: Of the plane, m in the MJCF's world; None without one.
+        height: Where the plane is, m in the MJCF's world; None without one.
     """
 
     def __init__(

@@ -58,7 +58,7 @@ class Feasibility:
     ) -> None:
         """
         Args:
-            height: Of the floor or table, m, instead of what collision.toml says.
+            height: Where the floor or table is, m, instead of what collision.toml says.
             unchecked: Do without shapes.
         """
         self.robot = robot

@@ -31,7 +31,7 @@ class Library:
     ) -> None:
         """
         Args:
-            height: Of the floor or table, m, instead of what collision.toml says.
+            height: Where the floor or table is, m, instead of what collision.toml says.
             unchecked: Do without shapes.
         """
         self.robot = robot

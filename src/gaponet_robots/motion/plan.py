@@ -32,7 +32,7 @@ class Plan:
 
     @property
     def minutes(self) -> float:
-        """Of all payloads together."""
+        """The time of all payloads together."""
         return len(self.payloads) * sum(m.duration for m in self.motions) / 60
 
 

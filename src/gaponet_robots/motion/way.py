@@ -38,7 +38,7 @@ class Way:
 
     @classmethod
     def along(cls, points: Array, speed: float, acceleration: float, least: float) -> Way:
-        """As fast as peaks of speed (rad/s) and acceleration (rad/s²) allow, in at least `least` s."""
+        """The way as fast as peaks of speed (rad/s) and acceleration (rad/s²) allow, in at least `least` s."""
         far = np.abs(np.diff(points, axis=0)).max(axis=1)
         legs = move_time(far, speed, least if len(points) == 2 else LEG)
         legs = np.maximum(legs, np.sqrt(PEAK_ACCELERATION * far / acceleration))

@@ -26,7 +26,7 @@ class RemoteRobot:
 
     Attributes:
         joint_names: All joints of the robot, in the order of every array; known from the first state on.
-        commanded: Those of them that targets may be for.
+        commanded: The ones among them that targets may be for.
         ended: Why the run is over, where it told.
     """
 

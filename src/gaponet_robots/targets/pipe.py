@@ -20,7 +20,7 @@ class PipeWire:
     def __init__(self, descriptor: int | None = None) -> None:
         """
         Args:
-            descriptor: Of a pipe; default standard input.
+            descriptor: A pipe's; default standard input.
 
         Raises:
             UsageError: Standard input is a terminal, where any key stops a run.

@@ -106,8 +106,8 @@ class ROS2Wire:
         Args:
             domain: ROS_DOMAIN_ID.
             interface: Network interface.
-            topic: Of JointTrajectory, with rt/ in front.
-            states: Of JointState, likewise.
+            topic: The topic of JointTrajectory, with rt/ in front.
+            states: The topic of JointState, likewise.
         """
         self.address = f"{topic}, domain {domain}, interface {interface}"
         self._bus = dds.Bus(domain, interface)

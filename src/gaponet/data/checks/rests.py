@@ -47,13 +47,13 @@ class _Rests:
     per_kg: Array
 
     def only(self, keep: Array) -> _Rests:
-        """Those of a mask (k)."""
+        """The rests of a mask (k)."""
         return _Rests(*(values[keep] for values in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Of a joint: the four numbers, their standard errors, scatter (rad), and the numbers without each fold."""
+    """A joint's four numbers, their standard errors, scatter (rad), and the numbers without each fold."""
 
     x: Array
     deviation: Array

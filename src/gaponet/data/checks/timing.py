@@ -81,7 +81,7 @@ def _scatter(away: Array) -> float:
 
 
 def _shifts(own: list[Response]) -> Array:
-    """By how much each recording follows later than all do, (recordings) s: found together with how all follow, since
+    """How much later each recording follows than all do, (recordings) s: found together with how all follow, since
     one that is late bends what is found of the others."""
     more = Response.following(own).whole
     found = np.where(np.isfinite(more), 0.0, np.nan)

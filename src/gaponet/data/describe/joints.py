@@ -14,7 +14,7 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
     """The robot's joint of each name in a log, in the same order; one error for all that it does not have.
 
     Args:
-        names: As the log writes them; /robot/link/joint is reduced to its last part.
+        names: Joint names as the log writes them; /robot/link/joint is reduced to its last part.
         where: File, for the error.
         joint_map: The log's name → the robot's, tried first.
 

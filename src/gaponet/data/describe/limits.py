@@ -28,7 +28,7 @@ def to_radians(name: str, values: Array, joint_names: tuple[str, ...], units: li
         values: (k, n), columns in the order of joint_names.
         joint_names: The robot's own names, (n).
         units: Unit of each joint, (n): rad, deg, or fraction (0..1 of the robot's joint range).
-        robot: Whose joint ranges give a fraction its meaning.
+        robot: The robot whose joint ranges give a fraction its meaning.
     """
     if name not in ("ctrl", "qpos", "qvel") or set(units) == {"rad"}:
         return values

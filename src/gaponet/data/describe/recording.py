@@ -52,7 +52,7 @@ class Recording:
         load: Reads the signals of these names.
         where: What to call the place of the names in errors.
         files: What it was read from, for the hash.
-        first_line: Of its rows in the file.
+        first_line: The line in the file where its rows begin.
         meta: What the format says beside: stated, dt, notes, as in Log.meta.
         default: What of logs.toml this recording itself shows, unless something else is said.
     """
@@ -108,7 +108,7 @@ class Recording:
         """A recording of arrays in memory; those that are not one row of numbers per sample are left alone.
 
         Args:
-            names: Of the columns of arrays that have so many.
+            names: The names of columns, for arrays that have so many.
             name: Default the file's.
             part: Which of several in the file.
             more: meta, default.

@@ -175,7 +175,7 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
     """What a pickle (or an uncompressed or zlib joblib file) holds.
 
     Args:
-        storage: Of a file of torch's: key → the bytes of a storage of tensors, little-endian.
+        storage: The storages of a file of torch's: key → the bytes of a storage of tensors, little-endian.
 
     Raises:
         LogError: It names anything else, is damaged, or too large.

@@ -46,7 +46,7 @@ def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progres
     """Write a dataset in a format of others.
 
     Args:
-        robot: Whose units and home the format may need.
+        robot: The robot, whose units and home the format may need.
         out: New or empty folder; appears when the export is complete.
         to: One of writers().
 

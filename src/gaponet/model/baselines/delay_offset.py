@@ -31,7 +31,7 @@ class DelayOffset:
 
     @classmethod
     def read(cls, run: Path) -> DelayOffset:
-        """As kept in a run folder, in delay_offset.json.
+        """Read the one kept in a run folder, in delay_offset.json.
 
         Raises:
             ModelError: Missing or damaged.

@@ -115,7 +115,7 @@ def play(
         targets: (T, N, n) rad at the robot's control period.
         mass: Payload in each hand, (N,) kg, told to the compensator.
         seeds: Seeds of each row's noise and rest position, (N,).
-        driven: By what; None for the targets as they are.
+        driven: What makes commands of the targets; None for the targets as they are.
         lengths: Rows of each that count, (N,), falling; those that are through stand still.
         progress: Called after each period with the share of all control steps that is done.
     """
