@@ -18,6 +18,7 @@ from gaponet_lab.plot.colours import colour
 from gaponet_lab.plot.style import figure, joint_label, legend, styled
 
 WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
+CORRECTED = 1e-5  # rad; a network that corrects by less draws noise
 
 
 def by_joint(methods: dict[str, Any]) -> Figure:
@@ -114,7 +115,7 @@ def _courses(
     command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
     still = np.ptp(command, axis=0) <= MOVED
     errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
-    learned = [n for n in methods if f"{row}/delta/{n}" in arrays]
+    learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > CORRECTED]
     courses = {}
     for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
         name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")

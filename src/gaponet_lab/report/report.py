@@ -188,7 +188,7 @@ def _trajectories(arrays: dict[str, Array], metrics: dict[str, Any], robot: Robo
     yield element(
         "p", "The 20 s with most motion of each recording, of the joints that move the three with the largest nominal "
         "error. The zoom (shaded above) is where the command turns or stops: there lag and sag are seen. Errors of "
-        "one motion are on one scale; Δa is the learned correction.", css="small",
+        "one motion are on one scale; Δa is a network's correction, where there is any.", css="small",
     )  # fmt: skip
     yield from shown[:OPEN]
     if shown[OPEN:]:
@@ -265,10 +265,9 @@ def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) 
 
 def _facts_line(card: dict[str, Any] | None, metrics: dict[str, Any]) -> list[str]:
     trained = "" if card is None else f"trained {card['hours']:.2f} h of logs, {card['steps']:,} control steps; "
-    gains = "" if card is None else f", kp {', '.join(f'{v:g}' for v in sorted(set(card['kp'])))} N·m/rad"
     return [
         f"{metrics['date']}: {metrics['sequences']} recordings, {len(metrics['motions'])} motions; {trained}simulator ",
-        element("code", metrics["simulator_hash"]), gains,
+        element("code", metrics["simulator_hash"]),
     ]  # fmt: skip
 
 
@@ -293,7 +292,7 @@ def _explained(methods: dict[str, Any]) -> Markup:
 
 
 def _by_joint(methods: dict[str, Any], own: str, metrics: dict[str, Any]) -> Markup:
-    mean, joints = by_group(methods, "joint", _both), methods[own]["by_joint"]
+    mean, joints = by_group(methods, "joint"), methods[own]["by_joint"]
     rows = []
     for joint, *errors in mean.texts():
         moving = metrics["moves"][joint]
