@@ -50,7 +50,7 @@ class Reach:
     unit: str = "4"
     """virtual: number or name in the fleet."""
     fleet: str = "hard"
-    """virtual: hard, easy, shifted, or a .toml file."""
+    """virtual: hard, easy, shifted, unnamed, or a .toml file."""
     hangs: Flag = False
     """unitree: the robot hangs. lowcmd demands it: all motors that are not commanded, legs too, go off."""
     fast: Flag = False

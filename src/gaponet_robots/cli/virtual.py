@@ -48,7 +48,7 @@ def virtual(
         unit: Unit of the fleet: its number or its name.
         payload_mass: kg in each hand named by payload_side.
         payload_side: both, or one hand.
-        fleet: Virtual units: hard, easy, shifted, or a .toml file.
+        fleet: Virtual units: hard, easy, shifted, unnamed, or a .toml file.
         domain: DDS domain.
         interface: Network interface; lo reaches this machine only.
         rate: States per second (DDS).

@@ -29,8 +29,8 @@ UNITS = 4
 DIGITS = 6  # significant, of a saved number
 LATEST = 1.0  # s: a link with a longer delay is none; also of the share of commands that it drops
 LARGEST = 1e6  # of any other parameter; infinity where that is how an effect is switched off
-SIGNED = ("friction_asymmetry", "cable_angle", "cogging_phase", "tilt_roll", "tilt_pitch", "com_x", "com_y", "com_z",
-          "zero_offset", "current_offset")  # fmt: skip
+SIGNED = ("friction_asymmetry", "drag_angle", "grip_x", "grip_z", "cable_angle", "cogging_phase", "tilt_roll",
+          "tilt_pitch", "com_x", "com_y", "com_z", "zero_offset", "current_offset")  # fmt: skip
 Spread = Annotated[float, Interval(ge=0, le=LARGEST)]
 UnitTable = dict[str, Extended | dict[str, dict[str, Extended]]]
 

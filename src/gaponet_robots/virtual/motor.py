@@ -7,12 +7,15 @@ simulator.
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 
+from gaponet.sim.batch import Batch
 from gaponet_robots.virtual.physics import Physics
 
 Array = np.ndarray
 
+DERATED = 40.0  # °C from which a drive takes gain back
 STILL = 1e-3  # rad/s: below this a joint counts as stuck
 KT_TEMPERATURE = 25.0  # °C at which kt_scale holds
 COPPER = 0.00393  # 1/K: resistance of copper, IEC 60028
@@ -79,6 +82,77 @@ def torque_share(physics: Physics, speed: Array) -> Array:
 def cogging_torque(physics: Physics, qpos: Array) -> Array:
     """Torque ripple at joint angles (N, n) rad, N·m."""
     return physics.cogging * np.sin(physics.cogging_count * qpos + physics.cogging_phase)
+
+
+class Couplings:
+    """What one joint does to another, through cables, a limb's supply and the base.
+
+    A cable bundle bent by the joint before (of a limb's first, after) presses on the joint and drags. What the motors
+    of a limb ask for together beyond a budget costs all of them gain. The moving links' weight makes the base lean,
+    after a first-order lag, and what a leaning base feels is gravity from elsewhere.
+    """
+
+    def __init__(self, physics: Physics, model: mujoco.MjModel, batch: Batch, effort: Array) -> None:
+        """batch: Whose gravity is turned; effort: (n) torque limits, N·m."""
+        self.p, self.effort = physics, effort
+        parent = model.dof_parentid
+        after = [next((i for i in range(model.nv) if parent[i] == j), j) for j in range(model.nv)]
+        self.neighbour = np.where(parent >= 0, parent, after)
+        limb = np.cumsum(parent != np.arange(model.nv) - 1) - 1  # a limb begins where a chain branches off
+        self.together = (limb[:, None] == limb).astype(float)
+        self.drags, self.limits = bool((physics.drag > 0).any()), bool((physics.limb_loss > 0).any())
+        self.flexes = bool((physics.flex > 0).any())
+        if self.flexes:
+            self._gravity, self._com = batch.expand("opt.gravity"), batch.bind("subtree_com")
+            self._level, self._weight = self._gravity.copy(), batch.expand("body_subtreemass")
+            self._pull = np.linalg.norm(self._level, axis=1, keepdims=True)
+        self.lean = np.zeros((len(physics.flex), 2))
+
+    def reset(self) -> None:
+        """Stand as the weight at rest leaves it."""
+        if self.flexes:
+            self.flex(np.inf)
+
+    def drag(self, qpos: Array) -> Array:
+        """Friction added at joint angles (N, n) rad, N·m."""
+        return self.p.drag * 0.5 * (1.0 - np.cos(qpos[:, self.neighbour] - self.p.drag_angle))
+
+    def share(self, torque: Array) -> Array:
+        """What the limbs' supplies leave of the gain under motor torques, (N, n)."""
+        asked = (np.abs(torque) / self.effort) @ self.together
+        return 1.0 / (1.0 + self.p.limb_loss * np.maximum(asked - self.p.limb_budget, 0.0))
+
+    def flex(self, h: float) -> None:
+        """Lean on for h s."""
+        moment = self._com[:, 0, :2] * self._weight[:, :1] * self._pull
+        caught_up = -np.expm1(-h / self.p.flex_time)
+        self.lean = self.lean + caught_up * (self.p.flex * moment - self.lean)
+        self._gravity[:] = self._level
+        self._gravity[:, :2] += self.lean * self._pull
+
+
+class Firmware:
+    """Targets in steps, smoothed by a first-order filter that hurries when it has fallen behind."""
+
+    def __init__(self, physics: Physics) -> None:
+        self.p, self.any = physics, bool((physics.smoothing > 0).any() or (physics.target_step > 0).any())
+
+    def reset(self, target: Array) -> None:
+        """Has long been at a target, (N, n) rad."""
+        self.at = target.copy()
+
+    def step(self, target: Array, h: float) -> Array:
+        """The target that the servo follows h s later, (N, n) rad."""
+        step = np.where(self.p.target_step > 0, self.p.target_step, 1.0)
+        lag = np.where(self.p.target_step > 0, np.round(target / step) * step, target) - self.at
+        rate = (1.0 + np.abs(lag) / self.p.smoothing_lag) / np.maximum(self.p.smoothing, 1e-9)
+        self.at = self.at - lag * np.expm1(-h * rate)
+        return self.at
+
+
+def derated(physics: Physics, winding: Array) -> Array:
+    """What a hot drive leaves of the gain at winding temperatures (N, n) °C."""
+    return 1.0 / (1.0 + physics.derating * np.maximum(winding - DERATED, 0.0))
 
 
 class Backlash:

@@ -85,6 +85,26 @@ class Physics:
     # Tilt: the base is not level.
     tilt_roll: Array = field(metadata=_unit("tilt", 0.0, "rad"))
     tilt_pitch: Array = field(metadata=_unit("tilt", 0.0, "rad"))
+    # Drag: friction that a cable bundle adds when the neighbouring joint has bent it away from an angle; at most.
+    drag: Array = field(metadata=_joint("drag", 0.0, "N·m"))
+    drag_angle: Array = field(metadata=_joint("drag", 0.0, "rad"))
+    # Churning: grease that resists with the square of the speed.
+    churning: Array = field(metadata=_joint("churning", 0.0, "N·m·s²/rad²"))
+    # Limb current: gain lost per unit that a limb's torques, each over its limit, sum to beyond a budget.
+    limb_loss: Array = field(metadata=_unit("limb_current", 0.0, "1"))
+    limb_budget: Array = field(metadata=_unit("limb_current", 0.0, "1"))
+    # Derating: gain that the drive takes back per kelvin of its winding above 40 °C.
+    derating: Array = field(metadata=_joint("derating", 0.0, "1/K"))
+    # Firmware: targets are rounded, then smoothed, by a time that falls to half at a lag, and on.
+    target_step: Array = field(metadata=_unit("smoothing", 0.0, "rad"))
+    smoothing: Array = field(metadata=_joint("smoothing", 0.0, "s"))
+    smoothing_lag: Array = field(metadata=_unit("smoothing", 1.0, "rad"))
+    # Flex: how far the base leans for a moment of the moving links' weight, after a while.
+    flex: Array = field(metadata=_unit("flex", 0.0, "rad/(N·m)"))
+    flex_time: Array = field(metadata=_unit("flex", 0.1, "s"))
+    # Grip: the payload's centre beside where the hand should hold it.
+    grip_x: Array = field(metadata=_unit("grip", 0.0, "m"))
+    grip_z: Array = field(metadata=_unit("grip", 0.0, "m"))
     # Links: mass over the published one, and centre of mass beside it.
     mass_scale: Array = field(metadata=_joint("mass", 1.0, "1"))
     com_x: Array = field(metadata=_joint("mass", 0.0, "m"))

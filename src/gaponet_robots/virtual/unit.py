@@ -18,8 +18,11 @@ from gaponet_robots.virtual.motor import (
     Backlash,
     Bristles,
     CommandLink,
+    Couplings,
+    Firmware,
     Thermal,
     cogging_torque,
+    derated,
     friction_limit,
     supply_share,
     torque_share,
@@ -101,6 +104,7 @@ class VirtualRobot:
         self._applied, self._force = b.bind("qfrc_applied"), b.bind("actuator_force")
         self._cogs, self._fast = bool((p.cogging != 0).any()), bool(np.isfinite(p.no_load_speed).any())
         self._thins, self._lags = bool((p.thinning != 0).any()), bool((p.current_time > 0).any())
+        self._churns = bool((p.churning > 0).any())
         self._damping = b.expand("dof_damping")
         self._cold_damping, self._thinned = self._damping.copy(), np.ones((1, 1))
         self._nominal_friction = model.dof_frictionloss.copy()
@@ -113,7 +117,8 @@ class VirtualRobot:
         self.backlash = Backlash(p, model.dof_armature)
         self.bristles = Bristles(p, self._nominal_friction)
         self.thermal = Thermal(p)
-        self.link = CommandLink(p, self.dt)
+        self.link, self.firmware = CommandLink(p, self.dt), Firmware(p)
+        self.couplings = Couplings(p, model, b, self._effort)
         self._supply = np.ones((self.num_envs, 1))
 
     def reset(self, ctrl: Array, seeds: list[int], warmth: Array | float = 0.0, start: Array | None = None) -> None:
@@ -132,7 +137,8 @@ class VirtualRobot:
         self.thermal.reset(np.repeat(warm, len(self.active), axis=1))
         self._idle_temperature = np.repeat(warm, self.n, axis=1)
         self.link.reset(target)
-        self._supply[:] = 1.0
+        self.firmware.reset(target)
+        self._supply[:], self._limb_share = 1.0, np.ones_like(target)
         self._time[:], self._qvel[:], self._warmstart[:] = 0.0, 0.0, 0.0
         self._ctrl[:] = target
         if start is None:
@@ -140,6 +146,7 @@ class VirtualRobot:
         else:
             self._qpos[:] = np.asarray(start)[:, self.active]
         load = self._load()
+        self._limb_share = self.couplings.share(load)
         self._twist = self._compliance * load
         self._ctrl[:] -= self._twist
         self._push, self._passed = np.zeros_like(target), self._motor_torque() * self.thermal.kt()
@@ -168,10 +175,13 @@ class VirtualRobot:
 
     def _settle(self, target: Array) -> None:
         """Where PD and gravity balance, and a little off it: friction keeps a joint where it happened to stop."""
-        stiffness = self._kp * self.thermal.kt()
+        whole = self._kp * self.thermal.kt() * derated(self.physics, self.thermal.winding)
         self._qpos[:] = target
         for _ in range(40):  # contracts by gravity stiffness / kp, 0.4 at worst on H1-2
-            self._qpos[:] = target - self._load() * (1.0 / stiffness + self._compliance)
+            load = self._load()
+            self.couplings.reset()
+            stiffness = whole * self.couplings.share(load)
+            self._qpos[:] = target - load * (1.0 / stiffness + self._compliance)
             np.clip(self._qpos, *self._limits.T, out=self._qpos)
         rest = np.stack([rng.standard_normal(self.n) for rng in self._rng])[:, self.active]
         band = (self._nominal_friction + self.physics.friction) / stiffness
@@ -184,7 +194,8 @@ class VirtualRobot:
 
     def _friction_limit(self, torque: Array) -> Array:
         """What friction can take now, under a motor torque at the joint, (N, active), N·m."""
-        return friction_limit(self.physics, self._nominal_friction, self._qvel, torque, self._push, self._thinned)
+        dry = self._nominal_friction + (self.couplings.drag(self._qpos) if self.couplings.drags else 0.0)
+        return friction_limit(self.physics, dry, self._qvel, torque, self._push, self._thinned)
 
     def _motor_torque(self) -> Array:
         """What the drive asks of the motor at the rated torque constant, (N, active), N·m."""
@@ -192,7 +203,8 @@ class VirtualRobot:
         return np.clip(torque * self._gain_share(), -self._effort, self._effort)
 
     def _gain_share(self) -> Array:
-        return 1.0 + self.physics.supply_gain * (self._supply - 1.0)
+        share = 1.0 + self.physics.supply_gain * (self._supply - 1.0)
+        return share * derated(self.physics, self.thermal.winding) * self._limb_share
 
     def step(self, ctrl: Array, rows: Array | None = None) -> None:
         """Send targets (N, n) rad and let one control period pass; for `rows` (k,) only, where given."""
@@ -212,7 +224,12 @@ class VirtualRobot:
             self._damping[:] = self._cold_damping * self._thinned
         kp, kd, added = self._kp * share, self._kd * share, self._added * share
         for k in range(count):
-            self._ctrl[:] = self.link.read(self._now + k * period) - self._twist
+            target = self.link.read(self._now + k * period)
+            if self.firmware.any:
+                target = self.firmware.step(target, period)
+            if self.couplings.flexes:
+                self.couplings.flex(period)
+            self._ctrl[:] = target - self._twist
             self._laws(kp, kd, added, kt, period)
             self.batch.step(rows, nstep=self.substeps)
             self._push = -self._constraint
@@ -248,18 +265,22 @@ class VirtualRobot:
     def _friction(self, joint_torque: Array, period: float) -> None:
         limit = self._friction_limit(joint_torque)
         ripple = cogging_torque(self.physics, self._qpos) if self._cogs else 0.0
+        if self._churns:
+            ripple = ripple - self.physics.churning * self._qvel * np.abs(self._qvel)
         if self.bristles.any:
             self._applied[:] = ripple - self.bristles.step(limit, self._qvel, period)
             self._frictionloss[:] = np.where(self.bristles.soft, 0.0, limit)
             return
         self._frictionloss[:] = limit
-        if self._cogs:
+        if self._cogs or self._churns:
             self._applied[:] = ripple
 
     def _slow_laws(self, count: int) -> None:
         squares = self._squares / count
         self.thermal.step(squares, self.dt)
         work = np.maximum(self._motor_torque() * self._qvel, 0.0)
+        if self.couplings.limits:
+            self._limb_share = self.couplings.share(self._motor_torque())
         self._supply = supply_share(self.physics, (self.thermal.heat(squares) + work).sum(axis=1, keepdims=True))
 
     def _report(self, rows: Iterable[int]) -> None:
@@ -350,6 +371,8 @@ def _edit(model: mujoco.MjModel, robot: RobotSpec, unit: Physics, locked: tuple[
         model.body_mass[body] *= unit.mass_scale[i]
         model.body_inertia[body] *= unit.mass_scale[i]
         model.body_ipos[body] += (unit.com_x[i], unit.com_y[i], unit.com_z[i])
+    for mount in robot.payload_mounts:
+        model.body(f"payload_{mount.side}").pos += (unit.grip_x[0], 0.0, unit.grip_z[0])
     roll, pitch = float(unit.tilt_roll[0]), float(unit.tilt_pitch[0])
     g = np.linalg.norm(model.opt.gravity)
     if roll or pitch:  # what a level world looks like from a base that leans

@@ -24,7 +24,7 @@ def test_the_saved_units_are_what_the_distributions_and_the_seed_give(name):
             assert np.array_equal(getattr(unit, f.name), getattr(again, f.name)), f.name
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "unnamed"])
 def test_every_number_has_a_source_and_the_file_says_virtual(name):
     table = tomllib.loads((FLEETS / f"{name}.toml").read_text(encoding="utf-8"))
     assert table["virtual"] is True
@@ -38,6 +38,14 @@ def test_units_of_a_type_are_alike_and_not_the_same():
     assert len({tuple(row) for row in kp}) == 4
     between_units, between_joints = kp.std(axis=0).mean(), kp.mean(axis=0).std()
     assert 0.2 * between_joints < between_units < 3 * between_joints
+
+
+def test_four_fifths_of_an_unnamed_cause_are_the_designs():
+    units = list(load_fleet("unnamed", load_robot("h1_2")).units.values())
+    for name in ("drag", "cogging", "churning", "derating", "smoothing", "flex", "grip_z", "limb_loss"):
+        values = np.array([getattr(u, name) for u in units])  # (units, joints)
+        own = np.abs(values - values.mean(axis=0)).mean()
+        assert 0.03 < own / np.abs(values).mean() < 0.25, name
 
 
 def test_the_shifted_fleet_lies_outside_the_easy_one():
@@ -91,7 +99,7 @@ def test_a_fleet_can_be_written_and_read(arm, tmp_path):
 
 def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(
-        UsageError, match=r"no fleet 'lab': in the package are easy, hard, shifted; or give a \.toml file"
+        UsageError, match=r"no fleet 'lab': in the package are easy, hard, shifted, unnamed; or give a \.toml file"
     ):
         load_fleet("lab", arm)
     with pytest.raises(UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"):

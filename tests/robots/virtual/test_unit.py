@@ -245,6 +245,72 @@ def test_a_hot_motor_sags_more(arm):
     assert sag[1] / sag[0] == pytest.approx(1 / 0.9, abs=0.04)
 
 
+def test_a_bent_cable_widens_the_loop_of_its_neighbour(arm):
+    ctrl = hold(0.0) + np.stack([np.zeros(50), 0.3 * np.sin(np.linspace(0, 6 * np.pi, 50))], axis=1)
+    bent, straight = ctrl + np.array([1.2, 0.0]), ctrl
+    behind = []
+    for motion in (straight, bent):
+        path, _ = run(arm, [unit(), unit(drag=0.5)], motion)
+        behind.append(np.abs(path[:, 1, 1] - path[:, 0, 1]).mean())
+    assert behind[0] < 1e-3 < 5e-3 < behind[1]
+
+
+def test_a_limb_whose_motors_ask_for_much_sags_more(arm):
+    path, _ = run(arm, [unit(), unit(limb_loss=1.0)], hold(1.0), 0.2)
+    light, _ = run(arm, [unit(), unit(limb_loss=1.0, limb_budget=10.0)], hold(1.0), 0.2)
+    assert abs(path[-1, 1, 0] - 1.0) > abs(path[-1, 0, 0] - 1.0) + 5e-3
+    assert np.abs(light[-1, 0] - light[-1, 1]).max() < 5e-4  # they came to rest apart
+
+
+def test_a_leaning_base_is_gravity_from_elsewhere(arm):
+    path, robots = run(arm, [unit(), unit(flex=0.02)], hold(1.0), 0.2)
+    gravity = robots.batch.expand("opt.gravity")
+    assert np.array_equal(gravity[0], [0, 0, -9.81])
+    assert 0.01 < np.hypot(*gravity[1, :2]) / 9.81 < 0.2
+    assert np.abs(path[-1, 0] - path[-1, 1]).max() > 1e-3
+
+
+def test_a_payload_beside_the_palm_pulls_with_its_lever(arm):
+    path, _ = run(arm, [unit(), unit(grip_x=0.05)], hold(1.0), 0.2)
+    empty, _ = run(arm, [unit(), unit(grip_x=0.05)], hold(1.0))
+    assert np.abs(path[-1, 0] - path[-1, 1]).max() > 1e-3
+    assert np.abs(empty[-1, 0] - empty[-1, 1]).max() < 5e-4  # they came to rest apart
+
+
+def test_churning_lags_with_the_square_of_the_speed(arm):
+    lag = []
+    for speed in (1.0, 2.0):
+        ramp = np.repeat((speed * 0.02 * np.arange(40))[:, None] - 0.8, 2, axis=1)
+        path, _ = run(arm, [unit(), unit(churning=0.2)], ramp)
+        lag.append((path[-1, 0] - path[-1, 1])[1])
+    assert 3.0 < lag[1] / lag[0] < 5.0
+
+
+def test_firmware_smooths_small_steps_more_than_large_ones(arm):
+    share = []
+    for step in (0.01, 0.4):
+        ctrl = hold(0.0, seconds=0.2)
+        ctrl[1:, 1] = step
+        path, _ = run(arm, [unit(), unit(smoothing=0.05, smoothing_lag=0.05)], ctrl)
+        share.append(((path[:, 0, 1] - path[:, 1, 1]) / step).max())
+    assert share[0] > 1.5 * share[1] > 0
+
+
+def test_targets_come_in_steps(arm):
+    ctrl = hold(0.0) + np.linspace(0, 0.05, 50)[:, None]
+    path, _ = run(arm, [unit(), unit(target_step=0.02)], ctrl)
+    assert 4e-3 < np.abs(path[:, 0, 1] - path[:, 1, 1]).max() < 0.03
+
+
+def test_a_hot_drive_takes_gain_back(arm):
+    robots = VirtualRobot(arm, [unit(derating=0.02)], [(0.2, "both")])
+    sag = []
+    for warmth in (0.0, 45.0):
+        robots.reset(hold(1.0)[:1], [0], warmth)
+        sag.append(abs(1.0 - robots.true_qpos()[0, 0]))
+    assert sag[1] > 1.2 * sag[0] > 0
+
+
 def test_supply_sag_lowers_the_torque_limit(arm):
     far = hold(-1.4, -1.4, 0.06)  # from where it stands: the drive saturates
     units = [unit(), unit(supply_voltage=24.0, supply_resistance=2.0, motor_constant=1.0)]
@@ -307,6 +373,8 @@ def test_every_effect_has_a_switch_that_matters(arm, effect):
     if effect in ("presliding", "thinning", "compliance", "current_loop", "torque_speed"):  # not in that fleet
         physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
         physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
+    if effect in ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip"):
+        physics = load_fleet("unnamed", arm).unit("virtual-1").only([effect, "thermal"])
     if effect == "stribeck":
         physics = replace(physics, friction=np.full(2, 0.5))
     if effect == "backlash":

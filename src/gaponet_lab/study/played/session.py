@@ -37,7 +37,7 @@ class Playing:
     unit: str = ""
     """Unit of the fleet that plays; by default one that no model was trained on."""
     fleet: str = ""
-    """Virtual units: hard, easy, shifted, or a .toml file; by default the fleet that was recorded."""
+    """Virtual units: hard, easy, shifted, unnamed, or a .toml file; by default the fleet that was recorded."""
     payloads: tuple[float, ...] = ()
     """kg in each hand; default those trained on, with --quick the lightest and the heaviest of them."""
 
