@@ -47,7 +47,8 @@ live: setup
 peers: setup
 	$(BIN)/python -m pytest -m peers -s tests/robots/control
 
-# mjlab, MJX, Newton and MuJoCo (environments of their own in ~/.cache/gaponet, some GB) play exports beside ours: minutes.
+# MuJoCo, MJX, mjlab, Isaac Lab and Newton (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
+# and mjlab and Isaac Lab train in one: half an hour.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/interop/engine
 

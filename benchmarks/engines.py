@@ -3,28 +3,56 @@
     make engines                                         # once: environments of their own in ~/.cache/gaponet
     python benchmarks/engines.py ROBOT WORK [--data DATASET]
 
-Exports the robot for MuJoCo, MJX, mjlab and Newton, once fitted without its law, and runs the check.py beside each
-export in that engine's environment, without gaponet. Prints a row per engine: mean |error| on the validation motions
-that travel (five of 30 s at most), there and in gaponet, and what the export says that it leaves out.
+Exports the robot for MuJoCo, MJX, mjlab, Isaac Lab and Newton, once fitted without its law, and runs the check.py
+beside each export in that engine's environment, without gaponet. Prints a row per engine: mean |error| on the
+validation motions that travel (five of 30 s at most), there and in gaponet, and what the export says that it leaves
+out. What is found in WORK is kept.
 """
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
+import time
 from pathlib import Path
 
 import tyro
 
-from gaponet.robot import load_robot
+from gaponet.files import write_text
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import save_robot
 from gaponet_interop.engine import folder as exporting
 from gaponet_interop.engine.forms import plain_form, recordings_of
 
 CACHE = Path.home() / ".cache" / "gaponet"
-CHECKS = {  # environment → export, check
-    "mujoco": ("mjcf", "check.py"), "mjx": ("mjcf", "check_mjx.py"),
-    "mjlab-1.6": ("mjlab", "check.py"), "newton": ("newton", "check.py"),
+CHECKS = {  # environment → export, check, what runs in it
+    "mujoco": ("mjcf", "check.py", "mujoco"), "mjx": ("mjcf", "check_mjx.py", "mujoco-mjx"),
+    "mjlab-1.6": ("mjlab", "check.py", "mjlab"), "isaaclab-3": ("isaaclab", "check.py", "isaaclab"),
+    "newton": ("newton", "check.py", "newton"),
 }  # fmt: skip
+VERSION = "import sys, importlib.metadata as m; print(m.version(sys.argv[1]))"
+
+
+def nearest(robot: RobotSpec, train: list, folder: Path) -> RobotSpec:
+    """The robot fitted without its law, once."""
+    if not (folder / "robot.toml").is_file():
+        save_robot(plain_form(robot, train), folder)
+    return load_robot(folder)
+
+
+def checked(python: Path, check: str, package: str, folder: Path) -> dict[str, str | float]:
+    """What a check prints, and how long it took, once."""
+    kept = folder / f"{python.parents[1].name}.json"
+    if not kept.is_file():
+        start = time.monotonic()
+        version = subprocess.run([python, "-c", VERSION, package], capture_output=True, text=True, check=True).stdout
+        done = subprocess.run([python, check], cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            return {"said": "", "failed": done.stderr.strip()[-200:], "version": version.strip(), "s": 0.0}
+        seconds = round(time.monotonic() - start)
+        write_text(kept, json.dumps({"said": done.stdout, "version": version.strip(), "s": seconds}))
+    return json.loads(kept.read_text())
 
 
 def main(
@@ -44,18 +72,23 @@ def main(
     spec, recordings = load_robot(robot), recordings_of(robot, data, load_robot(robot))
     assert recordings is not None, "no recordings: give --data"
     mass = min(s.meta.payload_mass for s in recordings[1])
-    plain = plain_form(spec, recordings[0])
+    plain = nearest(spec, recordings[0], work / "plain")
     exporting.plain_form = lambda *_, **__: plain  # type: ignore[assignment]
-    print("| engine | form | there, mrad | in gaponet | left out |\n| --- | --- | ---: | ---: | --- |")
-    for to in dict.fromkeys(to for to, _ in CHECKS.values()):
-        made = exporting.export_robot(spec, to, work / to, recordings, payload_mass=mass)
-        for name, (_, check) in ((n, c) for n, c in CHECKS.items() if c[0] == to):
-            python = environments / name / "bin" / "python"
-            done = subprocess.run([python, check], cwd=work / to, capture_output=True, text=True)
-            found = re.findall(r"^(.*?): ([\d.]+) mrad; in gaponet ([\d.]+)", done.stdout, re.MULTILINE)
-            for form, there, here in found or [(done.stderr.strip()[-200:], "–", "–")]:
-                notes = [note.split(":")[0] for note in made.notes if "met something" not in note]
-                print(f"| {name} | {form} | {there} | {here} | {'; '.join(notes)} |", flush=True)
+    print("| engine | form | there, mrad | in gaponet | s | left out |\n| --- | --- | ---: | ---: | ---: | --- |")
+    for to in dict.fromkeys(to for to, *_ in CHECKS.values()):
+        notes_file = work / f"{to}.json"
+        if not notes_file.is_file():
+            made = exporting.export_robot(spec, to, work / to, recordings, payload_mass=mass)
+            write_text(notes_file, json.dumps({"left": made.left, "notes": made.notes}))
+        notes = [n for n in json.loads(notes_file.read_text())["notes"] if "met something" not in n]
+        for name, (_, check, package) in ((n, c) for n, c in CHECKS.items() if c[0] == to):
+            got = checked(environments / name / "bin" / "python", check, package, work / to)
+            found = re.findall(r"^(.*?): ([\d.]+) mrad; in gaponet ([\d.]+)", got["said"], re.MULTILINE)
+            for form, there, here in found or [(got.get("failed", got["said"][-200:]), "–", "–")]:
+                left_out = "; ".join(note.split(":")[0] for note in notes)
+                print(
+                    f"| {package} {got['version']} | {form} | {there} | {here} | {got['s']} | {left_out} |", flush=True
+                )
 
 
 if __name__ == "__main__":

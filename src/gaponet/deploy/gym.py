@@ -81,9 +81,75 @@ class TrackingEnv(gymnasium.Env):
         return np.concatenate([q, self.sim.qvel[op], *ahead]).astype(np.float32)
 
 
-def tracking(
-    robot: str, model: str | None = None, motions: ListOf[str] = (), payload_mass: float = 0.0, **options: Any
-) -> TrackingEnv:
+class TrackingVectorEnv(gymnasium.vector.VectorEnv):
+    """TrackingEnv in all worlds of one AlignedSim; a world whose motion has ended begins another in its next step."""
+
+    metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
+    ) -> None:
+        """As TrackingEnv; the simulator has any number of worlds."""
+        if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
+            raise UsageError(f"TrackingVectorEnv needs motions (T, {sim.n}) of at least 3 rows")
+        self.sim, self.reach, self.preview, self.num_envs = sim, reach, preview, sim.num_envs
+        self.last = np.array([len(r) - 1 for r in references])
+        rows = np.minimum(np.arange(self.last.max() + 1), self.last[:, None])
+        self.references = np.stack([r[row] for r, row in zip(references, rows, strict=True)])  # (motions, T, n)
+        n, batch = len(sim.op), gymnasium.vector.utils.batch_space
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, ((2 + preview) * n,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (n,), np.float32)
+        self.observation_space, self.action_space = (
+            batch(space, self.num_envs) for space in (self.single_observation_space, self.single_action_space)
+        )
+        self.motion, self.t = np.zeros((2, self.num_envs), int)
+        self.ended = np.zeros(self.num_envs, bool)
+        self.np_random = np.random.default_rng(seed)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+        """A motion for each world from its first row; options may name them: {"motion": 3}, or one for each world."""
+        super().reset(seed=seed)
+        self._begin(np.ones(self.num_envs, bool), (options or {}).get("motion"))
+        return self._observe(), {"motion": self.motion.copy()}
+
+    def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
+        """Step one control period; worlds that ended with the last one begin anew instead, and are rewarded 0."""
+        op, fresh = self.sim.op, self.ended
+        target = self._row(1).copy()
+        target[:, op] += self.reach * np.clip(actions, -1.0, 1.0)
+        self.sim.step(target[0] if self.sim.single else target)
+        self.t += 1
+        if fresh.any():
+            self._begin(fresh)
+        qpos = np.atleast_2d(self.sim.qpos)
+        error = np.where(fresh[:, None], 0.0, qpos[:, op] - self._row(0)[:, op])
+        self.ended = ~fresh & (self.t >= self.last[self.motion] - 1)
+        return self._observe(), -(error**2).mean(1) / 0.01, np.zeros_like(fresh), self.ended, {"error": error}
+
+    def _begin(self, worlds: Array, motion: Any = None) -> None:
+        ids = np.flatnonzero(worlds)
+        self.motion[ids] = self.np_random.integers(len(self.last), size=len(ids)) if motion is None else motion
+        self.t[ids], self.ended = 0, self.ended & ~worlds
+        start = self._row(0)[ids]
+        self.sim.reset(start[0] if self.sim.single else start, ids=ids)
+
+    def _row(self, ahead: int) -> Array:
+        return self.references[self.motion, np.minimum(self.t + ahead, self.last[self.motion])]
+
+    def _observe(self) -> Array:
+        op, (q, v) = self.sim.op, map(np.atleast_2d, (self.sim.qpos, self.sim.qvel))
+        ahead = [self._row(k)[:, op] - q[:, op] for k in range(1, self.preview + 1)]
+        return np.concatenate([q[:, op], v[:, op], *ahead], axis=1).astype(np.float32)
+
+
+def _tracking(
+    robot: str,
+    model: str | None = None,
+    motions: ListOf[str] = (),
+    payload_mass: float = 0.0,
+    num_envs: int | None = None,
+    **options: Any,
+) -> TrackingEnv | TrackingVectorEnv:
     """gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
 
     Args:
@@ -91,16 +157,20 @@ def tracking(
         model: Run or artifact that aligns; without one the robot is played as it is.
         motions: Names of motions (gaponet_robots.motion.library); default all.
         payload_mass: kg in each hand.
+        num_envs: Worlds of gymnasium.make_vec; None for one environment.
         options: What TrackingEnv takes.
     """
     spec = load_robot(robot)
     library = take("PROVIDES", "motions", "a library of motions")(spec, max_payload=payload_mass)
     references = [library.make(name).sample(spec.dt) for name in motions or library.names()]
     network = None if model is None else GapModel.load(model)
-    return TrackingEnv(AlignedSim(spec, network, payload_mass), references, **options)
+    kind = TrackingEnv if num_envs is None else TrackingVectorEnv
+    return kind(AlignedSim(spec, network, payload_mass, num_envs=num_envs), references, **options)
 
 
-gymnasium.register("gaponet/Tracking-v0", entry_point="gaponet.deploy.gym:tracking")
+gymnasium.register(
+    "gaponet/Tracking-v0", entry_point="gaponet.deploy.gym:_tracking", vector_entry_point="gaponet.deploy.gym:_tracking"
+)
 
 
 class AlignedActions(gymnasium.Wrapper):

@@ -333,6 +333,8 @@ def _isaaclab_term() -> Any:
             self.align(self._asset, self._joint_ids, self._joint_names, offset=1.0, form=_isaaclab_form(facts))
             servos = facts[_isaaclab_form(facts)]
             self.late([servos[name]["delay"] for name in self._joint_names], env.physics_dt)
+            if len(self.share) > 1 and getattr(env, "_physics_handles_decimation", False):
+                raise ValueError("servos are late by parts of a control period: cfg.sim.use_newton_actuators = False")
 
     return IsaacLabTerm
 

@@ -142,7 +142,7 @@ def edit_mjcf(
     longest: dict[str, float],
     prefix: str = "",
     payload_mass: float = 0.0,
-) -> tuple[Path, str]:
+) -> tuple[Path, str, tuple[str, ...]]:
     """Write a copy of an MJCF and of all its files, with the servos of a robot.
 
     Args:
@@ -156,14 +156,14 @@ def edit_mjcf(
         payload_mass: In each hand, kg.
 
     Returns:
-        The copied main file, and what was changed as a unified diff.
+        The copied main file, what was changed as a unified diff, and joints whose targets were not in rad.
 
     Raises:
         RobotError: A joint is not in the text, has several servos, or the result does not compile to what was wanted.
     """
     path = path.resolve()
     before = compiled(spec := read_mjcf(path), path)
-    source, added = Source(path), list[str]()
+    source, added, other = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
         full = prefix + name
         tag = source.one(f"joints '{full}'", partial(_is_joint, name=full))
@@ -184,6 +184,7 @@ def edit_mjcf(
         samples = math.ceil(longest[name] / before.opt.timestep - 1e-9) + 2 if longest[name] else 0
         if drives is not None:
             source.replace(drives, _servo(servo, samples, _kept(drives, before, full)))
+            other += [full] * (abs(_radians(before, full) - 1) > 1e-3)
         else:
             source.append("actuator", f"    {_servo(servo, samples, {'name': full, 'joint': full})}\n")
             added.append(text_of(servo["home"]))
@@ -193,7 +194,7 @@ def edit_mjcf(
     _surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
     _require(compiled(read_mjcf(target), target), before, joints, robot, prefix, target)
-    return target, difference(source)
+    return target, difference(source), tuple(other)
 
 
 def _is_joint(tag: Tag, name: str) -> bool:
@@ -222,8 +223,16 @@ def _kept(tag: Tag, model: mujoco.MjModel, joint: str) -> dict[str, str]:
     kept = {k: tag.attributes[k] for k in KEPT_OF_SERVO if k in tag.attributes} | {"joint": joint}
     i = int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
     if model.actuator_ctrllimited[i] and model.actuator_biasprm[i, 1]:
-        return kept | {"ctrllimited": "true", "ctrlrange": text_of(*model.actuator_ctrlrange[i])}
+        limits = sorted(_radians(model, joint) * model.actuator_ctrlrange[i])
+        return kept | {"ctrllimited": "true", "ctrlrange": text_of(*limits)}
     return kept | {"ctrllimited": "false"}
+
+
+def _radians(model: mujoco.MjModel, joint: str) -> float:
+    """Where a servo aims at a target of 1, rad: 0.0175 where it takes degrees; 1 where it takes no targets."""
+    i = int(np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(joint).id)[0])
+    stiffness = -float(model.actuator_biasprm[i, 1] * model.actuator_gear[i, 0])
+    return float(model.actuator_gainprm[i, 0]) / stiffness if stiffness > 0 else 1.0
 
 
 def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: float, model: mujoco.MjModel) -> None:

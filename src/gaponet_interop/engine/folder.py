@@ -34,6 +34,7 @@ ENGINES = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
 CHECKS = {
     "mjcf": {"check.py": "mjcf.py", "check_mjx.py": "mjx.py"},
     "mjlab": {"check.py": "mjlab.py"},
+    "isaaclab": {"check.py": "isaaclab.py"},
     "newton": {"check.py": "newton.py"},
 }
 OURS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
@@ -109,10 +110,12 @@ def export_robot(
     if robot.has_law:
         prices["in gaponet, fitted without the law"] = left(judging, plain)
     file = None
+    other: tuple[str, ...] = ()
     with writing(out, KIND):
         if to == "mjcf":
             longest = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
-            file, changes = edit_mjcf(source or robot.mjcf, out, plain, facts["plain"], longest, prefix, payload_mass)
+            mine = source or robot.mjcf
+            file, changes, other = edit_mjcf(mine, out, plain, facts["plain"], longest, prefix, payload_mass)
             facts["file"] = str(file.relative_to(out))
             write_text(out / "changes.diff", changes)
             for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
@@ -132,7 +135,12 @@ def export_robot(
         _write_motions(out / CHECK, motions)
         _ship(out, to)
         write_text(out / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
-    return Exported(file, prices, len(judging), judging[0].meta.virtual, _notes(robot, facts, to))
+    notes = _notes(robot, facts, to)
+    if other:
+        notes += (
+            f"targets of {', '.join(other)} were not in rad before (degrees?): now they are; ctrl of keyframes not",
+        )
+    return Exported(file, prices, len(judging), judging[0].meta.virtual, notes)
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:

@@ -113,6 +113,37 @@ def motions(path: str | Path) -> list[dict[str, Any]]:
     return [{name: held[f"{name}_{i}"] for name in ("ctrl", "qpos", "qvel", "dt")} for i in range(int(held["count"]))]
 
 
+class Turns:
+    """Motions one after the other in a few worlds, so that worlds begin anew while others go on.
+
+    Attributes:
+        ctrl: (T, worlds, n) rad; where a world has no motion left its last command stands.
+        begins: Period → motion that each of some worlds begins there.
+    """
+
+    def __init__(self, motions: list[dict[str, Any]], worlds: int = 3) -> None:
+        self.motions, self.worlds = motions, min(worlds, len(motions))
+        free, played, self.begins = [0] * self.worlds, [], dict[int, dict[int, int]]()
+        for i, motion in enumerate(motions):
+            world = int(np.argmin(free))
+            played.append((free[world], world))
+            self.begins.setdefault(free[world], {})[world] = i
+            free[world] += len(motion["ctrl"]) - 1
+        self.played = played
+        self.ctrl = np.zeros((max(free), self.worlds, motions[0]["ctrl"].shape[1]))
+        for (row, world), motion in zip(played, motions, strict=True):
+            self.ctrl[row:, world] = motion["ctrl"][-1]
+            self.ctrl[row : row + len(motion["ctrl"]) - 1, world] = motion["ctrl"][:-1]
+
+    def error(self, found: Any, columns: list[int]) -> float:
+        """Mean |error| over the motions, rad; found: joints after each period, (T, worlds, n) rad."""
+        errors = []
+        for (row, world), motion in zip(self.played, self.motions, strict=True):
+            qpos = motion["qpos"][1:]
+            errors.append(np.abs(np.asarray(found)[row : row + len(qpos), world] - qpos)[:, columns].mean())
+        return float(np.mean(errors))
+
+
 def delay_weights(delay: Any, step: float) -> Any:
     """For engines whose actuators have no delay: the share of the last physics steps' commands in what servos are told.
 

@@ -1,5 +1,7 @@
 """In an environment with mjlab: play targets on an export under its action term, and hand back what happened.
 
+Two of the robot stand in one scene; the other one is told the targets of another world, its joints in another order.
+
 python mjlab_peer.py EXPORT IN.npz OUT.npz     # IN: test_mjlab.py writes it
 """
 
@@ -30,14 +32,18 @@ def environment(folder: str, num_envs: int, start: torch.Tensor, names: list[str
     options, decimation = gaponet.mjlab_options(folder)
 
     def begin(env, env_ids):
-        robot = env.scene["robot"]
-        order = [names.index(name) for name in robot.joint_names]
-        robot.write_joint_state_to_sim(start[env_ids][:, order], 0.0 * start[env_ids], env_ids=env_ids)
+        for name, where in (("robot", start), ("other", start.roll(2, 0))):
+            robot = env.scene[name]
+            order = [names.index(name) for name in robot.joint_names]
+            robot.write_joint_state_to_sim(where[env_ids][:, order], 0.0 * where[env_ids], env_ids=env_ids)
 
     cfg = ManagerBasedRlEnvCfg(
         decimation=decimation,
-        scene=SceneCfg(num_envs=num_envs, entities={"robot": gaponet.mjlab_entity(folder)}),
-        actions={"joint_pos": gaponet.mjlab_action(folder, entity_name="robot", actuator_names=tuple(reversed(names)))},
+        scene=SceneCfg(num_envs=num_envs, entities={name: gaponet.mjlab_entity(folder) for name in ("robot", "other")}),
+        actions={
+            "joint_pos": gaponet.mjlab_action(folder, entity_name="robot", actuator_names=tuple(reversed(names))),
+            "other": gaponet.mjlab_action(folder, entity_name="other", actuator_names=tuple(sorted(names))),
+        },
         events={"begin": EventTermCfg(func=begin, mode="reset")},
         sim=SimulationCfg(mujoco=options),
     )
@@ -71,18 +77,22 @@ def main(folder: str, given: str, out: str) -> None:
     env = environment(folder, targets.shape[1], start[0], names)
     env.reset()
     simulated = fields(env)  # a servo's law changes them from step to step
-    term, robot = env.action_manager.get_term("joint_pos"), env.scene["robot"]
-    asked = [names.index(name) for name in term.target_names]
+    robot, other = env.scene["robot"], env.scene["other"]
+    asked, theirs = (
+        [names.index(name) for name in env.action_manager.get_term(term).target_names]
+        for term in ("joint_pos", "other")
+    )
     order = [list(robot.joint_names).index(name) for name in names]
-    qpos, sent = [], []
+    qpos, sent, beside = [], [], []
     for t, target in enumerate(targets):
         if t == int(data["reset_at"]):
             start[0] = start[1]  # what `begin` writes
             env.reset(env_ids=torch.from_numpy(data["reset_ids"]))
-        env.step(target[:, asked])
+        env.step(torch.cat([target[:, asked], target.roll(2, 0)[:, theirs]], dim=1))
+        beside.append(other.data.joint_pos[:, order].roll(-2, 0).clone())
         qpos.append(robot.data.joint_pos[:, order].clone())
         sent.append(robot.data.joint_pos_target[:, order].clone())
-    np.savez(out, qpos=torch.stack(qpos), sent=torch.stack(sent), **simulated)
+    np.savez(out, qpos=torch.stack(qpos), beside=torch.stack(beside), sent=torch.stack(sent), **simulated)
 
 
 if __name__ == "__main__":

@@ -114,6 +114,8 @@ def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawf
     assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx([-80 * 180 / np.pi, 80 * 180 / np.pi])
     assert now.actuator_gear[1, 0] == 2
     assert now.sensor_type.tolist() == before.sensor_type.tolist()
+    assert now.site("tip").pos.tolist() == before.site("tip").pos.tolist()
+    assert (now.nsite, now.ntendon, now.nmesh) == (before.nsite, before.ntendon, before.nmesh) == (1, 1, 1)
     assert now.qpos0[now.joint("shoulder").qposadr[0]] == pytest.approx(-0.01)
     text = made.file.read_text() + (tmp_path / "out/parts/arm.xml").read_text()
     assert "<!-- mine -->" in text
@@ -145,6 +147,22 @@ def test_an_engine_that_steps_twice_as_long_keeps_delays_and_tells_its_price(rob
     assert model.opt.timestep == 0.01
     assert model.actuator_delay.tolist() == [0.013, 0.0, 0.006]
     assert 2e-5 < made.left["scene.xml alone"] < 0.002
+
+
+def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_on(
+    robot, lawful, mine, tmp_path, quick
+):
+    degrees = 'gainprm="0.42" biasprm="0 -24 -0.5" biastype="affine" gear="1" ctrlrange="-90 90"'
+    plain = '<general name="second" joint="elbow"/>'
+    mine.write_text(mine.read_text().replace(plain, f"{plain[:-2]} {degrees}/>"))
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
+    servo = mujoco.MjModel.from_xml_path(str(made.file)).actuator("second")
+    assert servo.gainprm[0] == 24.0
+    assert servo.biasprm[:2].tolist() == [0.0, -24.0]
+    assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
+    assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
+    assert made.left["scene.xml with servo_law.py"] < 2e-5
+    assert f'-    <general name="second" joint="elbow" {degrees}/>' in (tmp_path / "out/changes.diff").read_text()
 
 
 def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(robot, lawful, tmp_path, quick):

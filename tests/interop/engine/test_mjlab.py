@@ -68,6 +68,7 @@ def compare(python: str, model: GapModel, payload_mass: float, folder: Path, wha
     subprocess.run([python, peer, *(str(folder / name) for name in ("torch", "in.npz", "out.npz"))], check=True)
     there = dict(np.load(folder / "out.npz"))
     apart, corrected = np.abs(there.pop("qpos") - own["qpos"]), model.simulator().operated_index
+    beside = np.abs(there.pop("beside") - own["qpos"]).max()
     sent = np.abs(there.pop("sent") - own["sent"]).max()
     moved = np.abs(own["sent"] - own["targets"])[..., corrected].mean()
     compiled = build_model(model.simulator(), payload_mass)
@@ -76,6 +77,7 @@ def compare(python: str, model: GapModel, payload_mass: float, folder: Path, wha
     print(f"over {PERIODS} periods of {WORLDS} worlds (targets {sent:.1e}); of {len(there)} fields {len(other)} differ")
     assert moved > 1e-4
     assert apart.max() < TOLERANCE
+    assert beside < TOLERANCE  # the other robot of the scene
     assert len(there) > 400
     assert other == []
 

@@ -9,39 +9,50 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-from gaponet_interop.engine.mujoco_servos import delay_weights, motions, read
+from gaponet_interop.engine.mujoco_servos import Turns, delay_weights, motions, read
 
 jax.config.update("jax_enable_x64", True)  # in single precision friction does not hold as it should
 HERE = Path(__file__).parent
-facts, errors = read(HERE / "facts.json"), []
-names = [facts["prefix"] + name for name in facts["plain"]]
-columns = [list(facts["plain"]).index(name) for name in facts["corrected"]]
-for motion in motions(HERE / "check.npz"):
-    spec = mujoco.MjSpec.from_file(str(HERE / facts["file"]))
-    for servo in spec.actuators:
-        servo.delay = servo.nsample = 0
-    model, dt = spec.compile(), float(motion["dt"])
-    steps = round(dt / model.opt.timestep)
-    model.opt.timestep = dt / steps
-    at = np.array([model.joint(name).qposadr[0] for name in names])
-    dof = np.array([model.joint(name).dofadr[0] for name in names])
-    servo = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(name).id)[0] for name in names])
-    weights = jp.array(delay_weights([joint["delay"] for joint in facts["plain"].values()], model.opt.timestep))
-    device = mjx.put_model(model)
-    data = mjx.make_data(model)
-    data = data.replace(qpos=data.qpos.at[at].set(motion["qpos"][0]), qvel=data.qvel.at[dof].set(motion["qvel"][0]))
+facts, played = read(HERE / "facts.json"), motions(HERE / "check.npz")
+names, turns = [facts["prefix"] + name for name in facts["plain"]], Turns(played)
+spec = mujoco.MjSpec.from_file(str(HERE / facts["file"]))
+for servo in spec.actuators:
+    servo.delay = servo.nsample = 0
+model, dt = spec.compile(), float(np.median([m["dt"] for m in played]))
+steps = round(dt / model.opt.timestep)
+model.opt.timestep = dt / steps
+at = np.array([model.joint(name).qposadr[0] for name in names])
+dof = np.array([model.joint(name).dofadr[0] for name in names])
+servo = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == model.joint(name).id)[0] for name in names])
+weights = jp.array(delay_weights([joint["delay"] for joint in facts["plain"].values()], model.opt.timestep))
+device = mjx.put_model(model)
+home = mjx.make_data(model)
+begins, start = np.zeros(turns.ctrl.shape[:2], bool), np.zeros((2, *turns.ctrl.shape))
+for row, begun in turns.begins.items():
+    for world, motion in begun.items():
+        begins[row, world], start[:, row, world] = True, [played[motion][field][0] for field in ("qpos", "qvel")]
 
-    def step(carry: Any, _: Any, servo: Any = servo, weights: Any = weights, device: Any = device) -> Any:
-        data, past, ctrl = carry
-        past = jp.concatenate([ctrl[None], past[:-1]])
-        data = mjx.step(device, data.replace(ctrl=data.ctrl.at[servo].set((weights * past).sum(0))))
-        return (data, past, ctrl), None
 
-    def period(carry: Any, ctrl: Any, step: Any = step, steps: int = steps, at: Any = at) -> Any:
-        (data, past, _), _ = jax.lax.scan(step, (*carry, ctrl), None, steps)
-        return (data, past), data.qpos[at]
+def step(carry: Any, _: Any) -> Any:
+    data, past, ctrl = carry
+    past = jp.concatenate([ctrl[None], past[:-1]])
+    data = mjx.step(device, data.replace(ctrl=data.ctrl.at[servo].set((weights * past).sum(0))))
+    return (data, past, ctrl), None
 
-    start = (data, jp.repeat(jp.array(motion["ctrl"][:1], float), len(weights), axis=0))
-    played = jax.jit(lambda c, t, p=period: jax.lax.scan(p, c, t)[1])(start, jp.array(motion["ctrl"][:-1], float))
-    errors.append(np.abs(np.asarray(played) - motion["qpos"][1:])[:, columns].mean())
-print(f"MJX: {1e3 * np.mean(errors):.2f} mrad; in gaponet {facts['left_mrad']['plain']:.2f}")
+
+def period(carry: Any, asked: Any) -> Any:
+    ctrl, fresh, qpos, qvel = asked
+    new = (
+        home.replace(qpos=home.qpos.at[at].set(qpos), qvel=home.qvel.at[dof].set(qvel)),
+        jp.tile(ctrl, (len(weights), 1)),
+    )
+    carry = jax.tree.map(lambda a, b: jp.where(fresh, a, b), new, carry)
+    (data, past, _), _ = jax.lax.scan(step, (*carry, ctrl), None, steps)
+    return (data, past), data.qpos[at]
+
+
+first = jax.tree.map(lambda x: jp.stack([x] * turns.worlds), (home, jp.zeros((len(weights), len(names)))))
+asked = tuple(map(jp.array, (turns.ctrl, begins, *start)))
+found = jax.jit(lambda c, x: jax.lax.scan(jax.vmap(period), c, x)[1])(first, asked)
+error = turns.error(found, [list(facts["plain"]).index(name) for name in facts["corrected"]])
+print(f"MJX, {turns.worlds} worlds: {1e3 * error:.2f} mrad; in gaponet {facts['left_mrad']['plain']:.2f}")

@@ -7,7 +7,7 @@ import numpy as np
 import robot_cfg
 import warp as wp
 
-from gaponet_interop.engine.mujoco_servos import delay_weights, motions, read
+from gaponet_interop.engine.mujoco_servos import Turns, delay_weights, motions, read
 
 HERE = Path(__file__).parent
 facts, played = read(HERE / "facts.json"), motions(HERE / "check.npz")
@@ -23,9 +23,9 @@ for field, of in robot_cfg.SERVOS.items():
         getattr(robot, field)[i] = of[name]
 for i in dof:
     robot.joint_target_mode[i] = int(newton.JointTargetMode.POSITION)
-scene, worlds = newton.ModelBuilder(), len(played)
+turns, scene = Turns(played), newton.ModelBuilder()
 newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
-scene.replicate(robot, worlds)
+scene.replicate(robot, turns.worlds)
 model = scene.finalize(device="cpu")
 options = facts["options"]
 solver = newton.solvers.SolverMuJoCo(
@@ -33,28 +33,26 @@ solver = newton.solvers.SolverMuJoCo(
     iterations=options["iterations"], ls_iterations=options["ls_iterations"], jacobian=options["jacobian"],
 )  # fmt: skip
 state, after, control = model.state(), model.state(), model.control()
-set_to = lambda x: x.reshape(worlds, -1)[:, dof]  # noqa: E731
-q, v = model.joint_q.numpy().reshape(worlds, -1), model.joint_qd.numpy().reshape(worlds, -1)
-for world, motion in enumerate(played):
-    q[world, dof], v[world, dof] = motion["qpos"][0], motion["qvel"][0]
-state.joint_q.assign(q.ravel())
-state.joint_qd.assign(v.ravel())
-newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+rows = lambda x: x.numpy().reshape(turns.worlds, -1)  # noqa: E731
 weights = delay_weights([robot_cfg.DELAYS[name] for name in names], step)[:, None]
 offset = np.array([robot_cfg.OFFSETS[name] for name in names])
-rows = max(len(m["ctrl"]) for m in played)
-ctrl = np.stack([np.concatenate([m["ctrl"], np.repeat(m["ctrl"][-1:], rows - len(m["ctrl"]), 0)]) for m in played], 1)
-past, found, target = np.repeat(ctrl[:1], len(weights), 0), [], np.zeros_like(q)
-for asked in ctrl[:-1]:
+past, found, target = np.zeros((len(weights), turns.worlds, len(names))), [], 0.0 * rows(model.joint_q)
+for row, asked in enumerate(turns.ctrl):
+    if begun := turns.begins.get(row):
+        q, v = rows(state.joint_q).copy(), rows(state.joint_qd).copy()
+        for world, motion in begun.items():
+            q[world, dof], v[world, dof] = played[motion]["qpos"][0], played[motion]["qvel"][0]
+            past[:, world] = asked[world]
+        state.joint_q.assign(q.ravel())
+        state.joint_qd.assign(v.ravel())
+        newton.eval_fk(model, state.joint_q, state.joint_qd, state)
     for _ in range(facts["decimation"]):
         past = np.concatenate([asked[None], past[:-1]])
         target[:, dof] = (weights * past).sum(0) + offset
         control.joint_target_q.assign(target.ravel().astype(np.float32))
         solver.step(state, after, control, None, step)
         state, after = after, state
-    found.append(set_to(state.joint_q.numpy()))
-columns = [names.index(name) for name in facts["corrected"]]
-errors = [np.abs(np.stack(found)[: len(m["qpos"]) - 1, i][:, columns] - m["qpos"][1:, columns]).mean()
-          for i, m in enumerate(played)]  # fmt: skip
-print(f"Newton {newton.__version__}, warp {wp.__version__}, {worlds} worlds: {1e3 * np.mean(errors):.2f} mrad; "
+    found.append(rows(state.joint_q)[:, dof].copy())
+error = turns.error(found, [names.index(name) for name in facts["corrected"]])
+print(f"Newton {newton.__version__}, warp {wp.__version__}, {turns.worlds} worlds: {1e3 * error:.2f} mrad; "
       f"in gaponet {facts['left_mrad']['plain']:.2f}")  # fmt: skip
