@@ -109,38 +109,52 @@ def export_robot(
     prices = {"in gaponet": left(judging, robot)}
     if robot.has_law:
         prices["in gaponet, fitted without the law"] = left(judging, plain)
-    file = None
-    other: tuple[str, ...] = ()
     with writing(out, KIND):
-        if to == "mjcf":
-            longest = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
-            mine = source or robot.mjcf
-            file, changes, other = edit_mjcf(mine, out, plain, facts["plain"], longest, prefix, payload_mass)
-            facts["file"] = str(file.relative_to(out))
-            write_text(out / "changes.diff", changes)
-            for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
-                if form == "plain" or robot.has_law:
-                    prices[f"{file.name} {what}"] = _played(file, facts, judging, robot, form)
-        elif to == "urdf":
-            if source is None:
-                raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf, or .sdf")
-            file, changes = edit_urdf(source, out, facts["plain"], robot.operated, prefix)
-            facts["file"] = file.name
-            write_text(out / "changes.diff", changes)
-            prices[f"{file.name} alone, all else as before"] = left(judging, tags_alone(plain))
-        elif to != "json":
-            file = out / ROBOT
-            _write_scene(robot if to == "mjlab" else plain, file, payload_mass, servos=to == "mjlab")
-            write_text(out / "robot_cfg.py", CONFIGS[to](robot.name, facts))
+        file, told, more = _write_form(robot, plain, to, out, facts, judging, source, prefix, payload_mass)
         _write_motions(out / CHECK, motions)
         _ship(out, to)
         write_text(out / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
-    notes = _notes(robot, facts, to)
-    if other:
-        notes += (
-            f"targets of {', '.join(other)} were not in rad before (degrees?): now they are; ctrl of keyframes not",
-        )
-    return Exported(file, prices, len(judging), judging[0].meta.virtual, notes)
+    notes = (*_notes(robot, facts, to), *told)
+    return Exported(file, prices | more, len(judging), judging[0].meta.virtual, notes)
+
+
+def _write_form(
+    robot: RobotSpec,
+    plain: RobotSpec,
+    to: str,
+    out: Path,
+    facts: dict[str, Any],
+    judging: ListOf[Sequence],
+    source: Path | None,
+    prefix: str,
+    payload_mass: float,
+) -> tuple[Path | None, tuple[str, ...], dict[str, float]]:
+    """The robot in the engine's own file, whose name goes into facts: file, notes, and what it leaves, rad."""
+    left_there = dict[str, float]()
+    if to == "mjcf":
+        longest = {n: max(facts[form][n]["delay"] for form in ("joints", "plain")) for n in robot.joint_names}
+        mine = source or robot.mjcf
+        file, changes, other = edit_mjcf(mine, out, plain, facts["plain"], longest, prefix, payload_mass)
+        facts["file"] = str(file.relative_to(out))
+        write_text(out / "changes.diff", changes)
+        for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
+            if form == "plain" or robot.has_law:
+                left_there[f"{file.name} {what}"] = _played(file, facts, judging, robot, form)
+        units = f"targets of {', '.join(other)} were not in rad before (degrees?): now they are; ctrl of keyframes not"
+        return file, (units,) * bool(other), left_there
+    if to == "urdf":
+        if source is None:
+            raise UsageError("--to urdf edits a copy of your own file: --into FILE.urdf, or .sdf")
+        file, changes = edit_urdf(source, out, facts["plain"], robot.operated, prefix)
+        facts["file"] = file.name
+        write_text(out / "changes.diff", changes)
+        left_there[f"{file.name} alone, all else as before"] = left(judging, tags_alone(plain))
+        return file, (), left_there
+    if to == "json":
+        return None, (), left_there
+    _write_scene(robot if to == "mjlab" else plain, out / ROBOT, payload_mass, servos=to == "mjlab")
+    write_text(out / "robot_cfg.py", CONFIGS[to](robot.name, facts))
+    return out / ROBOT, (), left_there
 
 
 def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:

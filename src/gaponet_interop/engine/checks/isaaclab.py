@@ -70,7 +70,9 @@ solver = MJWarpSolverCfg(
 )  # fmt: skip
 cfg = ManagerBasedEnvCfg(
     decimation=facts["decimation"], scene=Scene(num_envs=turns.worlds, env_spacing=2.0),
-    sim=sim_utils.SimulationCfg(dt=step, use_newton_actuators=False, device="cpu", physics=NewtonCfg(solver_cfg=solver)),
+    sim=sim_utils.SimulationCfg(
+        dt=step, use_newton_actuators=False, device="cpu", physics=NewtonCfg(solver_cfg=solver)
+    ),
     observations=Observations(), actions=Actions(), events=Events(),
 )  # fmt: skip
 env = ManagerBasedEnv(cfg)
