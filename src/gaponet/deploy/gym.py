@@ -89,7 +89,7 @@ class TrackingVectorEnv(gymnasium.vector.VectorEnv):
     def __init__(
         self, sim: AlignedSim, references: ListOf[Array], reach: float = 0.2, preview: int = 2, seed: int = 0
     ) -> None:
-        """As TrackingEnv; the simulator has any number of worlds."""
+        """The arguments are those of TrackingEnv; the simulator has any number of worlds."""
         if not len(references) or any(r.shape[1] != sim.n or len(r) < 3 for r in references):
             raise UsageError(f"TrackingVectorEnv needs motions (T, {sim.n}) of at least 3 rows")
         self.sim, self.reach, self.preview, self.num_envs = sim, reach, preview, sim.num_envs
