@@ -7,7 +7,7 @@
 
 Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify; and
 benchmarks/plain_fit.py on the same dataset. Both are measured by gaponet gap on FRESH motions that are in no dataset
-that anything was fitted to, as many of each kind. One JSON line a robot; each robot has a process of its own.
+that anything was fitted to, as many of each kind. One JSON line a robot.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import resource
 import shutil
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +33,7 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.split import split_entries
 from gaponet.data.store import open_dataset
 from gaponet.robot import load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.sim.replay import whole_errors
 from gaponet_lab.plot.style import figure, save, styled
 
 if TYPE_CHECKING:
@@ -122,43 +123,42 @@ def play(
                  place.name, "--position-unit", "rad", "--time-unit", "s")  # fmt: skip
     told = json.loads(call("doctor", data, "--json"))
     row["doctor"] = [f"{f['level']} {f['check']}" for f in told["findings"] if f["level"] in ("warning", "error")]
-    row["nominal"] = left(fresh, mine)
     try:
         took = Taken()
         fit = json.loads(call("identify", data, "--out", found, "--json"))
         row["seconds"], row["cpu"] = took()
         row |= {"warnings": fit["warnings"], "chosen": fit["chosen"], "val": fit["val_mpjae"]}
-        row |= inside(robot, found, fit["std"])
+        row |= inside(robot, found, fit["std"], fit["undetermined"])
     except RefusedError as refused:
         row["refused"] = str(refused)
-    row["identified"] = left(fresh, found) if (found / "robot.toml").exists() else row["nominal"]
+    measured = json.loads(call("gap", fresh, "--robot", found if "refused" not in row else mine, "--json"))["methods"]
+    row["nominal"] = measured["nominal"]["mpjae"]
+    row["identified"] = measured.get("identified", measured["nominal"])["mpjae"]
     if not rival:
         return row
     took, (dataset, spec) = Taken(), open_dataset(str(data), None, None)
-    save_robot(plain_fit(dataset.sequences(split_entries(dataset)["train"]), spec), folder / "plain")
+    plain = plain_fit(dataset.sequences(split_entries(dataset)["train"]), spec)
     row["plain_seconds"], row["plain_cpu"] = took()
-    row["plain"] = left(fresh, folder / "plain")
+    judged = open_dataset(str(fresh), None, None)[0]
+    row["plain"] = float(whole_errors(judged.sequences(judged.select()), plain).mean())
     return row
 
 
-def left(data: Path, robot: Path) -> float:
-    """Mean |error| of all motions of a dataset, rad."""
-    methods = json.loads(call("gap", data, "--robot", robot, "--json"))["methods"]
-    return float(methods.get("identified", methods["nominal"])["mpjae"])
-
-
-def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]]) -> Row:
-    """Distance of each parameter from the truth in its standard errors, and in its own size: field → numbers."""
+def inside(robot: Stranger, folder: Path, std: dict[str, dict[str, float]], undetermined: dict[str, list[str]]) -> Row:
+    """Distance of each parameter called determined from the truth in its standard errors, and in its own size: field →
+    numbers; and how many of each field are called not determined."""
     spec, law = load_robot(folder), robot.law
     truth = {"kp": law.kp, "damping": law.kd + law.damping, "frictionloss": law.friction, "armature": law.armature,
              "delay": law.delay, "offset": law.offset}  # fmt: skip
-    row: Row = {"sigmas": {}, "relative": {}}
+    row: Row = {"sigmas": {}, "relative": {}, "undetermined": {}}
     for field in FIELDS:
         for j, joint in enumerate(robot.joints):
             i = spec.joint_names.index(joint.replace("/", "_"))
             value = getattr(spec, field)[i] + (spec.kd[i] if field == "damping" else 0.0)
             far, error = abs(float(value - truth[field][j])), std.get(joint.replace("/", "_"), {}).get(field)
-            if error and np.isfinite(far):
+            if field in undetermined.get(joint.replace("/", "_"), ()):
+                row["undetermined"][field] = row["undetermined"].get(field, 0) + 1
+            elif error and np.isfinite(far):
                 row["sigmas"].setdefault(field, []).append(round(far / error, 2))
                 if field not in ("offset", "delay"):
                     row["relative"].setdefault(field, []).append(round(far / truth[field][j], 3))
@@ -276,17 +276,14 @@ def main() -> None:
     rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
     seconds = args.seconds or (SMALL if args.small else None)
     rows = [r for r in rows if r["seed"] not in (args.seeds or ())]
+    process = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))  # imports are paid once
     for seed in args.seeds or range(args.first, args.first + args.robots):
         if any(r["seed"] == seed for r in rows):
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
-        with multiprocessing.get_context("fork").Pool(1) as process:
-            rows.append(
-                process.apply(
-                    play, (seed, folder, args.motions, seconds, args.small, args.named, args.spoil, not args.alone)
-                )
-            )
+        how = (seconds, args.small, args.named, args.spoil, not args.alone)
+        rows.append(process.submit(play, seed, folder, args.motions, *how).result())
         journal.write_text("".join(json.dumps(row) + "\n" for row in rows))
         r = rows[-1]
         print(
@@ -297,6 +294,7 @@ def main() -> None:
         )
         if not args.keep:
             shutil.rmtree(folder)
+    process.shutdown()
     text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
     print(text)
     if args.page:

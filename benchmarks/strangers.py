@@ -23,7 +23,16 @@ PUBLIC = {  # model → joints that are welded where it stands: slides, wheels, 
     "shadow_hand/right_hand.xml": ("FFJ1", "FFJ2", "MFJ1", "MFJ2", "RFJ1", "RFJ2", "LFJ1", "LFJ2"),
 }  # fmt: skip
 RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
-LAWS = ("stribeck", "load", "backlash", "dead_band", "speed", "saturation", "filter")  # not of the form that is fitted
+LAWS = (
+    "stribeck",
+    "load",
+    "backlash",
+    "dead_band",
+    "speed",
+    "saturation",
+    "filter",
+    "creep",
+)  # not of the form that is fitted
 NUMBERS = 3e6  # of a log in all: at most so much is recorded
 MOTIONS, SECONDS = 12, (120.0, 300.0)
 SMALL, SLOW = 4, 60.0
@@ -51,6 +60,7 @@ class Law:
     dead_band: Array
     speed: Array
     filter: Array
+    creeps: bool
 
 
 @dataclass(frozen=True)
@@ -129,6 +139,8 @@ class Stranger:
             joint.damping, joint.armature = _of(joint.damping, law.damping[j]), law.armature[j]
             joint.frictionloss = law.friction[j]
             joint.solref_friction = [2.5 * spec.option.timestep, 1.0]
+            if not law.creeps:  # MuJoCo's own joints creep by milliradians a second where real ones stick
+                joint.solimp_friction = [0.9999, 0.9999, 0.001, 0.5, 2.0]
             _servo(spec, name, law.kp[j], law.kd[j], law.limit[j])
         return spec.compile()
 
@@ -399,7 +411,7 @@ def _dressed(seed: int, rng: np.random.Generator, spec: mujoco.MjSpec, body: str
         limit=np.maximum(1.25 * weight, 0.12 * kp * spread(0.7, 1.5, n)) if "saturation" in laws else limit,
         stribeck=kp * each("stribeck", 2e-3, 1e-2), stribeck_speed=spread(0.02, 0.2, n), load=each("load", 0.03, 0.25),
         backlash=each("backlash", 1e-3, 1e-2), dead_band=each("dead_band", 1e-3, 1e-2),
-        speed=each("speed", 0.4, 2.0), filter=each("filter", 0.01, 0.06),
+        speed=each("speed", 0.4, 2.0), filter=each("filter", 0.01, 0.06), creeps="creep" in laws,
     )  # fmt: skip
     said = {name: getattr(law, name) * _wrong(rng, n, name != "kp") for name in ("kp", "kd", "damping", "armature")}
     dirt = Dirt(

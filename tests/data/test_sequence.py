@@ -177,3 +177,26 @@ def test_time_is_never_stretched(arm, short):
     assert rows[-1] == pytest.approx(time[-1], abs=sequence.dt)
     assert np.abs(sequence.qpos - truth(rows)).max() < 0.5 * sequence.dt * 2 + 1e-3  # half a period at 2 rad/s
     assert sequence.dt == pytest.approx(0.02 - short / 3 if short else 0.02, abs=2e-5)
+
+
+@pytest.mark.parametrize("lost", [0, 15])
+def test_rows_that_a_loop_stamps_unevenly_are_of_its_periods(arm, lost):
+    """Each row's command is of the period that the row is nearest to, whatever the stamps' jitter and lost rows."""
+    rng, period = np.random.default_rng(lost), 1 / 30
+    stamp = 7.0 + period * (np.arange(600) + np.clip(rng.normal(0, 0.15, 600), -0.3, 0.3))
+    kept = np.sort(np.r_[0, rng.permutation(np.arange(1, 600))[: 599 - lost]])
+    sent = np.stack([np.arange(600.0), np.arange(600.0)], axis=1)[kept]
+    log = arm_log(stamp[kept])
+    log.channels["ctrl"] = Channel(stamp[kept], sent)
+    sequence = to_sequence(log, arm, META)
+    assert sequence.dt == pytest.approx(period, rel=3e-4)
+    rows = np.arange(len(sequence))
+    late = rows - sequence.ctrl[:, 0]
+    assert np.array_equal(late[np.isin(rows, kept)], np.zeros(len(kept)))
+    assert sequence.qpos[:, 0] == pytest.approx(7.0 + period * rows, abs=5e-3)
+
+
+def test_rows_without_a_period_begin_where_they_begin(arm):
+    time = np.cumsum(np.random.default_rng(0).exponential(0.02, 400))
+    sequence = to_sequence(arm_log(time), arm, META)
+    assert sequence.qpos[0, 0] == pytest.approx(time[0], rel=1e-6)

@@ -88,7 +88,8 @@ def identify(
         },
         "table": vars(found.robot.table) if found.robot.table else None,
         "touching": list(found.touch.motions) if found.touch else [],
-        "warnings": list(found.warnings), "seconds": made.seconds, "robot": str(out),
+        "warnings": list(found.warnings), "undetermined": found.undetermined,
+        "seconds": made.seconds, "robot": str(out),
     })  # fmt: skip
 
 

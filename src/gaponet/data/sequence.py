@@ -12,7 +12,7 @@ from annotated_types import Interval
 
 from gaponet.arrays import Array
 from gaponet.data.log import Log
-from gaponet.data.signals import differentiate, resample_linear, resample_zoh
+from gaponet.data.signals import TIE, differentiate, resample_linear, resample_zoh
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import GAIN_TOLERANCE, RobotSpec
 from gaponet.structure import Json
@@ -22,6 +22,7 @@ OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")
 SHORTEST, LONGEST = 1e-4, 1.0  # periods, s
 MAX_GAP = 2.0  # between two samples of the state, s: what moved there is not known, and a clock that jumps is no clock
 MAX_GROWTH = 3  # times as many rows as were recorded: a few bursts must not set the period of all
+FEW = 16  # rows of which a loop's period is told first
 ASSUMED = "of robot.toml"  # note of gains that the log did not say
 LEVELS = ("joint", "upper_body", "whole_body")
 
@@ -223,8 +224,9 @@ def to_sequence(log: Log, robot: RobotSpec, meta: SequenceMeta, dt: float | None
         dt = kept
         arrays = {name: channel.values for name, channel in log.channels.items()}
     else:
-        dt = round(median, 5) if dt is None else dt
-        arrays = _resample(log, dt)
+        free = shared and dt is None and "dt" not in log.meta
+        begin, dt = _loop(time, median, robot.dt) if free else (None, round(median, 5) if dt is None else dt)
+        arrays = _resample(log, dt, begin)
     arrays = {name: _to_robot(name, values, log, robot) for name, values in arrays.items()}
     converted = log.meta.get("converted_from", {})
     odd = [j for j, name in enumerate(robot.joint_names) if "qvel" not in arrays or converted.get(name) == "fraction"]
@@ -299,18 +301,42 @@ def _median_period(log: Log) -> float:
     return median
 
 
-def _resample(log: Log, dt: float) -> dict[str, Array]:
+def _loop(time: Array, median: float, usual: float) -> tuple[float | None, float]:
+    """When the loop that wrote uneven rows began, and its period, s: least squares over the rows' numbers, some of them
+    lost; or no beginning and the median period, where rows keep to no period."""
+    begin, period = float(time[0]), float(np.diff(time).mean())
+    period = period if abs(period - median) < 0.05 * median else median
+    rows = FEW
+    while True:
+        some = time[:rows]
+        period, begin = np.polyfit(np.round((some - begin) / period), some - time[0], 1)
+        begin += time[0]
+        if rows >= len(time):
+            break
+        rows *= 2
+    number = (time - begin) / period
+    if not abs(period - median) < 0.1 * median or np.median(np.abs(number - np.round(number))) > 0.2:
+        return None, round(median, 5)
+    short = (usual, round(float(period), 5), float(period))
+    return begin, next(p for p in short if abs(p - period) * number[-1] <= 0.1 * period)
+
+
+def _resample(log: Log, dt: float, begin: float | None) -> dict[str, Array]:
+    """On a grid; of a loop that began then, a command belongs to the period that its row is nearest to."""
     start = max(c.time[0] for c in log.channels.values())
     stop = min(c.time[-1] for c in log.channels.values())
     if stop - start < 2 * dt:
         raise LogError(
             f"{log.source}: command and state channels overlap for {stop - start:.3f} s only; check the clocks"
         )
-    grid = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1)
-    grid = np.minimum(grid, stop)
+    if begin is None:
+        grid, near = start + dt * np.arange(int((stop - start) / dt + 1e-9) + 1), TIE
+    else:
+        grid, near = begin + dt * np.arange(round((stop - begin) / dt) + 1), 0.5
+    grid = np.clip(grid, start, stop)
     return {
-        name: (resample_zoh if name == "ctrl" else resample_linear)(channel.time, channel.values, grid)
-        for name, channel in log.channels.items()
+        name: resample_zoh(c.time, c.values, grid, near) if name == "ctrl" else resample_linear(c.time, c.values, grid)
+        for name, c in log.channels.items()
     }
 
 

@@ -37,19 +37,20 @@ def resample_linear(time: Array, values: Array, grid: Array) -> Array:
     return values[left] * (1 - weight) + values[right] * weight  # (T, n)
 
 
-def resample_zoh(time: Array, values: Array, grid: Array) -> Array:
+def resample_zoh(time: Array, values: Array, grid: Array, near: float = TIE) -> Array:
     """Hold each command until the next one arrives.
 
     Commands are steps, not ramps: linear interpolation would invent motion the robot was never asked for. A command
-    that comes within TIE of a grid's period after an instant is of that instant: one loop writes state and command with
-    one stamp, and neither the grid's rounding nor the loop's jitter may make it a whole period late.
+    that comes a little after an instant is of that instant: one loop writes state and command with one stamp, and
+    neither the grid's rounding nor the loop's jitter may make it a whole period late.
 
     Args:
         time: Strictly increasing timestamps, (k,), s.
         values: Commands, (k, n), rad.
         grid: Query times, evenly spaced, (T,), s, within [time[0], time[-1]].
+        near: How much is a little, of the grid's period.
     """
-    slack = TIE * (grid[-1] - grid[0]) / max(len(grid) - 1, 1)
+    slack = near * (grid[-1] - grid[0]) / max(len(grid) - 1, 1)
     return values[np.searchsorted(time, grid + slack, side="right") - 1]  # (T, n)
 
 

@@ -43,6 +43,7 @@ ENOUGH, LITTLE = 2e-3, 2e-4  # of the whole robot's cost, of the limbs': a fall 
 POLISH = 2  # iterations of the whole robot with a term of the law
 CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
+HALF = 0.29  # standard deviation of what lies anywhere within one step
 LASTS = 4.0  # s of recording that count as one independent measurement beside a belief
 BELIEF = {"kp": 0.5, "armature": 1.5}  # standard deviation of the logarithm of a file's value
 TOLD = 0.1  # the same of a kp that recordings state
@@ -101,6 +102,7 @@ class Identified:
         before, after: Mean |error| of the motions that judged, rad: of the given robot, of this one.
         chosen: What did best: given, joints (each on its own), whole (all together), limbs (each as one), or mixed.
         warnings: What ended at a bound, what to look at, and what the recordings do not determine (last).
+        undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         std: Joint → field → standard error; none of a shared law.
         tried: The terms of the law in the order tried.
         touch: What was found about the table; None where nothing may touch.
@@ -120,6 +122,7 @@ class Identified:
     shared: tuple[Tried, ...] = ()
     by_joint: dict[str, tuple[float, float]] | None = None
     covariance: Covariance = field(default_factory=dict)
+    undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def better(self) -> bool:
@@ -217,13 +220,15 @@ def identify(
     if not stops:
         found = replace(found, stop_low=given.stop_low, stop_high=given.stop_high)
         found = given if chosen == "given" and not (touch and touch.kept) else found
+    unknown = fit.undetermined(values, std, over_kp)
     doubts = (*fit.bounds_met(values), *_asked_stops(given, robot), *far_from_published(found),
-              *fit.undetermined(values, std, over_kp))  # fmt: skip
+              *(text for _, text in unknown.values()))  # fmt: skip
     began, ended = (float(judge.errors(v).mean()) for v in (first, values))
     each = zip(*(judge.by_joint(v).tolist() for v in (first, values)), strict=True)
     by_joint = dict(zip(robot.operated, each, strict=True))
     sure = {j: whole.covariance[j] for j in robot.operated if std[j]}
-    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure)
+    wide = {joint: fields for joint, (fields, _) in unknown.items()}
+    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure, wide)
 
 
 def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Values]]:
@@ -253,8 +258,8 @@ def _with_terms(
             polished = whole.descend(searched, richer, x, (POLISH,), clock, f"{term}, whole robot")
             richer = min(richer, polished, key=lambda v: float(judge.errors(v).mean()))
         tried.append(Tried(term, judge.errors(values), judge.errors(richer)))
-        if tried[-1].kept:
-            values = base = richer
+        if tried[-1].kept:  # a term that is nothing in every joint only gave the others more iterations
+            values = base = {f: v for f, v in richer.items() if f not in TERMS[term] or richer[TERMS[term][0]].any()}
     return tuple(tried), values
 
 
@@ -461,26 +466,31 @@ class Fit:
         each = np.zeros((self.n, clusters, len(names)))
         np.add.at(each, (slice(None), cluster), pull[:, :-2])  # type: ignore[arg-type]
         each = each - each.mean(axis=1, keepdims=True)
-        held = (axes.low == axes.high)[..., None] * np.eye(len(names))
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
         spread = np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - len(names), 1))
-        inverse = np.linalg.pinv(normal + 1e12 * held, hermitian=True)
+        # What no row has to say of a parameter is as unknown as before: then it is the file's, or nobody's.
+        size = np.sqrt(np.einsum("...ii->...i", normal))
+        lost = size < 3e-5
+        inverse = _inverse(normal, np.where(lost | (axes.low == axes.high), np.inf, size))
         step = np.clip((inverse @ pull.sum(axis=1)[..., None])[..., 0], -1, 1)
         cov = inverse @ spread @ inverse + step[..., :, None] * step[..., None, :]
-        # What no row has to say of a parameter is as unknown as before: then it is the file's, or nobody's.
-        lost = np.einsum("...ii->...i", normal) < 1e-9
         width = np.sqrt(np.einsum("...ii->...i", cov)) + np.where(lost & (axes.low < axes.high), 1e3, 0)
         ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
         by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
-        std = {
-            f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + np.abs(g).max(axis=1) * lost.any(axis=1)
-            for f, g in by.items()
-        }
+        std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
+        for f, error in self._stepped(values).items():
+            std[f] = np.hypot(std[f], error)
         joints, wide = self.base.operated, cov + (1e3 * np.eye(len(names)) * lost[..., None, :])
         wide = axes.unit[..., :, None] * wide * axes.unit[..., None, :]
         self.covariance = {j: (names, wide[i]) for i, j in enumerate(joints)}
         found = {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)}
         return found, {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)}
+
+    def _stepped(self, values: Values) -> Values:
+        """What the physics step may take for damping, armature or delay: a step's length beside time that runs on."""
+        h = HALF * self.runs.dt / self.runs.count
+        total = values["damping"] + self.base.kd[self.base.operated_index]
+        return {"damping": h * values["kp"], "armature": h * total, "delay": np.full(self.n, h)}
 
     def bounds_met(self, values: Values) -> tuple[str, ...]:
         """Every parameter at a bound, with what to check; no friction, armature or delay at all are ordinary."""
@@ -491,6 +501,7 @@ class Fit:
             for k, f in enumerate(names):
                 held = axes.low[i, k] == axes.high[i, k]
                 below = x[i, k] - axes.low[i, k] < 0.02 and (f == "damping" or axes.low[i, k] != 0)
+                held |= f == "stribeck_speed" and not values["stribeck"][i]
                 if held or not (below or axes.high[i, k] - x[i, k] < 0.02):
                     continue
                 if f == "damping" and below and not self.bounds.spare[i] and self.base.kd[self.base.operated_index[i]]:
@@ -503,32 +514,45 @@ class Fit:
                 found.append(f"{joint}: {f} ended at its bound: {what}")
         return tuple(found)
 
-    def undetermined(self, values: Values, std: Std, over_kp: Std) -> tuple[str, ...]:
-        """Joints that stood, and parameters whose standard error is as large as what they may mean."""
-        names, found = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"], []
+    def undetermined(self, values: Values, std: Std, over_kp: Std) -> dict[str, tuple[tuple[str, ...], str]]:
+        """Joints that stood, and parameters whose standard error is as large as what they may mean: joint → fields, and
+        what is to be said."""
+        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        found: dict[str, tuple[tuple[str, ...], str]] = {}
         axes = Axes(self.bounds, names, values)
         x = axes.of(values)
         ahead = axes.values(x + 1)
         for i, joint in enumerate(self.base.operated):
             if self.bounds.still[i]:
-                found.append(
+                why = (
                     f"{joint}: not determined by these logs: no command moves it by {STILL:g} rad; it keeps the file's "
                     "values but for its offset and, where others load it, kp; record a motion that moves it"
                 )
+                found[joint] = tuple(names), why
                 continue
-            wide, alone = [], []
+            wide, alone = {}, []
             for k, f in enumerate(names):
+                if f == "stribeck_speed" and not values["stribeck"][i]:
+                    continue
                 value, error = values[f][i], std[joint].get(f, 0.0)
                 if error > WIDE * max(abs(value), ahead[f][i] - value):
-                    wide.append(f"{f} {measured(value, error)}")
+                    wide[f] = f"{f} {measured(value, error)}"
                     ratio = over_kp.get(joint, {}).get(f, np.inf)
                     if f not in OVER_KP or ratio > WIDE * max(abs(x[i, k]), 1.0):
                         alone.append(f)
             together = set(alone) == {"kp"} and len(wide) > 1
             as_set = "; known as multiples of kp: take the values as a set" if together else ""
             if wide:
-                found.append(f"{joint}: not determined by these logs: {', '.join(wide)}{as_set}")
-        return tuple(found)
+                told = ", ".join(wide.values())
+                found[joint] = tuple(wide), f"{joint}: not determined by these logs: {told}{as_set}"
+        return found
+
+
+def _inverse(normal: Array, size: Array) -> Array:
+    """Inverses of (…, P, P), by their diagonals' roots (…, P); 0 of parameters whose size is infinite."""
+    each = size[..., :, None] * size[..., None, :]
+    held = np.eye(size.shape[-1]) * np.isinf(size)[..., None]
+    return np.asarray(np.linalg.pinv(normal / each + held, rcond=1e-10, hermitian=True) / each)
 
 
 STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and differ there; rows that must show it

@@ -40,7 +40,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     told = Response.following(own, [s.motion not in odd for s in same])
     onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
     apart = SURE * _scatter(told.onset - onset)
-    if onset < FIRST - step or onset < -max(-FIRST / 3, step / 2, apart):
+    if onset < FIRST - step or onset < -max(-FIRST / 3, step, apart):
         text = (
             f"joints begin to move {-onset * 1e3:.0f} ms before their commands: are command and state swapped, or are "
             "their clocks apart? Shift one of them at import"
