@@ -76,26 +76,22 @@ def _show_steps(out: Out, found: dict[str, Any]) -> None:
     """What is left after each step, in all and by joint and payload, and what the step removes in all."""
     who = "VIRTUAL robot" if found["virtual"] else "real robot"
     kind = "held-out recordings" if found["unseen"] else "recordings, some of them used in training"
-    joints, loads = found["by_joint"], found["by_payload"]
+    joints, loads, ends = found["by_joint"], found["by_payload"], ("floor", "unexplained")
+    rest = lambda part: (part["floor"]["both"], part["unexplained"])  # noqa: E731
     rows = [
         [title(s), mrad(left), *map(mrad, found["removed"].get(s, ())), *[""] * (0 if s in found["removed"] else 2),
-         *(mrad(j["left"][s]) for j in joints.values()), *(mrad(p[s]) for p in loads.values())]
+         *(mrad(p[s]) for p in loads.values())]
         for s, left in found["left"].items()
     ]  # fmt: skip
-    for end, of in (("floor", lambda x: x["floor"]["both"]), ("unexplained", lambda x: x["unexplained"])):
-        rows.append([end, mrad(of(found)), "", "", *(mrad(of(j)) for j in joints.values()), *[""] * len(loads)])
+    rows += [[end, mrad(of), *[""] * (2 + len(loads))] for end, of in zip(ends, rest(found), strict=True)]
     out.table(
         f"Mean |error| left after each step, mrad: {found['sequences']} {kind} of a {who}",
-        [
-            "step",
-            "left",
-            "removed",
-            "± over motions",
-            *(j.replace("_", " ") for j in joints),
-            *(f"{p} kg" for p in loads),
-        ],
+        ["step", "left", "removed", "± over motions", *(f"{p} kg" for p in loads)],
         rows,
     )
+    out.table("The same by joint", ["joint", *map(title, found["left"]), *ends], [
+        [name, *(mrad(part["left"][s]) for s in found["left"]), *map(mrad, rest(part))] for name, part in joints.items()
+    ])  # fmt: skip
     if found["floor"]["repeatability"] is None:
         rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
         out.say(f"floor: {rest}; no motion was recorded twice or repeats itself: repeatability is unknown")
