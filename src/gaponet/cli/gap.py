@@ -93,5 +93,5 @@ def _show_steps(out: Out, found: dict[str, Any]) -> None:
         [name, *(mrad(part["left"][s]) for s in found["left"]), *map(mrad, rest(part))] for name, part in joints.items()
     ])  # fmt: skip
     if found["floor"]["repeatability"] is None:
-        rest = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
-        out.say(f"floor: {rest}; no motion was recorded twice or repeats itself: repeatability is unknown")
+        seen = "unknown, encoders too" if found["floor"]["encoder"] is None else "encoder only"
+        out.say(f"floor: {seen}; no motion was recorded twice or repeats itself: repeatability is unknown")
