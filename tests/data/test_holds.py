@@ -40,6 +40,27 @@ def test_a_joint_that_rests_through_two_holds_is_counted_once(arm):
     assert holds.fresh.tolist() == [[True, True], [True, False], [True, False]]
 
 
+def test_a_joint_that_moved_long_ago_and_others_since_remember_their_approach(arm):
+    ctrl = staircase(np.random.default_rng(0).uniform(-1, 1, 60).tolist())
+    ctrl[:, 1] = np.where(np.arange(len(ctrl)) < 50, 0.3, -0.1)
+    sequence = arm_sequence(arm, ctrl, sticking(ctrl, 0.02, 0.03))
+    holds = Holds.of(sequence, BOTH)
+    assert len(sequence) > 4000
+    rest, near = 0, []
+    for t in range(len(sequence)):  # row by row, what a hold's joint was doing when it was last away from its rest
+        if rest < len(holds) and (np.abs(sequence.ctrl[t] - holds.ctrl[rest]) < 1e-6).all():
+            near.append(t)
+        elif near:
+            away = np.abs(sequence.qpos[: near[-1] + 1] - holds.qpos[rest]) > 0.01
+            for joint in range(2):
+                last = np.flatnonzero(away[:, joint])
+                side = -np.sign(sequence.qpos[last[-1], joint] - holds.qpos[rest, joint]) if len(last) else 0
+                assert holds.approach[rest, joint] == side
+            rest, near = rest + 1, []
+    assert rest >= 55
+    assert set(holds.approach[5:, 1].tolist()) == {-1}
+
+
 def test_a_moving_robot_never_holds(arm):
     ctrl = np.sin(np.arange(300) * 0.02)[:, None] * np.ones((1, 2))
     assert len(Holds.of(arm_sequence(arm, ctrl, ctrl), BOTH)) == 0

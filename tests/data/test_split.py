@@ -13,11 +13,11 @@ from gaponet.data.commands import alike, sketch
 from gaponet.data.importer import import_logs
 from gaponet.data.split import (
     PARTS,
+    _by_motion,
     make_split,
     one_motion,
     read_split,
     require_distinct_samples,
-    split_by_motion,
     split_entries,
     spread,
     write_split,
@@ -45,23 +45,23 @@ def values(entries, field):
 
 def test_a_split_holds_every_motion_once():
     motions = [f"m{i}" for i in range(40)]
-    split = split_by_motion(motions)
+    split = _by_motion(motions)
     assert {part: len(names) for part, names in split.items()} == {"train": 25, "val": 5, "test": 10}
     assert sorted(name for names in split.values() for name in names) == sorted(motions)
 
 
 def test_a_split_depends_on_names_alone_and_not_on_their_order_or_number():
     motions = [f"m{i}" for i in range(40)]
-    assert split_by_motion(motions) == split_by_motion([*reversed(motions), *motions])
+    assert _by_motion(motions) == _by_motion([*reversed(motions), *motions])
 
 
 def test_two_motions_cannot_be_split_in_three():
     with pytest.raises(UsageError, match=r"2 motion\(s\) \(.*\): a split by motion needs 3 or more"):
-        split_by_motion(["a", "b"])
+        _by_motion(["a", "b"])
 
 
 def test_by_motion_is_the_rule_that_training_uses(dataset):
-    parts, rule = make_split(dataset, "motion"), split_by_motion(list("abcdefgh"))
+    parts, rule = make_split(dataset, "motion"), _by_motion(list("abcdefgh"))
     assert values(parts["test"], "motion") == set(rule["test"])
     assert values(parts["val"], "motion") == set(rule["val"])
     assert values(parts["train"], "motion") == set(rule["train"])

@@ -20,6 +20,7 @@ CTRL_STILL = 1e-3  # range of the command in the window, rad
 DRIFT_STILL = 2e-3  # between the means of the window's halves, rad
 NOISE_STILL = 3e-3  # standard deviation in the window, rad; two steps of a 12-bit encoder
 MOVED = 0.01  # less than this is no motion, rad
+BLOCK = 1024  # rows whose extremes are looked at before the rows themselves
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,11 @@ class Holds:
         n = sequence.qpos.shape[1]
         qpos, ctrl = np.zeros((len(ends), n)), np.zeros((len(ends), n))
         approach, fresh = np.zeros((len(ends), n), int), np.ones((len(ends), n), bool)
-        w = _window(sequence)
+        w, starts = _window(sequence), np.arange(0, len(sequence), BLOCK)
+        extremes = np.stack([f.reduceat(sequence.qpos, starts) for f in (np.minimum, np.maximum)])  # (2, blocks, n)
         for i, end in enumerate(ends):
             qpos[i], ctrl[i] = sequence.qpos[end + 1 - w : end + 1].mean(axis=0), sequence.ctrl[end]
-            moved = sequence.qpos[: end + 1] - qpos[i]  # (end + 1, n)
-            away = np.abs(moved) > MOVED
-            last = end - away[::-1].argmax(axis=0)  # (n,) last row away from the rest
-            approach[i] = np.where(away.any(axis=0), -np.sign(moved[last, np.arange(n)]), 0)
+            approach[i] = -_last_away(sequence.qpos[: end + 1], extremes, qpos[i])
             if i:
                 fresh[i] = (np.abs(qpos[i] - qpos[i - 1]) > MOVED) | (np.abs(ctrl[i] - ctrl[i - 1]) > MOVED)
         return Holds(qpos, ctrl, approach, fresh)
@@ -100,6 +99,20 @@ class StaticError:
     def balanced(self) -> bool:
         """Whether both sides were seen; otherwise stiction and sag cannot be told apart."""
         return np.isfinite(self.half_band)
+
+
+def _last_away(qpos: Array, extremes: Array, rest: Array) -> Array:
+    """On which side of a rest (n) the joints of (T, n) were when they last were away from it, (n): +1, −1, 0 never."""
+    full, side = len(qpos) // BLOCK, np.zeros(len(rest), int)
+    blocks = (np.abs(extremes[:, :full] - rest) > MOVED).any(axis=0)  # whole ones, (full, n)
+    for j, x in enumerate(rest):
+        for start in (full * BLOCK, *BLOCK * np.flatnonzero(blocks[:, j])[:-2:-1]):
+            moved = qpos[start : start + BLOCK, j] - x
+            away = np.flatnonzero(np.abs(moved) > MOVED)
+            if away.size:
+                side[j] = np.sign(moved[away[-1]])
+                break
+    return side
 
 
 def _window(sequence: Sequence) -> int:

@@ -88,11 +88,10 @@ def estimate_delay(ctrl: Array, qpos: Array, dt: float, max_delay: float = 0.4) 
         (n,) s; NaN for a joint that was not commanded to move (range below 0.02 rad), does not follow (correlation
         below 0.3) or follows best at the longest lag tried, which then is no maximum: slow motions through stiction.
     """
-    kernel = np.hanning(7)[1:-1, None] / np.hanning(7).sum()
-    smooth = lambda x: np.apply_along_axis(lambda c: np.convolve(c, kernel[:, 0], "same"), 0, np.diff(x, axis=0))  # noqa: E731
-    u, v = smooth(ctrl), smooth(qpos)
-    shifts = range(min(int(max_delay / dt), len(u) // 2) + 1)
-    score = np.stack([_correlation(u[: len(u) - s], v[s:]) for s in shifts])  # (S, n)
+    kernel = np.hanning(7)[1:-1] / np.hanning(7).sum()
+    u, v = (np.stack([np.convolve(c, kernel, "same") for c in np.diff(x, axis=0).T]) for x in (ctrl, qpos))
+    shifts = range(min(int(max_delay / dt), u.shape[1] // 2) + 1)
+    score = np.stack([correlation(u[:, : u.shape[1] - s], v[:, s:]) for s in shifts])  # (S, n)
     best = score.argmax(axis=0)
     delay = np.full(ctrl.shape[1], np.nan)
     for j, s in enumerate(best):
@@ -111,10 +110,12 @@ def fast_speed(ctrl: Array, dt: float) -> Array:
     return np.percentile(np.abs(differentiate(ctrl, dt)), 95, axis=0)
 
 
-def _correlation(a: Array, b: Array) -> Array:
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    power = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return (a * b).sum(axis=0) / np.where(power > 0, power, np.inf)
+def correlation(a: Array, b: Array) -> Array:
+    """Of each row of one with that of the other, (n, T) both → (n); 0 where one does not change."""
+    a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    product = lambda x, y: np.einsum("it,it->i", x, y)  # noqa: E731
+    power = np.sqrt(product(a, a) * product(b, b))
+    return np.asarray(product(a, b) / np.where(power > 0, power, np.inf))
 
 
 def busiest(qpos: Array, rows: int) -> int:
@@ -169,7 +170,7 @@ class Response:
         for part in range(PARTS):
             rows = slice(part * size, (part + 1) * size)
             u, v = (np.diff(x[::every][rows].astype(float), axis=0) for x in (ctrl, qpos))
-            length = 2 * max(len(u), lags)
+            length = 1 << (2 * max(len(u), lags) - 1).bit_length()
             a, b = np.fft.rfft(u, length, axis=0), np.fft.rfft(v, length, axis=0)
             own.append(np.fft.irfft(a.conj() * a, length, axis=0)[:lags].T)
             later = np.fft.irfft(a.conj() * b, length, axis=0)
@@ -208,15 +209,9 @@ class Response:
                 continue
             way = np.cumsum(weights) / weights.sum()
             first = int(np.argmax(way > 0.05))
-            onset[j] = (
-                np.nan
-                if not quick[j]
-                else (
-                    at[first]
-                    + step
-                    - step * (way[first] - 0.05) / max(way[first] - (way[first - 1] if first else 0.0), 1e-9)
-                )
-            )
+            if quick[j]:
+                before = way[first - 1] if first else 0.0
+                onset[j] = at[first] + step - step * (way[first] - 0.05) / max(way[first] - before, 1e-9)
             moved = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS])
             spread = np.fft.rfft(moved, 2 * lags, axis=1)
             square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves

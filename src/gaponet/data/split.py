@@ -98,7 +98,7 @@ def split_entries(
     if len(set(lead.values())) < MOTIONS <= max(played.values(), default=0):
         parts = in_turn(dataset, "repetition")
         return parts | {p: [e for e in parts[p] if not away(e.meta)] for p in ("train", "val")}
-    motions = split_by_motion(lead.values())
+    motions = _by_motion(lead.values())
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
     entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
     parts = {
@@ -175,7 +175,7 @@ def one_motion(dataset: Dataset) -> dict[str, str]:
     return {name: heads[lead] for name, lead in leads.items()}
 
 
-def split_by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
+def _by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
     """The motions of each part by a fixed rule without a seed: in the order of the SHA-256 of their names, test first,
     then validation. Repetitions, payloads and units of a motion stay together. Adding a motion later moves few others.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.holds import Holds
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import FAST, Response, differentiate, estimate_delay, fast_speed, lowpass
+from gaponet.data.signals import FAST, Response, correlation, differentiate, estimate_delay, fast_speed, lowpass
 from gaponet.data.store import Entry
 from gaponet.robot import RobotSpec
 
@@ -195,25 +195,20 @@ def _slope(ctrl: Array, qpos: Array, dt: float, lag: Array, speed: Array) -> Arr
 def _kind(sequence: Sequence) -> dict[str, Array]:
     """What the command is like: the position soon after, the velocity, or the torque?"""
     every = max(1, round(0.02 / sequence.dt))
-    ctrl, qpos = (x[::every].astype(float) for x in (sequence.ctrl, sequence.qpos))
-    speed, lags = np.gradient(qpos, axis=0), range(0, min(round(MAX_LAG_S / 0.02), len(qpos) // 2), 2)
+    ctrl, qpos = (np.ascontiguousarray(x[::every].T, float) for x in (sequence.ctrl, sequence.qpos))  # (n, T)
+    rows, speed = qpos.shape[1], np.gradient(qpos, axis=1)
     beside, fast = [], []
-    for lag in lags:
-        u, q = ctrl[: len(ctrl) - lag], qpos[lag:]
-        both = u.T @ q / len(u)  # (n, n)
+    for lag in range(0, min(round(MAX_LAG_S / 0.02), rows // 2), 2):
+        u, q = ctrl[:, : rows - lag], qpos[:, lag:]
+        both = np.abs(u @ q.T) / (rows - lag)  # (n, n)
+        told, is_at, spread = (u**2).mean(axis=1)[:, None], (q**2).mean(axis=1), np.maximum(q.var(axis=1), 1e-12)
         for scale in (1.0, np.degrees(1), np.radians(1)):  # units, signs and names are other checks' matters
-            away = scale**2 * (u**2).mean(axis=0)[:, None] + (q**2).mean(axis=0) - 2 * scale * np.abs(both)
-            beside.append((np.maximum(away, 0) / np.maximum(q.var(axis=0), 1e-12)).min(axis=1))
-        fast.append(_correlation(u, speed[lag:]))
-    near = np.where(np.ptp(qpos, axis=0) > 0.05, np.sqrt(np.min(beside, axis=0)), np.nan)
-    torque = np.full(near.shape, np.nan) if sequence.tau is None else _correlation(ctrl, sequence.tau[::every])
+            away = scale**2 * told + is_at - 2 * scale * both
+            beside.append((np.maximum(away, 0) / spread).min(axis=1))
+        fast.append(correlation(u, speed[:, lag:]))
+    near = np.where(np.ptp(qpos, axis=1) > 0.05, np.sqrt(np.min(beside, axis=0)), np.nan)
+    torque = np.full(near.shape, np.nan) if sequence.tau is None else correlation(ctrl, sequence.tau[::every].T)
     return {"beside": near, "as_velocity": np.max(fast, axis=0), "as_torque": torque}
-
-
-def _correlation(a: Array, b: Array) -> Array:
-    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
-    power = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
-    return np.asarray((a * b).sum(axis=0) / np.where(power > 0, power, np.inf))
 
 
 def _halted(ctrl: Array, qpos: Array, dt: float) -> float:
@@ -330,17 +325,13 @@ def _torque(sequence: Sequence, robot: RobotSpec) -> Torque | None:
     usual = median_filter(size, size=(window, 1), mode="nearest")
     jumps = np.abs(np.diff(sequence.ctrl, axis=0, prepend=sequence.ctrl[:1])).max(axis=1) > STEPPED
     calm = maximum_filter1d(jumps, 2 * window + 1) == 0
+    flat = [sum(r.stop - r.start for r in _runs(x == x.max()) if r.stop - r.start >= FLAT) for x in size.T]
     return Torque(
         low=tau.min(axis=0),
         high=tau.max(axis=0),
         over_limit=(size > robot.effort_limit * (1 + TORQUE_NOISE)).sum(axis=0),
         spikes=((size - usual > SPIKE_SHARE * robot.effort_limit) & calm[:, None]).sum(axis=0),
-        flat=np.array(
-            [
-                sum(r.stop - r.start for r in _runs(column == column.max()) if r.stop - r.start >= FLAT)
-                for column in size.T
-            ]
-        ),
+        flat=np.array(flat),
     )
 
 

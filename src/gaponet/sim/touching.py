@@ -63,13 +63,13 @@ def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
     model = build_model(replace(robot, table=None), bare=True)
     data = mujoco.MjData(model)
     tips = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in robot.tips]
-    found = []
+    found, qpos, xpos, xmat = [], data.qpos, data.xpos, data.xmat  # views, looked up once
     for s in sequences:
         height = np.full(len(s), np.inf)
-        for t in range(len(s)):
-            data.qpos[:] = s.qpos[t]
+        for t, row in enumerate(s.qpos):
+            qpos[:] = row
             mujoco.mj_kinematics(model, data)
-            height[t] = min(data.xpos[b, 2] + data.xmat[b].reshape(3, 3)[2] @ p - r for b, p, r in tips)
+            height[t] = min(xpos[b, 2] + xmat[b, 6:] @ p - r for b, p, r in tips)
         found.append(height)
     return found
 

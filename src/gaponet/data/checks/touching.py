@@ -21,7 +21,7 @@ Heights = Callable[[Sequence], Array]  # lowest tip in every row, m
 
 LOW, HIGH = 0.03, 0.05  # m above the lowest tip of all
 STANDS = 0.05  # rad/s
-ROWS = 25  # that must show it
+RATE, ROWS = 10.0, 5  # Hz at which recordings are looked at, and rows that must show it
 MORE, CURRENT = 1.5, 1.2  # times what 19 rows in 20 show, and the usual torque, where tips are high
 
 
@@ -40,6 +40,7 @@ class Standing:
     def of(cls, sequence: Sequence, robot: RobotSpec, heights: Heights, gravity: Gravity) -> Standing:
         """What a sequence says about it."""
         op, meta = robot.operated_index, sequence.meta
+        sequence = sequence.rows(slice(None, None, max(1, round(1 / (RATE * sequence.dt)))))
         still = np.flatnonzero(np.abs(sequence.qvel[:, op]).max(axis=1) < STANDS)
         qpos = sequence.qpos[still].astype(float)
         load = gravity(qpos, meta.payload_mass, meta.payload_side)[:, op]
