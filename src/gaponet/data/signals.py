@@ -111,7 +111,7 @@ def fast_speed(ctrl: Array, dt: float) -> Array:
 
 
 def correlation(a: Array, b: Array) -> Array:
-    """Of each row of one with that of the other, (n, T) both → (n); 0 where one does not change."""
+    """Correlate row by row, (n, T) with (n, T) → (n); 0 where one does not change."""
     a, b = a - a.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
     product = lambda x, y: np.einsum("it,it->i", x, y)  # noqa: E731
     power = np.sqrt(product(a, a) * product(b, b))
