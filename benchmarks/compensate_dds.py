@@ -1,7 +1,7 @@
 """Compensation over a real DDS bus, as a user would run it: python benchmarks/compensate_dds.py RUN
 
 For each of two runs, without and with the model, a VIRTUAL H1-2 is served anew in a process of its own and
-`gaponet run --driver unitree` plays the motion on it in another, guard process included. RUN: a run of gaponet train on
+`gaponet run --driver unitree` plays the motion on it in another, watchdog included. RUN: a run of gaponet train on
 virtual units other than this one.
 """
 

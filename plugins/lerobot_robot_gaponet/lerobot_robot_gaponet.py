@@ -2,7 +2,7 @@
 
 LeRobot finds this module by the name of its distribution (register_third_party_plugins) and the classes by the names of
 their configurations. Angles are LeRobot's outside (degrees, gripper 0..100) and rad inside. The robot is commanded by
-`gaponet run --targets zmq` in a process of its own: compensator, limits, watchdogs and guard are those of gaponet, and
+`gaponet run --targets zmq` in a process of its own: compensator, limits, checks and watchdog are those of gaponet, and
 a policy that stalls leaves the arm held, then damped.
 """
 

@@ -37,7 +37,7 @@ child.leave_folder()
 from pathlib import Path
 from gaponet.data.importer import import_logs
 from gaponet_robots.control.driver import DriverError
-from gaponet_robots.control.guard import Guard
+from gaponet_robots.control.watchdog import Watchdog
 from gaponet.executor import opened
 from gaponet.robot import load_robot
 from gaponet_lab.bench.latency import in_own_process
@@ -47,10 +47,10 @@ if __name__ == "__main__":
     robot = load_robot(Path("arm"))
     print(len(import_logs("logs", robot, "lab", 0.0, "set").entries), "imported")
     lock = os.open("lock", os.O_CREAT | os.O_RDWR)
-    guard = Guard({"kind": "so101", "robot": "so101", "early": False, "port": "nowhere"}, lock, 1, 1)
-    guard.wait_ready()
-    guard.release()
-    print("guarded")
+    watchdog = Watchdog({"kind": "so101", "robot": "so101", "early": False, "port": "nowhere"}, lock, 1, 1)
+    watchdog.wait_ready()
+    watchdog.release()
+    print("watched")
     with opened("local", 1, 1, Path(".")) as pool:
         print(*pool.map(abs, [-3]), "computed")
     try:
@@ -104,7 +104,7 @@ def test_no_command_runs_what_lies_in_the_folder(poisoned):
 
 def test_no_child_runs_what_lies_in_the_folder(poisoned):
     pytest.importorskip("serial")
-    assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "guarded", "3 computed", "measured"]
+    assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "watched", "3 computed", "measured"]
     assert ran(poisoned) == []
 
 

@@ -76,7 +76,7 @@ class Asked:
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
     """Timing."""
     safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
-    """Limits and watchdogs."""
+    """Limits and checks of states."""
     plane: float | None = None
     """Height of the floor or table in the robot's frame, m; default what its collision.toml says."""
     unchecked: Flag = False

@@ -26,7 +26,6 @@ from gaponet.sim.model import build_model
 from gaponet_robots.control.clock import Clock, MonotonicClock, uncollected
 from gaponet_robots.control.driver import Driver, DriverError, Fault, State
 from gaponet_robots.control.following import Following
-from gaponet_robots.control.guard import Guard
 from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
 from gaponet_robots.control.plan import MOVED, SLOW, Fence, Plan, Planner
 from gaponet_robots.control.publisher import sole_publisher
@@ -34,6 +33,7 @@ from gaponet_robots.control.recording import Event, Recording
 from gaponet_robots.control.rows import Row
 from gaponet_robots.control.safety import ASTRAY, SOFT, Limits, SafetyConfig, Watch, limit_command, limit_delta
 from gaponet_robots.control.stop import Keys, StopRequest, on_signal
+from gaponet_robots.control.watchdog import Watchdog
 from gaponet_robots.motion.minjerk import blend
 from gaponet_robots.motion.way import Search, Way
 from gaponet_robots.targets.policy import NotYet, Policy, play
@@ -51,7 +51,7 @@ class Compensates(Protocol):
         """What to command so that the robot gets to `target`, (n) rad."""
 
 
-HANG = 5.0  # control periods without a sign of life after which the guard process damps the robot
+HANG = 5.0  # control periods without a sign of life after which the watchdog damps the robot
 FRESH = 5  # periods in a row without a fault before anything is commanded
 PATIENCE = 5.0  # s to wait for them
 PROVEN = 0.3  # weight beyond which a robot is not handed over before a joint has followed, where one goes …
@@ -73,7 +73,7 @@ class Controller:
         safety: SafetyConfig | None = None,
         compensator: Compensates | None = None,
         clock: Clock | None = None,
-        guard: bool = True,
+        watchdog: bool = True,
         planner: Planner | None = None,
         unchecked: bool = False,
         payload_mass: float | None = None,
@@ -87,10 +87,10 @@ class Controller:
             driver: The robot; not yet connected.
             robot: Its type.
             config: Times of the phases.
-            safety: Limits and watchdogs; default SafetyConfig().
+            safety: Limits and checks of states; default SafetyConfig().
             compensator: Turns targets into commands; without one targets are sent as they are.
             clock: Default the machine's monotonic clock.
-            guard: Start the process that damps the robot if this one dies, where the driver has one.
+            watchdog: Start the process that damps the robot if this one dies, where the driver has one.
             planner: Checks the way to the first target, and targets that are not known in advance while it moves;
                 default one without payload, for a robot that has shapes (collision.toml).
             unchecked: Do without one.
@@ -116,8 +116,8 @@ class Controller:
             meta=meta | {"payload_mass": payload_mass},
         )  # fmt: skip
         self._folder, self._full_told = folder, False
-        self._use_guard, self._on_event, self._on_connect = guard, on_event, on_connect
-        self._guard: Guard | None = None
+        self._use_watchdog, self._on_event, self._on_connect = watchdog, on_event, on_connect
+        self._watchdog: Watchdog | None = None
         self._payload_mass, self._prepared = payload_mass, compensator is None
         self._ctrl: Array | None = None  # commanded joints
         self._weight: float | None = None  # that was sent last; None: nothing was ever commanded
@@ -151,7 +151,7 @@ class Controller:
         if self.phase is not Phase.IDLE or self.recording.events:
             raise UsageError("a controller runs once; make a new one")
         with ExitStack() as stack:
-            stack.enter_context(uncollected())  # left last: the guard would take a collection for silence
+            stack.enter_context(uncollected())  # left last: the watchdog would take a collection for silence
             lock = stack.enter_context(sole_publisher(self.driver.address))
             stack.callback(lambda: self.driver.close(hold=not self._damped))
             self.driver.connect()
@@ -163,7 +163,7 @@ class Controller:
             if self._folder:
                 self.recording.grow_in(self._folder)
             stack.callback(self.recording.rows.close)
-            self._start_guard(lock, stack)
+            self._start_watchdog(lock, stack)
             stack.enter_context(on_signal(self.stop))
             if policy is None:
                 if self.plan is None or self.plan.motion is None:
@@ -180,13 +180,13 @@ class Controller:
         gains = (driver.kp, driver.kd)
         self.limits = Limits.of(self.robot, driver.commanded, self.safety, gains, driver.qpos_range)
 
-    def _start_guard(self, lock: int, stack: ExitStack) -> None:
-        spec = self.driver.guard() if self._use_guard else None
+    def _start_watchdog(self, lock: int, stack: ExitStack) -> None:
+        spec = self.driver.watchdog() if self._use_watchdog else None
         if spec is None:
             return
-        guard = self._guard = Guard(spec, lock, HANG * self.dt, self.config.damp)
-        stack.callback(lambda: guard.release(self._loose))
-        guard.wait_ready()
+        watchdog = self._watchdog = Watchdog(spec, lock, HANG * self.dt, self.config.damp)
+        stack.callback(lambda: watchdog.release(self._loose))
+        watchdog.wait_ready()
 
     def _loop(self, policy: Policy, keys: Keys | None) -> None:
         start, k, due = self.clock.now(), 0, 0  # due: the period that should follow the last one; k, the one that can
@@ -198,8 +198,8 @@ class Controller:
             self._due = start + due * self.dt
             if keys:
                 keys.poll()
-            if self._guard and not self._guard.alive() and not self._ended:
-                self.stop("the guard process ended")
+            if self._watchdog and not self._watchdog.alive() and not self._ended:
+                self.stop("the watchdog ended")
             self.recording.late.append(now - self._due)
             self._period(k, now, policy)
             lost = int((self.clock.now() - start) / self.dt) - k  # whole periods that this one ran over
@@ -277,13 +277,13 @@ class Controller:
         return Fault("stop", f"asked to stop: {self.stop.reason}") if self.stop.reason else fault
 
     def _fail(self, k: int, now: float, fault: Fault) -> None:
-        """Damp; but send nothing if nothing was commanded, or if the guard has damped the robot already."""
+        """Damp; but send nothing if nothing was commanded, or if the watchdog has damped the robot already."""
         if self._ended:
             return
         if self._weight is None:
             self._enter(Phase.STOPPED, k, now, fault.kind, f"{fault.text}; nothing was commanded")
-        elif self._guard and self._guard.fired():
-            self._enter(Phase.STOPPED, k, now, fault.kind, f"{fault.text}; the guard process has damped the robot")
+        elif self._watchdog and self._watchdog.fired():
+            self._enter(Phase.STOPPED, k, now, fault.kind, f"{fault.text}; the watchdog has damped the robot")
         elif fault.kind == "obedience" and self.driver.at_end == "hand_over" and self.phase is not Phase.RELEASE:
             self._last = self._where  # whatever listens or not: nothing moves, and the arms become the robot's own
             self._enter(Phase.RELEASE, k, now, fault.kind, fault.text)
@@ -297,7 +297,7 @@ class Controller:
             return "", self.driver.confirm()
         except (DriverError, OSError) as error:
             self._loose = True
-            more = "; the guard process goes on trying" if self._guard else ""
+            more = "; the watchdog goes on trying" if self._watchdog else ""
             return "driver", f"could NOT be damped: switch the supply off ({error}){more}"
 
     def _verify(self) -> None:
@@ -452,13 +452,13 @@ class Controller:
         """Limit a command and write it, or say why none may leave. A period that stood still sends nothing."""
         q, v, before = state.qpos[self.joints], state.qvel[self.joints], self._ctrl
         assert before is not None
-        if self._guard and not self._guard.beat(weight):  # first, so that it counts from before the first command
-            return Fault("stop", "the guard process ended")
+        if self._watchdog and not self._watchdog.beat(weight):  # first, so that it counts from before the first command
+            return Fault("stop", "the watchdog ended")
         looked = -np.inf
         while (now := self.clock.now()) - looked > PROMPT:
             looked = now
             fault = self.watch.overrun(now - self._due)
-            if fault or (self._guard and self._guard.fired()):
+            if fault or (self._watchdog and self._watchdog.fired()):
                 return fault or Fault("overrun", "this process stood still")
             out = limit_command(ctrl, before, q, v, self.dt, self.limits, now + PROMPT - state.time)
         if not out.feasible.all():
@@ -559,8 +559,8 @@ class Controller:
 
     def _damp(self, weight: float, share: float) -> None:
         try:
-            if self._guard and not self._guard.fired():
-                self._guard.beat(weight)
+            if self._watchdog and not self._watchdog.fired():
+                self._watchdog.beat(weight)
             self.driver.damp(weight, share)
         except Exception as error:  # whatever a driver raises, it is to damp: again next period; raised at the end
             if not isinstance(error, DriverError | OSError):

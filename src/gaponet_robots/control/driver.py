@@ -122,5 +122,5 @@ class Driver(Protocol):
                 damped or free.
         """
 
-    def guard(self) -> dict[str, object] | None:
-        """How another process can damp this robot if this one dies (deploy.guard); None if it cannot."""
+    def watchdog(self) -> dict[str, object] | None:
+        """How another process can damp this robot if this one dies (deploy.watchdog); None if it cannot."""

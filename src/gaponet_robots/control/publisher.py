@@ -17,7 +17,7 @@ LOCKS = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR 
 
 @contextmanager
 def sole_publisher(address: str) -> Iterator[int]:
-    """Hold the lock of an address; gives its file descriptor, to be kept open by a guard process.
+    """Hold the lock of an address; gives its file descriptor, to be kept open by a watchdog.
 
     A port has one lock, whatever links and names lead to it: that of its device number.
 

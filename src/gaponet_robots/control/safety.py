@@ -1,4 +1,4 @@
-"""Which commands may leave, and when none may: limits and watchdogs on arrays. No clock, no bus, no file is touched.
+"""Which commands may leave, and when none may: limits, and checks on arrays. No clock, no bus, no file is touched.
 
 A position command leaves only if it is within
 
@@ -34,7 +34,7 @@ STILL = 4  # new states in which one joint must read the same before that can co
 
 @dataclass(frozen=True)
 class SafetyConfig:
-    """Limits and watchdogs."""
+    """Limits and checks of states."""
 
     margin: float = 0.02
     """Distance kept from each end of a joint's range, rad."""
@@ -215,7 +215,7 @@ ASTRAY = ("obedience", "frozen", "jump", "tracking")
 
 
 class Watch:
-    """Watchdogs over successive states; the first fault is returned, and it is the caller who remembers it."""
+    """Checks of successive states; the first fault is returned, and it is the caller who remembers it."""
 
     def __init__(
         self, joint_names: tuple[str, ...], commanded: Array, dt: float, config: SafetyConfig, noisy: bool = True

@@ -67,7 +67,7 @@ class DryRun:
         """Leave the bus; nothing was sent."""
         self.driver.close(hold=True)
 
-    def guard(self) -> dict[str, object] | None:
+    def watchdog(self) -> dict[str, object] | None:
         """Nothing is commanded, so nothing must be damped."""
         return None
 

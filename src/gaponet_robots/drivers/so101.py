@@ -82,7 +82,7 @@ class SO101Driver:
         Args:
             calibration: JSON file that LeRobot's calibration wrote; default what the servos hold of it.
             timeout: Longest silence of the bus while replies are awaited, s.
-            silent: `connect` opens the port and says nothing: for the guard, because a bus has one speaker.
+            silent: `connect` opens the port and says nothing: for the watchdog, because a bus has one speaker.
             torque_limit: The limit of each servo, for a driver that does not connect, 0.1 %; default full.
         """
         if set(robot.joint_names) != set(SPEAK):
@@ -140,7 +140,7 @@ class SO101Driver:
         self._bus = reg.ServoBus(self._serial, self.timeout)
 
     def _say_exclusive(self, how: int) -> None:
-        """Let no other program open the port (ALONE; whoever has it open keeps it, so our guard), or let them again."""
+        """Let no other program open the port (ALONE; whoever has it open, as our watchdog, keeps it), or let them."""
         with contextlib.suppress(*LOST, AttributeError, ValueError):  # a port without a descriptor, or one that is gone
             if how:
                 fcntl.ioctl(self._serial.fileno(), how)  # type: ignore[union-attr]
@@ -368,7 +368,7 @@ class SO101Driver:
                 self._serial.close()
         self._serial = None
 
-    def guard(self) -> dict[str, object] | None:
+    def watchdog(self) -> dict[str, object] | None:
         """Has the port open before it is exclusive, and speaks only when this process is gone or hangs."""
         calibration = str(self.calibration) if self.calibration else None
         return {

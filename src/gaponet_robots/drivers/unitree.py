@@ -279,7 +279,7 @@ class UnitreeDriver:
         found = self._bus.publishers()
         return {topic: found[topic] for topic in ("rt/lowstate", "rt/arm_sdk", "rt/lowcmd", *sorted(found))}
 
-    def guard(self) -> dict[str, object] | None:
+    def watchdog(self) -> dict[str, object] | None:
         """A second participant that is connected from the start and silent while the controller lives."""
         return {
             "kind": "unitree", "robot": str(self.robot.folder.resolve()), "early": True, "topic": self.topic,

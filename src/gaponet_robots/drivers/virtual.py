@@ -139,6 +139,6 @@ class VirtualDriver:
     def close(self, hold: bool = False) -> None:
         """Nothing is left: the robot ends with the process."""
 
-    def guard(self) -> None:
+    def watchdog(self) -> None:
         """It dies with the controller's process."""
         return None

@@ -2,7 +2,7 @@
 
 A `Wire` brings what was said; `LiveTargets` judges it and is the controller's policy. A target that cannot be taken
 changes nothing: the last good one holds. Where none could be taken for a while the robot damps. What is taken goes
-through compensator, limits and guard as a motion's row does; docs/deploy-safety.md says what each fault ends in.
+through compensator, limits and watchdog as a motion's row does; docs/deploy-safety.md says what each fault ends in.
 """
 
 from __future__ import annotations

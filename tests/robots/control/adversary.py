@@ -93,7 +93,7 @@ class Adversary:
 
     def connect(self) -> None: ...
 
-    def guard(self) -> None:
+    def watchdog(self) -> None:
         return None
 
     def truth(self, t: float) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
     python tests/robots/control/live.py --minutes 10 [--model RUN]
 
-Four processes: a VIRTUAL H1-2 on DDS, `gaponet run --driver unitree --targets zmq` with its guard, and a sender that
+Four processes: a VIRTUAL H1-2 on DDS, `gaponet run --driver unitree --targets zmq` with its watchdog, and a sender that
 does something wrong every few seconds, for less than the robot waits, until it is killed. Then a short run for each way
 to go wrong for good. Prints JSON; exit code 1 if a run ended otherwise than docs/deploy-safety.md says, or if a command
 was outside the limits. `make faults` plays half a minute of it and three of the ways.

@@ -356,7 +356,7 @@ def test_a_compensator_acts_within_its_bounds(arm):
 
 
 def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
-    class Guard:
+    class Watchdog:
         beats = 0
 
         def alive(self):
@@ -366,25 +366,25 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
             return False
 
         def beat(self, weight):
-            assert guard.beats or not driver.sent, "from the first beat on it would damp the robot"
+            assert watchdog.beats or not driver.sent, "from the first beat on it would damp the robot"
             self.beats += 1
             return True
 
     class Slow:
         def reset(self, target, payload_mass=None):
-            assert guard.beats == 0  # from the first beat on, the guard damps a robot that it hears nothing of
+            assert watchdog.beats == 0  # from the first beat on, the watchdog damps a robot that it hears nothing of
             clock.wait_until(clock.now() + 0.4)
 
         def step(self, target, qpos, qvel):
             return target
 
-    clock, guard = SimulatedClock(), Guard()
+    clock, watchdog = SimulatedClock(), Watchdog()
     driver = Tampered(arm, clock)
     controller = Controller(driver, arm, QUICK, compensator=Slow(), clock=clock)
-    controller._guard = guard
+    controller._watchdog = watchdog
     recording = controller.run(play(MOTION, controller.dt))
     assert recording.fault is None
-    assert guard.beats > 40
+    assert watchdog.beats > 40
 
 
 def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
@@ -407,8 +407,8 @@ def test_damping_takes_the_stiffness_away_and_brakes(arm):
     assert (np.abs(sinking.qvel) < 5).all()
 
 
-def test_the_guard_tries_again_until_it_has_damped(capsys):
-    from gaponet_robots.control import guard
+def test_the_watchdog_tries_again_until_it_has_damped(capsys):
+    from gaponet_robots.control import watchdog
 
     class Loose:
         address = "/dev/loose"
@@ -434,7 +434,7 @@ def test_the_guard_tries_again_until_it_has_damped(capsys):
             self.closed = True
 
     robot = Loose()
-    guard._damp(robot, 0.1, 0.5, connected=False)
+    watchdog._damp(robot, 0.1, 0.5, connected=False)
     assert robot.tries == 3
     assert len(robot.damped) > 3
     assert 0.5 >= robot.damped[0] > robot.damped[-1]
@@ -442,4 +442,4 @@ def test_the_guard_tries_again_until_it_has_damped(capsys):
     said = capsys.readouterr().err
     assert "could NOT be damped: switch the supply off (the cable is out); trying again" in said
     assert "(one servo does not answer)" in said
-    assert said.endswith("guard: /dev/loose let go\n")
+    assert said.endswith("watchdog: /dev/loose let go\n")

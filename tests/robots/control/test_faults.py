@@ -61,7 +61,7 @@ def once(at_fault: Callable[[], object], injected: list[float]) -> Recording:
             at_fault()
         return swing(k) if k < AT + 30 else None
 
-    return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+    return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, watchdog=False).run(policy)
 
 
 def steady(served: RobotProcess, attempt: Callable[[list[float]], Any], kind: str = "", tries: int = 8) -> Any:
@@ -71,7 +71,7 @@ def steady(served: RobotProcess, attempt: Callable[[list[float]], Any], kind: st
     and not of the controller: again, and said. An attempt notes when it injects the fault, if it injects one.
     """
     for _ in range(tries):
-        wait(is_free)  # of the guard of the last attempt
+        wait(is_free)  # of the watchdog of the last attempt
         served.ask("clear")
         injected: list[float] = []
         recording = attempt(injected)
@@ -145,7 +145,7 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(served):
                 served.ask(word)
             return swing(k)
 
-        return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, guard=False).run(policy)
+        return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, watchdog=False).run(policy)
 
     recording = steady(served, attempt, "stale")
     assert recording.fault.kind == "stale", recording.fault.text
@@ -171,7 +171,7 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
         robots.append(RobotProcess(domain))
         driver = UnitreeDriver(ROBOT, domain=domain, sole=False)  # DDS remembers for a while who commanded before
         try:
-            return Controller(driver, ROBOT, config, SAFETY, guard=False, on_event=told).run(policy)
+            return Controller(driver, ROBOT, config, SAFETY, watchdog=False, on_event=told).run(policy)
         finally:
             if not injected:
                 robots[-1].kill()
@@ -249,7 +249,7 @@ Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY, S
 """
 
 
-def test_a_controller_killed_while_its_compensator_prepares_has_sent_nothing_and_its_guard_neither(served):
+def test_a_controller_killed_while_its_compensator_prepares_has_sent_nothing_and_its_watchdog_neither(served):
     served.ask("clear")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
     process = subprocess.Popen(
@@ -307,7 +307,7 @@ def test_a_controller_that_dies_or_hangs_leaves_a_damped_robot(served, how):
 
 
 def is_free() -> bool:
-    """Whether no guard is at it any more."""
+    """Whether no watchdog is at it any more."""
     try:
         with sole_publisher(UnitreeDriver(ROBOT, domain=DOMAIN).address):
             return True

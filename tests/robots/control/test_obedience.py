@@ -123,7 +123,7 @@ def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch
     arm.close()
 
 
-def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, guarded: object = None) -> Recording:
+def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched: object = None) -> Recording:
     """One and a half second in which all joints swing."""
     from gaponet_robots.drivers.so101 import SO101Driver
 
@@ -132,10 +132,10 @@ def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, guarded:
             controller.stop("the operator")
         return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
 
-    controller = Controller(SO101Driver(so101, timeout=0.001), so101, QUICK, clock=clock, guard=False)
-    if guarded:
-        controller._guard = guarded
-        controller._start_guard = lambda lock, stack: stack.callback(lambda: guarded.release(controller._loose))
+    controller = Controller(SO101Driver(so101, timeout=0.001), so101, QUICK, clock=clock, watchdog=False)
+    if watched:
+        controller._watchdog = watched
+        controller._start_watchdog = lambda lock, stack: stack.callback(lambda: watched.release(controller._loose))
     return controller.run(policy)
 
 
@@ -218,13 +218,13 @@ def test_a_servo_in_error_is_let_go_at_once(so101, clock, bus):
     assert told(bus, reg.TORQUE_LIMIT)[0][0] > off
 
 
-def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_guard_goes_on(so101, clock, bus):
+def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus):
     ends: list[bool] = []
     bus.way, bus.at = "lost", 1.0
     recording = play(
         so101,
         clock,
-        guarded=SimpleNamespace(alive=lambda: True, fired=lambda: False, beat=lambda weight: True, release=ends.append),
+        watched=SimpleNamespace(alive=lambda: True, fired=lambda: False, beat=lambda weight: True, release=ends.append),
     )
     assert recording.fault.kind == "driver"
     last = recording.events[-1]
@@ -281,7 +281,7 @@ def swing(
 
     config = ControlConfig(blend=1.5, settle=0.1, damp=1.0)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
-    recording = Controller(driver, robot, config, clock=clock, guard=False, payload_mass=told).run(policy)
+    recording = Controller(driver, robot, config, clock=clock, watchdog=False, payload_mass=told).run(policy)
     return recording, clock.robot.heard.weight
 
 
@@ -332,9 +332,9 @@ def test_a_run_in_which_nothing_moves_shows_nothing_and_is_no_data(monkeypatch):
     clock = living(monkeypatch, robot)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
     rest = lambda k, state: robot.qpos_home if k < 10 else None  # noqa: E731
-    recording = Controller(driver, robot, ControlConfig(blend=0.3, settle=0.0, damp=0.3), clock=clock, guard=False).run(
-        rest
-    )
+    recording = Controller(
+        driver, robot, ControlConfig(blend=0.3, settle=0.0, damp=0.3), clock=clock, watchdog=False
+    ).run(rest)
     assert recording.fault is None
     assert recording.events[-1].text == "no data: no joint was told to go far enough to show whether the robot obeys"
     with pytest.raises(LogError, match="no joint was told to go far enough"):

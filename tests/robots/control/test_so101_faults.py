@@ -86,7 +86,7 @@ def once(servos: ServoProcess, fault: str) -> Recording:
             servos.tell(fault)
         return None if k > 12 else np.array([0.2 * np.sin(0.3 * k), *np.zeros(5)])
 
-    return Controller(driver, ROBOT, SLOW, CALM, guard=False).run(policy)
+    return Controller(driver, ROBOT, SLOW, CALM, watchdog=False).run(policy)
 
 
 @pytest.mark.parametrize(
@@ -122,12 +122,12 @@ def test_a_cable_that_is_pulled_ends_the_run(servos):
             servos.process.wait()
         return None if k > 12 else np.zeros(6)
 
-    recording = Controller(driver, ROBOT, SLOW, CALM, guard=False).run(policy)
+    recording = Controller(driver, ROBOT, SLOW, CALM, watchdog=False).run(policy)
     assert recording.fault.kind in ("driver", "stale", "overrun")
 
 
 def let_go(port: str) -> None:
-    """Wait until the guard has damped: it holds the robot's lock as long."""
+    """Wait until the watchdog has damped: it holds the robot's lock as long."""
     deadline = time.monotonic() + 30
     while time.monotonic() < deadline:
         with contextlib.suppress(UsageError), sole_publisher(port):
@@ -136,7 +136,7 @@ def let_go(port: str) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
-def test_the_guard_switches_the_torque_off_when_the_controller_is_no_more(servos, how, tmp_path):
+def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(servos, how, tmp_path):
     script = (
         "import sys, numpy as np\n"
         "from gaponet_robots.control.controller import ControlConfig, Controller\n"

@@ -74,7 +74,7 @@ def test_a_link_that_loses_every_fifth_state_says_so():
     assert found["lost"] == pytest.approx(found["states"] / 4, rel=0.1)
 
 
-def test_a_robot_whose_mjcf_lies_in_a_subfolder_can_be_opened_by_a_guard(tmp_path):
+def test_a_robot_whose_mjcf_lies_in_a_subfolder_can_be_opened_by_a_watchdog(tmp_path):
     from gaponet_robots.drivers.unitree import UnitreeDriver
 
     folder = tmp_path / "arm"
@@ -88,6 +88,6 @@ def test_a_robot_whose_mjcf_lies_in_a_subfolder_can_be_opened_by_a_guard(tmp_pat
     text = (h1_2.folder / "robot.toml").read_text()
     (own / "robot.toml").write_text('mjcf = "model/robot.xml"\n' + text)
     (own / "model" / "robot.xml").write_text(h1_2.mjcf.read_text())
-    spec = UnitreeDriver(load_robot(own)).guard()
+    spec = UnitreeDriver(load_robot(own)).watchdog()
     spec.pop("early")
     assert open_driver(**spec).joint_names == h1_2.joint_names

@@ -298,10 +298,10 @@ def test_a_port_that_is_lost_while_damping_is_opened_again(driver, servos, wire)
     assert servos.heard[0] == OFF
 
 
-def test_the_guard_says_nothing_until_it_damps_and_then_asks_nothing(so101, wire, servos, driver):
+def test_the_watchdog_says_nothing_until_it_damps_and_then_asks_nothing(so101, wire, servos, driver):
     from gaponet_robots.drivers.open import open_driver
 
-    spec = driver.guard()
+    spec = driver.watchdog()
     early, other = spec.pop("early"), open_driver(**spec)
     del servos.heard[:]
     assert early

@@ -28,20 +28,20 @@ RETRY = 600.0  # s for which it tries to damp a robot that does not confirm it
 EVERY, AGAIN = 0.01, 0.1  # s between two messages, and after one that failed
 
 
-class Guard:
+class Watchdog:
     """The controller's end."""
 
     def __init__(self, spec: dict[str, object], lock: int, hang: float, damp: float) -> None:
         """
         Args:
-            spec: What the driver says of itself (Driver.guard).
+            spec: What the driver says of itself (Driver.watchdog).
             lock: Descriptor of the controller's lock.
             hang: s without a sign of life after which it damps.
             damp: s for which it damps.
         """
         text = json.dumps(spec | {"hang": hang, "damp": damp})
         self._process = subprocess.Popen(
-            child.words("gaponet_robots.control.guard", text),
+            child.words("gaponet_robots.control.watchdog", text),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(lock,), start_new_session=True, bufsize=0,
         )  # fmt: skip
         assert self._process.stdin
@@ -59,20 +59,20 @@ class Guard:
         ready, _, _ = select.select([self._out], [], [], timeout)
         if not ready or self._out.readline() != READY:
             self._process.kill()
-            raise DriverError("the guard process could not reach the robot; see its message above")
+            raise DriverError("the watchdog could not reach the robot; see its message above")
 
     def alive(self) -> bool:
-        """Whether the guard runs and has not taken this process for dead or hanging."""
+        """Whether the watchdog runs and has not taken this process for dead or hanging."""
         return self._process.poll() is None and not self.fired()
 
     def fired(self) -> bool:
-        """Whether the guard damps the robot or has damped it: nothing more may be sent."""
+        """Whether the watchdog damps the robot or has damped it: nothing more may be sent."""
         if not self._fired and select.select([self._out], [], [], 0)[0]:
             self._fired = self._out.readline() == FIRED
         return self._fired
 
     def beat(self, weight: float) -> bool:
-        """Say that the controller lives and has commanded the robot with this weight; False if the guard is gone."""
+        """Say that the controller lives and has commanded the robot with this weight; False if the watchdog is gone."""
         try:
             self._in.write(bytes([round(STEPS * weight)]))
         except BlockingIOError:
@@ -82,10 +82,10 @@ class Guard:
         return self._process.poll() is None
 
     def release(self, loose: bool = False) -> None:
-        """The controller has stopped; the guard ends without doing anything.
+        """The controller has stopped; the watchdog ends without doing anything.
 
         Args:
-            loose: Nobody confirmed that the robot is damped: the guard is left alone, and goes on trying.
+            loose: Nobody confirmed that the robot is damped: the watchdog is left alone, and goes on trying.
         """
         try:
             os.set_blocking(self._in.fileno(), True)
@@ -127,7 +127,7 @@ def main(spec: dict[str, Any]) -> None:
         return
     _say(FIRED)
     why = "ended" if readable else f"was silent for {hang * 1e3:.0f} ms"
-    print(f"guard: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
+    print(f"watchdog: the controller {why}; damping {driver.address}", file=sys.stderr, flush=True)
     _damp(driver, damp, weight, connected=early)
 
 
@@ -140,7 +140,7 @@ def _say(word: bytes) -> None:
 def _damp(driver: Driver, seconds: float, weight: float, connected: bool) -> None:
     """Damp for some seconds from when the robot could be reached, until it confirms it; what fails is tried again."""
     began, since, said = time.monotonic(), None, ""
-    tell = lambda text: print(f"guard: {driver.address} {text}", file=sys.stderr, flush=True)  # noqa: E731
+    tell = lambda text: print(f"watchdog: {driver.address} {text}", file=sys.stderr, flush=True)  # noqa: E731
     while True:
         now, wait = time.monotonic(), EVERY
         left = 1.0 if since is None else max(1.0 - (now - since) / seconds, 0.0)
