@@ -5,9 +5,10 @@ What it offers to gaponet (gaponet.parts); nothing is imported here.
 
 COMMANDS = {
     name: f"gaponet_lab.cli.{name}:{name}" for name in ("view", "report", "experiment", "runs", "demo", "bench")
-} | {name: f"gaponet_lab.cli.known:{name}" for name in ("show", "check")}
+} | {name: f"gaponet_lab.cli.known:{name}" for name in ("show", "check", "fleet")}
 PROVIDES = {
     "what is known of a robot": "gaponet_lab.known.evidence:known",
+    "what recordings say": "gaponet_lab.known.evidence:evidence",
     "figure of a gap": "gaponet_lab.report.gap_figure:write_gap",
     "figure of a replay": "gaponet_lab.report.replay_figure:write",
     "figures of a dataset": "gaponet_lab.report.draw_dataset:draw_all",

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,15 +27,18 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
     robot = write_arm(tmp_path / "arm")
     logs(robot, tmp_path / "data", 0, 8, kp=0.8, delay=1)
     logs(robot, tmp_path / "new_logs", 20, 4, kp=0.7, delay=1)
+    logs(robot, tmp_path / "logs" / "a", 40, 4, kp=0.8, delay=1)
     monkeypatch.chdir(tmp_path)
     blocks = re.findall(r"```(console|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert [kind for kind, _ in blocks] == ["console", "console", "python", "console"]
+    assert [kind for kind, _ in blocks] == ["console", "console", "python", "console", "console", "console"]
     codes = {}
     for kind, text in blocks:
         if kind == "python":
             exec(compile(text, "randomize.md", "exec"), {})
             continue
         for line in text.strip().splitlines():
+            if line.startswith("gaponet fleet"):
+                shutil.copytree("my_arm", "robots/a")
             try:
                 codes[line] = main(line.removeprefix("gaponet ").split())
             except SystemExit as end:

@@ -25,7 +25,7 @@ TASKS = {
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
-    "Is it closed?": ("eval", "check", "replay", "report", "runs", "experiment"),
+    "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
     "Share it, time it": ("push", "pull", "bench"),
 }

@@ -96,13 +96,14 @@ class Knowledge:
         """A joint's attribute as an array."""
         return np.array(getattr(self.joints[joint], what), float)
 
-    def si(self, joint: str) -> tuple[dict[str, float], Array]:
-        """A joint's values by field, and their covariance (P, P), in SI units."""
+    def si(self, joint: str, covariance: Array | None = None) -> tuple[dict[str, float], Array]:
+        """A joint's values by field, and their covariance (P, P), in SI units; or another one on the axes, in SI."""
         x, step = self.array(joint, "values"), 1e-6
         here = values_of(self.fields, x)
         ahead = values_of(self.fields, x + step * np.eye(len(x)))
+        own = self.array(joint, "covariance") if covariance is None else covariance
         slope = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
-        return {f: float(v) for f, v in here.items()}, slope @ self.array(joint, "covariance") @ slope.T
+        return {f: float(v) for f, v in here.items()}, slope @ own @ slope.T
 
 
 def seen(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:

@@ -75,8 +75,9 @@ def ranges(
         what = "days" if scope == "any-day" else "robots"
         notes.append(f"from {len(each)} {what}: how far they differ is known to a factor of {_factor(len(each)):.1f}")
     lost = np.sqrt(np.einsum("njj->nj", covariance)) > LOST * believed(fields, now)
-    rng, count = np.random.default_rng(seed), max(DRAWN, samples)
-    x = middle + np.einsum("sd,dnp->snp", rng.standard_normal((count, len(apart))), apart)
+    rng, count, alone = np.random.default_rng(seed), max(DRAWN, samples), _alone(apart)
+    x = middle + np.sqrt(1 - alone) * np.einsum("sd,dnp->snp", rng.standard_normal((count, len(apart))), apart)
+    x = x + np.sqrt(alone * np.square(apart).sum(axis=0)) * rng.standard_normal(x.shape)
     for i in range(len(joints)):
         x[:, i] += rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
     bounded = [f not in SIGNED and f not in ("kp", "stribeck_speed") for f in fields]
@@ -130,6 +131,17 @@ def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> A
         if one.operated != spec.operated:
             raise UsageError(f"{one.folder}: operates {', '.join(one.operated)}; this robot {', '.join(spec.operated)}")
     return np.stack([np.stack(list(seen(one, fields).values())) for one in found])
+
+
+def _alone(apart: Array) -> float:
+    """Share of the variance between few days or robots (k, n, P) that is drawn number by number: what goes together in
+    k of them may do so by chance (Schäfer and Strimmer 2005, shrinkage of correlations)."""
+    if len(apart) < FEWEST:
+        return 0.0
+    flat = apart.reshape(len(apart), -1)
+    flat = flat[:, np.square(flat).sum(axis=0) > 0]
+    r = np.corrcoef(flat.T)[np.triu_indices(flat.shape[1], 1)]
+    return float(min(1.0, ((1 - r**2) ** 2).sum() / (len(flat) - 1) / np.square(r).sum()))
 
 
 def _factor(count: int) -> float:

@@ -1,8 +1,9 @@
-"""gaponet show and gaponet check: what is known of a robot, and whether logs are still of it."""
+"""gaponet show, check and fleet: what is known of a robot, whether logs are still of it; and of many, every night."""
 
 from __future__ import annotations
 
 import sys
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -125,25 +126,60 @@ def check(
         raise SystemExit(1)
 
 
+def fleet(
+    robots: Annotated[Folder, tyro.conf.arg(help="Folder of robot folders, each of gaponet identify or calibrate.")],
+    logs: Annotated[Folder, tyro.conf.arg(help="Folder of each robot's logs or dataset; or one dataset of all units.")],
+    out: Path,
+    night: str = "",
+    calibrate: bool = True,
+    payload_mass: float | None = None,
+    executor: str = "local",
+    workers: int = 0,
+    json: Json = False,
+) -> None:
+    """A fleet's nightly job: check every robot, calibrate those that drifted, one page of who, by what, since when.
+
+    The same command again goes on where it was. The exit code is 0 where all are the same, else 1.
+
+    Args:
+        out: Folder of what is found: fleet.html, calibrated/ROBOT, ROBOT.json with its nights.
+        night: Its name; default today.
+        calibrate: Whether those that drifted are calibrated.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        executor: Where: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md); folders are on a
+            disk that all machines see.
+        workers: Robots at a time; 0 for as many as there are cores.
+    """
+    from gaponet.progress import bar
+    from gaponet_lab.known import fleet as known
+
+    screen, when, found = Out(json), night or date.today().isoformat(), dict[str, known.Night]()
+    with bar("checking") as update:
+        for name, mine, count in known.night(robots, logs, out, when, calibrate, payload_mass, executor, workers):
+            found[name] = mine
+            update(len(found), count, f"{name}: {mine['verdict']}")
+    odd = {name: mine for name, mine in sorted(found.items()) if mine["verdict"] != known.SAME}
+    if odd:
+        screen.table(f"Not as they were, {when}", ["robot", "since", "what moved, or what is wrong"], [
+            [name, known.since(known.history(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
+            for name, n in odd.items()
+        ])  # fmt: skip
+    took = sum(n["took"] for n in found.values())
+    screen.say(f"{len(found) - len(odd)} of {len(found)} are the same; {took:.0f} s of processor; {out / 'fleet.html'}")
+    screen.result({"night": when, "robots": found, "page": str(out / "fleet.html")})
+    if odd:
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
 def _row(m: Moved, known: Knowledge, counts: bool) -> list[str]:
+    from gaponet_lab.known.table import change
+
     mine = [k.left for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
     left = sum(mine) / len(mine)
-    return [m.joint, m.field, _by(m, known), f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
+    by = change(m.field, m.by, known, m.joint)
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
             "moved" if counts else ""]  # fmt: skip
-
-
-def _by(m: Moved, known: Knowledge) -> str:
-    """A change as people say it."""
-    if m.field in ("offset", "play"):
-        return f"{1e3 * m.by:+.1f} mrad"
-    if m.field == "delay":
-        return f"{1e3 * m.by:+.1f} ms"
-    if m.field in ("friction_motor", "friction_external"):
-        return f"{1e2 * m.by:+.1f} % of the load"
-    if m.field in ("kp", "stribeck_speed"):
-        return f"× {2.718281828459045**m.by:.2f}"
-    value = known.joints[m.joint].values[known.fields.index(m.field)]
-    return f"{100 * m.by / value:+.0f} %" if value > 1e-9 else "from none"
 
 
 def _plain(m: Moved) -> dict[str, object]:

@@ -59,6 +59,20 @@ def certainty(known: Knowledge, joint: str) -> Certainty:
     return Certainty(found.values, found.errors, _groups(tied, known.fields))
 
 
+def change(field: str, by: float, known: Knowledge, joint: str) -> str:
+    """How far a number moved on its axis, or play, as people say it."""
+    if field in ("offset", "play"):
+        return f"{1e3 * by:+.1f} mrad"
+    if field == "delay":
+        return f"{1e3 * by:+.1f} ms"
+    if field in ("friction_motor", "friction_external"):
+        return f"{1e2 * by:+.1f} % of the load"
+    if field in ("kp", "stribeck_speed"):
+        return f"× {np.exp(by):.2f}"
+    value = known.joints[joint].values[known.fields.index(field)]
+    return f"{100 * by / value:+.0f} %" if value > 1e-9 else "from none"
+
+
 def _groups(tied: Array, fields: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
     """Fields that hang together, two or more."""
     reach = np.linalg.matrix_power((tied | np.eye(len(fields), dtype=bool)).astype(float), len(fields)) > 0

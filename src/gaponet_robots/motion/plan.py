@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -25,15 +26,24 @@ BEST, ENOUGH = 41.0, 9.0  # minutes
 
 @dataclass(frozen=True)
 class Plan:
-    """Motions in the order in which they are played, at every payload (kg)."""
+    """Payload (kg) and motion, in the order in which they are played."""
 
-    motions: tuple[Motion, ...]
-    payloads: tuple[float, ...]
+    played: tuple[tuple[float, Motion], ...]
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """Each once."""
+        return tuple({m.name: m for _, m in self.played}.values())
+
+    @property
+    def payloads(self) -> tuple[float, ...]:
+        """kg, each once."""
+        return tuple(dict.fromkeys(mass for mass, _ in self.played))
 
     @property
     def minutes(self) -> float:
         """The time of all payloads together."""
-        return len(self.payloads) * sum(m.duration for m in self.motions) / 60
+        return sum(m.duration for _, m in self.played) / 60
 
 
 def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], seed: int = 0) -> Plan:
@@ -56,7 +66,7 @@ def make_plan(robot: RobotSpec, minutes: float, payloads: tuple[float, ...], see
         if sum(m.duration for m in chosen) >= 60 * minutes / len(payloads):
             break
         chosen.append(_standing(library, name))
-    return Plan(tuple(chosen), payloads)
+    return Plan(tuple((mass, motion) for mass in payloads for motion in chosen))
 
 
 def _standing(library: Library, name: str) -> Motion:
@@ -79,19 +89,27 @@ def _names(robot: RobotSpec, library: Library) -> Iterator[str]:
             yield from (f"{FIRST[k + 1]}-{short(joint)}" for joint in robot.operated)
 
 
-def sheet(robot: RobotSpec, plan: Plan, files: list[str], rate: float) -> str:
-    """What to do, and a table to fill in, as Markdown."""
+def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, known: Path | None = None) -> str:
+    """What to do, and a table to fill in, as Markdown.
+
+    Args:
+        files: Motion → file.
+        known: Folder of a robot of which there are logs already.
+    """
     gains = "; ".join(
         f"{short(j)} {robot.kp[i]:g}/{robot.kd[i]:g}" for i, j in enumerate(robot.joint_names) if j in robot.operated
     )
     masses = ", ".join(f"{p:g}" for p in plan.payloads)
     few = " Enough to identify gains, friction and delay; little to train on." if plan.minutes < ENOUGH else ""
+    size = (
+        f"On virtual H1-2 robots {ENOUGH:g} minutes left a third of the simulator's error, {BEST:g} came "
+        f"within a tenth of the best.{few}"
+    )
     lines = [
         f"# Recording sheet: {robot.name}",
         "",
-        f"{plan.minutes:.0f} minutes of motion: {len(plan.motions)} motions at {masses} kg, commands at {rate:g} Hz. "
-        f"On virtual H1-2 robots {ENOUGH:g} minutes left a third of the simulator's error, {BEST:g} came "
-        f"within a tenth of the best.{few}",
+        f"{plan.minutes:.{1 if known else 0}f} minutes of motion: {len(plan.motions)} motions at {masses} kg, "
+        f"commands at {rate:g} Hz. {'Chosen for what they tell of this robot beside its logs.' if known else size}",
         "",
         "Robot: ____________  unit: ____________  date: ____________  by: ____________",
         "",
@@ -107,14 +125,12 @@ def sheet(robot: RobotSpec, plan: Plan, files: list[str], rate: float) -> str:
         "| nr | file | kg | s | time | temperature | remarks |",
         "| ---: | --- | ---: | ---: | --- | --- | --- |",
     ]
-    number = 0
-    for mass in plan.payloads:
-        for motion, file in zip(plan.motions, files, strict=True):
-            number += 1
-            lines.append(f"| {number} | {file} | {mass:g} | {motion.duration:.0f} | | | |")
+    for number, (mass, motion) in enumerate(plan.played, 1):
+        lines.append(f"| {number} | {files[motion.name]} | {mass:g} | {motion.duration:.0f} | | | |")
     lines += ["", "Then, for each payload:", ""]
     lines += [
         f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out data"
         for p in plan.payloads
     ]
-    return "\n".join([*lines, "    gaponet doctor data", ""])
+    then = [f"    gaponet check {known} data", f"    gaponet calibrate {known} data --out ROBOT_2"] if known else []
+    return "\n".join([*lines, "    gaponet doctor data", *then, ""])
