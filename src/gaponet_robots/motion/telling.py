@@ -58,7 +58,7 @@ class Telling:
 
     @classmethod
     def of(cls, robot: RobotSpec, known: Knowledge, played: ListOf[Sequence], nthread: int = 0) -> Telling:
-        """Of recordings that the identified robot would make; their names differ."""
+        """What recordings would tell that the identified robot would make; their names differ."""
         evidence = take("PROVIDES", "what recordings say", "what is known of a robot")
         says = evidence(robot, played, known.fields, 10**6, nthread).by_recording()
         kept = lambda what: np.stack([known.array(j, what) for j in robot.operated])  # noqa: E731
@@ -70,7 +70,7 @@ class Telling:
         return self._joined(self.normals[:, list(picks)].sum(axis=1))
 
     def _joined(self, normal: Array) -> Array:
-        """Of slopes squared (…, n, P, P)."""
+        """Covariance after recordings with these slopes squared, (…, n, P, P)."""
         size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), NONE))
         share = normal / (size[..., :, None] * size[..., None, :]) + NONE * np.eye(normal.shape[-1])
         scaled = share / np.sqrt(self.scatter)[:, None, :]
