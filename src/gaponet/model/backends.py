@@ -135,13 +135,14 @@ class OnnxNetwork:
 class NumpyNetwork:
     """The weights of an artifact on numpy alone: for machines without onnxruntime, and to check it."""
 
-    def __init__(self, path: Path) -> None:
-        if not path.is_file():
+    def __init__(self, weights: Path | dict[str, Array]) -> None:
+        """weights: weights.npz, or what it holds (model/fuse.py)."""
+        if isinstance(weights, Path) and not weights.is_file():
             raise ModelError(
-                f"{path}: missing: this artifact was written without it, or its kind of network has no numpy form; "
+                f"{weights}: missing: this artifact was written without it, or its kind of network has no numpy form; "
                 "write it with gaponet export RUN, or load with backend='onnxruntime'"
             )
-        self.weights = FusedForward.read_weights(path)
+        self.weights = FusedForward.read_weights(weights) if isinstance(weights, Path) else weights
         self._made: dict[int, FusedForward] = {}
 
     def __call__(self, x: Array) -> Array:

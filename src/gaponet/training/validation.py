@@ -7,19 +7,19 @@ motions rather than the robot (docs/log.md).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 
 import numpy as np
 import torch
 
-from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.model.backends import FunctionNetwork
+from gaponet.model.backends import FunctionNetwork, Network, NumpyNetwork
 from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
+from gaponet.model.fuse import fuse
 from gaponet.model.layers import DeltaNet
-from gaponet.model.loop import Infer
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import replay
 
@@ -33,7 +33,7 @@ def mean_error(
     n, op = len(robot.operated), robot.operated_index
     corrector = None
     if net is not None:
-        corrector = DeltaCorrector(FunctionNetwork(_infer(net), config.input_dim(n), n), config, robot)
+        corrector = DeltaCorrector(_network(net, config.input_dim(n), n), config, robot)
     twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
     return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]))
 
@@ -55,13 +55,9 @@ def choose_gain(net: DeltaNet, error: Callable[[], float], whole: float) -> floa
     return best
 
 
-def _infer(net: torch.nn.Module) -> Infer:
-    """A network as a function of numpy arrays."""
-    net.eval()
-    device = next(net.parameters()).device
-
-    def infer(x: Array) -> Array:
-        with torch.inference_mode():
-            return net(torch.from_numpy(x).to(device)).cpu().numpy()
-
-    return infer
+def _network(net: torch.nn.Module, dim: int, n: int) -> Network:
+    """The form that ships, three times as fast as torch here, where this kind of network has one."""
+    net = copy.deepcopy(net).cpu().eval()
+    weights = fuse(net)
+    infer = torch.inference_mode()(lambda x: net(torch.from_numpy(x)).numpy())
+    return FunctionNetwork(infer, dim, n) if weights is None else NumpyNetwork(weights)
