@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -54,3 +55,14 @@ def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_
     assert pairs
     for there, here in pairs:
         assert abs(float(there) - float(here)) <= 0.05 * float(here) + 0.05
+
+
+@pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])
+def test_their_own_train_command_takes_the_exported_robot(exported: Path, tmp_path: Path, name: str) -> None:
+    to, _, version, packages = ENGINES[name]
+    python = environment(name, version, *((package,) for package in packages))
+    peer = Path(__file__).parent / f"{to}_train.py"
+    there = {**os.environ, "PYTHONPATH": f"{exported / to}{os.pathsep}{peer.parent}"}
+    subprocess.run([python, peer, tmp_path], cwd=exported / to, env=there, check=True)
+    trained = sorted(f.name for folder in (tmp_path, exported / to / "logs") for f in folder.rglob("model_*.pt"))
+    assert "model_1.pt" in trained
