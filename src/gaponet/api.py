@@ -237,7 +237,7 @@ def identify(
     from gaponet.data.split import split_entries
     from gaponet.files import writing
     from gaponet.robot_folder import ORIGIN, save_robot
-    from gaponet.sim.identify import BETTER, no_gain
+    from gaponet.sim.identify import BETTER
     from gaponet.sim.identify import identify as fit
     from gaponet.sim.replay import whole_errors
     from gaponet.training.budget import Budget
@@ -257,9 +257,9 @@ def identify(
         found = fit(
             data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update, seconds, stops
         )
-        given, left = whole_errors(val, spec, threads), whole_errors(val, found.robot, threads)
+        given, left = (whole_errors(val, one, threads) for one in (spec, found.judged or found.robot))
         if not found.better or left.mean() > BETTER * given.mean():
-            raise NoGainError(no_gain(found, spec, given, left))
+            raise NoGainError(found.no_gain(spec, given, left))
         save_robot(found.robot, Path(out))
         nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
         val_errors = {"nominal": nominal, "identified": left}
@@ -469,7 +469,8 @@ def calibrate_robot(
 
     Raises:
         UsageError: The unit is not named.
-        NoGainError: The fit does not follow the recordings better than the robot as it was known; nothing is written.
+        NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the robot as
+            it was known; nothing is written.
     """
     from gaponet.eval.knowledge import Knowledge
     from gaponet.files import write_text, writing
@@ -486,7 +487,15 @@ def calibrate_robot(
             found = refit(
                 sequences, spec, seconds, unknown_payload, None,
                 lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"), believed,
+                judge=not unknown_payload,
             )  # fmt: skip
+        if not found.kept:
+            before, after = (1e3 * float(e.mean()) if len(e) else 0.0 for e in found.judged)
+            told = f"leaves {after:.2f} mrad of {before:.2f}" if before else "is all there is of each joint"
+            raise NoGainError(
+                f"nothing is written: a motion that the fit does not see {told}, so keep {spec.name} as it is known; "
+                "or give motions that ask more of each joint"
+            )
         if found.payload_mass is not None:
             mass = float(found.payload_mass)
             sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]

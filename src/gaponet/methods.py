@@ -35,6 +35,7 @@ METHODS = {  # name, colour
     "load": ("friction by load", "#17543c"),
     "servo": ("least torque, encoder", "#113f2d"),
     "contact": ("table, stops, zeros", "#6b4f2a"),
+    "hand": ("where payloads hang, the hand", "#8d6e44"),
     "raw": ("raw targets", "#5c5c5c"),
     "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
     "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),

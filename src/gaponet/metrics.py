@@ -51,6 +51,12 @@ class Run:
         """e after each step, (T − 1, n), rad: row 0 is the common start and is no error."""
         return (self.qpos_sim - self.qpos_real)[1:]
 
+    def holds(self, columns: list[int] | None) -> list[int] | None:
+        """Those of these columns (None: all) that the recording holds; None where it holds all."""
+        if self.recorded is None:
+            return columns
+        return [i for i in self.recorded if columns is None or i in columns]
+
 
 def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec) -> list[Run]:
     """Put recordings and simulated positions (T, n_all) together, operated joints only."""
@@ -80,16 +86,9 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
         iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
         SAGE and the paper report, tables show the first few).
     """
-    mine = [(r, c) for r in part if (c := _recorded(r, columns)) is None or c]
+    mine = [(r, c) for r in part if (c := r.holds(columns)) is None or c]
     rows = [_sequence_metrics(r, c) for r, c in mine]
     return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
-
-
-def _recorded(run: Run, columns: list[int] | None) -> list[int] | None:
-    """Those of these columns that the recording holds."""
-    if run.recorded is None:
-        return columns
-    return [i for i in run.recorded if columns is None or i in columns]
 
 
 def _slice(run: Run) -> list[int] | slice:

@@ -365,4 +365,11 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
     identified = robot.with_servos(servos) if servos else robot
     if found is not None:
         identified = dataclasses.replace(identified, table=found, nominal=robot)
+    sides = [mount.side for mount in robot.payload_mounts]
+    for side in table.identified_mount:
+        if side not in sides:
+            raise RobotError(f"[identified_mount.{side}] names no [[payload_mount]]; sides are {', '.join(sides)}")
+    if moved := {side: vars(mount) for side, mount in table.identified_mount.items()}:
+        mounts = tuple(dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts)
+        identified = dataclasses.replace(identified, payload_mounts=mounts, nominal=robot)
     return identified

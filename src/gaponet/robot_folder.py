@@ -46,6 +46,10 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         if robot.table is not None and robot.table != robot.nominal.table:
             lines = [f"{name} = {value!r}\n" for name, value in vars(robot.table).items()]
             text += "[identified_table]\n" + "".join(lines)
+        if robot.payload_mounts != robot.nominal.payload_mounts:
+            text += "".join(
+                f'[identified_mount."{m.side}"]\npos = {list(m.pos)}\nmass = {m.mass!r}\n' for m in robot.payload_mounts
+            )
     xml = robot.mjcf.read_text(encoding="utf-8")
     xml = bare_mjcf(robot.mjcf) if FILES.search(xml) else xml
     beside = {name: robot.folder / name for name in BESIDE if (robot.folder / name).is_file()}

@@ -48,11 +48,21 @@ class ServoType:
 
 @dataclass(frozen=True)
 class PayloadMount:
-    """One [[payload_mount]], where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`."""
+    """One [[payload_mount]], where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`;
+    `mass` (kg) hangs there always, as a hand that the MJCF lacks."""
 
     side: Name
     body: str
     pos: tuple[Metres, Metres, Metres]
+    mass: Annotated[float, Interval(ge=0, le=100)] = 0.0
+
+
+@dataclass(frozen=True)
+class _Mount:
+    """One [identified_mount.SIDE]."""
+
+    pos: tuple[Metres, Metres, Metres]
+    mass: Annotated[float, Interval(ge=0, le=100)]
 
 
 @dataclass(frozen=True)
@@ -110,6 +120,7 @@ class RobotTable:
     carries_payload: bool = True  # false: the robot's payload is not in the simulator
     identified: dict[str, _Servo] = field(default_factory=dict)
     identified_table: Table | None = None
+    identified_mount: dict[str, _Mount] = field(default_factory=dict)
     description: str = ""
     license: str = ""
     mjcf: str = "robot.xml"

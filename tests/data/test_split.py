@@ -287,3 +287,17 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
     parts = make_split(report.dataset, "time")
     named = [[e.meta.motion for e in parts[part]] for part in PARTS]
     assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]
+
+
+def test_joints_recorded_one_at_a_time_are_all_judged_and_asked(arm, tmp_path):
+    data = Dataset.create(tmp_path / "data", arm)
+    for joint, others in (("shoulder", "abc"), ("elbow", "defg")):
+        still = next(j for j in arm.joint_names if j != joint)
+        for motion in others:
+            ctrl = wave(60, 2, hertz=0.3 + 0.1 * len(data))
+            one = arm_sequence(arm, ctrl, late(ctrl, 2), motion)
+            data.append(replace(one, meta=replace(one.meta, notes={"posture": {still: 0.0}})))
+    parts = split_entries(data)
+    for part in PARTS:
+        assert {e.meta.unrecorded for e in parts[part]} == {("shoulder",), ("elbow",)}
+    assert sum(map(len, parts.values())) == 7

@@ -18,7 +18,7 @@ from gaponet.eval.verdict import LEARNED
 from gaponet.methods import title
 from gaponet.metrics import Run
 from gaponet.sim.model import model_hash
-from gaponet.sim.replay import replay
+from gaponet.sim.replay import replay, whole_errors
 from gaponet_lab.report.gap_figure import waterfall
 
 
@@ -127,3 +127,16 @@ def test_the_steps_of_an_identified_simulator_are_those_that_a_report_reads(tmp_
     gap = panel | {"by_joint": {"elbow": panel}, "virtual": True, "unseen": True, "sequences": 1, "robot": "arm"}
     (tmp_path / "gap.json").write_text(json.dumps(gap))
     assert read_gap(tmp_path)["left"].keys() == panel["left"].keys()
+
+
+def test_a_joint_that_nobody_recorded_has_no_bar_and_dilutes_nothing(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    data = Dataset.create(tmp_path / "data", robot)
+    for s in recordings(robot, 3, rows=200):
+        data.append(replace(s, meta=replace(s.meta, notes={"posture": {"elbow": 0.0}})))
+    stiffer = robot.with_servos({"shoulder": {"kp": 30.0}})
+    found = gap_by_step(Candidate(stiffer.folder, stiffer, None), data)
+    assert list(found["by_joint"]) == ["shoulder"]
+    assert found["removed"]["gain"] == pytest.approx(found["by_joint"]["shoulder"]["removed"]["gain"])
+    both = whole_errors(data.sequences(data.entries), robot)
+    assert both.mean() == pytest.approx(found["methods"]["nominal"]["by_joint"]["shoulder"]["mpjae"], rel=1e-3)

@@ -4,22 +4,17 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
-from arm import recordings, write_arm
 from logs import arm_sequence, late, wave
 
-from gaponet.data.signals import differentiate, lowpass
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.robot import available, load_robot
-from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
-from gaponet.sim.model import build_model
 from gaponet_lab.real.adversaries import ADVERSARIES
 from gaponet_lab.real.bench import Bench, load_method
 from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
 from gaponet_lab.real.questions import floor, questions
-from gaponet_lab.real.rivals import METHODS, gains_of_torque, hanging, with_gains_of_torque
+from gaponet_lab.real.rivals import METHODS
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmark.md"
 
@@ -99,37 +94,3 @@ def test_the_method_on_the_page_is_one(arm, played, tmp_path):
     assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
     with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
         load_method("nothing.py:f")
-
-
-def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    mount = robot.payload_mounts[0]
-    true = replace(robot, payload_mounts=(replace(mount, pos=(mount.pos[0] - 0.06, *mount.pos[1:])),))
-    windows = []
-    for mass in (0.0, 0.2, 0.4):
-        for s in recordings(robot, 2, rows=200):
-            model = build_model(true, mass + 0.1, "both", s.dt)
-            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
-            qvel = differentiate(qpos, s.dt)
-            tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
-            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass))
-            windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
-    moved, load = hanging(windows, robot)
-    assert moved.payload_mounts[0].pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)
-    assert load(windows[0]).meta.payload_mass == pytest.approx(0.1, abs=0.02)
-
-
-def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(arm):
-    rng, made = np.random.default_rng(0), []
-    for seed in range(4):
-        ctrl = wave(200, 2, hertz=0.5 + 0.1 * seed)
-        s = arm_sequence(arm, ctrl, late(ctrl, 3), f"m{seed}")
-        error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
-        tau = np.stack([7.0 * error[:, 0] - 0.3 * s.qvel[:, 0], rng.standard_normal(200)], axis=1)
-        made.append(replace(s, tau=tau + 0.01 * rng.standard_normal(tau.shape)))
-    (kp, kd, explained), (_, _, noise) = gains_of_torque(made, arm).values()
-    assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
-    assert explained > 0.95 > 0.5 > noise
-    robot = with_gains_of_torque(made, arm)
-    assert robot.kp[0] == pytest.approx(7.0, rel=0.03)
-    assert robot.kp[1] == arm.kp[1]

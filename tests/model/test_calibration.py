@@ -17,6 +17,7 @@ from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.export import export
 from gaponet.robot import load_robot
+from gaponet.sim.refit import refit
 from gaponet.sim.replay import replay
 
 
@@ -120,3 +121,16 @@ def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs,
     with pytest.raises(NoGainError, match="nothing is written"):
         api.calibrate_robot(robot, same, tmp_path / "again", seconds=8.0)
     assert not (tmp_path / "again" / "robot.toml").exists()
+
+
+def test_one_short_command_calibrates_nothing_and_windows_of_several_are_judged_by_motions_left_out(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for payload in (0.0, 0.1):
+        data.append(record(robot, commands(60, 0), "m0", payload))
+    with pytest.raises(NoGainError, match="is all there is of each joint"):
+        api.calibrate_robot(robot, data, tmp_path / "one")
+    several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
+    found = refit(several, robot, judge=True)
+    assert (len(found.judged[0]), found.kept) == (3, True)
+    assert (found.judged[1] < 0.5 * found.judged[0]).all()
+    assert not refit([record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True).kept

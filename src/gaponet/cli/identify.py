@@ -125,10 +125,16 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray], details
         screen.table(f"{title}, ± standard error", ["joint", *(COLUMNS[f][0] for f in part)], rows)
     for term in found.tried:
         fell, error = (mrad(x) for x in term.gain)
-        kept = "kept" if term.kept else "not kept"
-        screen.say(
-            f"{term.name}: validation error falls by {fell} ± {error} mrad over {len(term.before)} recordings; {kept}"
+        told = (
+            f"{len(term.before)} {'motions' if term.name == 'torque' else 'recordings'}; {'not ' * (not term.kept)}kept"
         )
+        screen.say(f"{term.name}: validation error falls by {fell} ± {error} mrad over {told}")
+    if found.judged:
+        screen.say("from torque, then fitted to the validation motions, too: the numbers are from before that")
+        for m in found.robot.payload_mounts:
+            screen.say(
+                f"payload_mount {m.side}: at {m.pos} m of {m.body}, where {m.mass:g} kg hang that the model lacks"
+            )
     for law in found.shared:
         own, one = (mrad(e.mean()) for e in (law.before, law.after))
         costs = f"{mrad(-law.gain[0])} ± {mrad(law.gain[1])}"

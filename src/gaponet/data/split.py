@@ -66,8 +66,8 @@ def split_entries(
     rates: tuple[float, ...] = (),
     train_share: float = 1.0,
 ) -> Parts:
-    """Entries per part: the fixed split by motion, the same for all rates and shares; by repetition, where one or two
-    motions were played three times or more.
+    """Entries per part: the fixed split by motion, the same for all rates and shares, of each set of joints by itself
+    where recordings hold different ones; by repetition, where one or two motions were played three times or more.
 
     Args:
         holdout_units: Appear in the test part only, with its motions.
@@ -98,7 +98,7 @@ def split_entries(
     if len(set(lead.values())) < MOTIONS <= max(played.values(), default=0):
         parts = in_turn(dataset, "repetition")
         return parts | {p: [e for e in parts[p] if not away(e.meta)] for p in ("train", "val")}
-    motions = _by_motion(lead.values())
+    motions = _split_by_joints({lead[e.meta.motion]: frozenset(e.meta.unrecorded) for e in dataset.entries})
     motions["train"] = motions["train"][: max(1, round(train_share * len(motions["train"])))]
     entries_at = [e for e in dataset.entries if not rates or any(_same_rate(r, 1 / e.dt) for r in rates)]
     parts = {
@@ -187,6 +187,20 @@ def _by_motion(motions: Iterable[str]) -> dict[str, list[str]]:
         )
     test, val = (max(1, round(len(names) * share)) for share in (TEST_SHARE, VAL_SHARE))
     return {"train": names[test + val :], "val": names[test : test + val], "test": names[:test]}
+
+
+def _split_by_joints(unrecorded: dict[str, frozenset[str]]) -> dict[str, list[str]]:
+    """Split motions; where they hold different joints (one at a time, say) those of each set by themselves, so that
+    each joint is judged; of two motions one judges."""
+    groups = [[m for m in unrecorded if unrecorded[m] == joints] for joints in set(unrecorded.values())]
+    if len(groups) == 1 or max(map(len, groups)) < MOTIONS:
+        return _by_motion(unrecorded)
+    parts: dict[str, list[str]] = {part: [] for part in PARTS}
+    for names in map(hash_order, groups):
+        few = {"train": names[-1:], "val": names[:-1], "test": []}
+        for part, mine in (_by_motion(names) if len(names) >= MOTIONS else few).items():
+            parts[part] += mine
+    return {part: hash_order(names) for part, names in parts.items()}
 
 
 def _same_rate(a: float, b: float) -> bool:

@@ -78,7 +78,7 @@ def gap_by_step(
                 "unexplained": _above(metrics(done[last], [i])["mpjae"], floors[j]["both"]),
                 "floor": floors[j],
             }
-            for i, j in enumerate(robot.operated)
+            for i, j in enumerate(robot.operated) if metrics(done[last], [i])
         },
         "by_payload": {
             f"{p:g}": {n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()}
@@ -118,6 +118,7 @@ CAUSES = {
     "load": ("friction_motor", "friction_external"),
     "servo": ("min_torque", "encoder_step"),
     "contact": ("zero", "stop_low", "stop_high"),
+    "hand": (),
 }
 
 
@@ -132,8 +133,8 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
             for i, joint in enumerate(simulator.joint_names)
         }
         changed = robot.with_servos(servos)
-        if cause == "contact":
-            changed = replace(changed, table=simulator.table)
+        more = {"contact": "table", "hand": "payload_mounts"}.get(cause)
+        changed = replace(changed, **{more: getattr(simulator, more)}) if more else changed
         if model_hash(changed) != model_hash(robot):
             steps += [(cause, changed)] if cause != "friction" else [(cause, changed), ("creep", changed)]
         robot = changed
@@ -142,8 +143,9 @@ def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
 
 def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
     """How far each step lowers the error, and its standard error over motions, rad."""
-    c = slice(None) if columns is None else columns
-    errors = {name: np.array([np.abs(r.error[:, c]).mean() for r in part]) for name, part in done.items()}
+    held = {name: [(r, c) for r in part if (c := r.holds(columns)) is None or c] for name, part in done.items()}
+    errors = {name: np.array([np.abs(r.error if c is None else r.error[:, c]).mean() for r, c in part])
+              for name, part in held.items()}  # fmt: skip
     less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}
     return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
 

@@ -4,8 +4,8 @@ Per operated joint: kp, total damping, dry friction, armature, zero offset, comm
 lowers the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). First every joint on
 its own beside the recording (sim/joint_runs.py), from several starts; then all of them together in the simulator of the
 whole robot (sim/free_runs.py), from there and from the robot's file: least squares both times (sim/multistart.py).
-Validation motions choose among the given robot and what was found on the way; last comes what the robot touches
-(sim/touching.py).
+Validation motions choose among the given robot and what was found on the way; then comes what the robot touches
+(sim/touching.py); then a fit that begins with recorded torque is a rival to all that (gaponet_lab/known/torque.py).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 
 from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
+from gaponet.parts import named, offered
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
 from gaponet.sim.free_runs import FreeRuns, cut
@@ -100,15 +101,16 @@ class Identified:
     Attributes:
         robot: The same robot with identified parameters; as it was given where nothing did better.
         before, after: Mean |error| of the motions that judged, rad: of the given robot, of this one.
-        chosen: What did best: given, joints (each on its own), whole (all together), limbs (each as one), or mixed.
+        chosen: What did best: given, joints (each on its own), whole (all together), limbs (as one), mixed, or torque.
         warnings: What ended at a bound, what to look at, and what the recordings do not determine (last).
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         std: Joint → field → standard error; none of a shared law.
-        tried: The terms of the law in the order tried.
+        tried: The terms of the law in the order tried; then torque, by motions.
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
         by_joint: Joint → mean |error| before and after, rad.
         covariance: Joint → of its fields on the axes of eval/knowledge.py; none of a shared law.
+        judged: The robot that the validation motions judged, where `robot` was fitted to them, too, afterwards.
     """
 
     robot: RobotSpec
@@ -123,11 +125,25 @@ class Identified:
     by_joint: dict[str, tuple[float, float]] | None = None
     covariance: Covariance = field(default_factory=dict)
     undetermined: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    judged: RobotSpec | None = None
 
     @property
     def better(self) -> bool:
         """Whether it is another robot than the given one."""
         return self.chosen != "given" or bool(self.touch and self.touch.kept)
+
+    def no_gain(self, robot: RobotSpec, given: Array, left: Array) -> str:
+        """Why an identification writes nothing, and what to record."""
+        by_joint = self.by_joint or {}
+        worst = sorted(by_joint, key=lambda joint: -by_joint[joint][0])[:3]
+        told = ", ".join(f"{joint} {1e3 * by_joint[joint][0]:.2f}" for joint in worst)
+        why = f"; {self.warnings[0]}" if self.warnings else ""
+        return (
+            f"nothing is written: nothing that was fitted follows the {len(given)} validation motion(s) better than "
+            f"{robot.name} as it is ({1e3 * given.mean():.2f} mrad, best fit {1e3 * left.mean():.2f}; worst {told}). "
+            "Record gaponet excite's motions, every joint over its range, slow and fast, and look at gaponet doctor"
+            f"{why}"
+        )
 
 
 class Clock:
@@ -228,7 +244,9 @@ def identify(
     by_joint = dict(zip(robot.operated, each, strict=True))
     sure = {j: whole.covariance[j] for j in robot.operated if std[j]}
     wide = {joint: fields for joint, (fields, _) in unknown.items()}
-    return Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure, wide)
+    made = Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure, wide)
+    rival = offered("PROVIDES").get("identification from torque") if validation else None
+    return named(rival)(made, sequences, validation, given, nthread) if rival else made
 
 
 def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Values]]:
@@ -588,16 +606,3 @@ def _asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
                     "identify with --stops; if something was in its way, leave those motions out"
                 )
     return found
-
-
-def no_gain(found: Identified, robot: RobotSpec, given: Array, left: Array) -> str:
-    """Why an identification writes nothing, and what to record."""
-    by_joint = found.by_joint or {}
-    worst = sorted(by_joint, key=lambda joint: -by_joint[joint][0])[:3]
-    told = ", ".join(f"{joint} {1e3 * by_joint[joint][0]:.2f}" for joint in worst)
-    why = f"; {found.warnings[0]}" if found.warnings else ""
-    return (
-        f"nothing is written: nothing that was fitted follows the {len(given)} validation motion(s) better than "
-        f"{robot.name} as it is ({1e3 * given.mean():.2f} mrad, best fit {1e3 * left.mean():.2f}; worst {told}). "
-        f"Record gaponet excite's motions, every joint over its range, slow and fast, and look at gaponet doctor{why}"
-    )

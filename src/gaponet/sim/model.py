@@ -250,7 +250,7 @@ def _add_payload(spec: mujoco.MjSpec, robot: RobotSpec, mass: float, side: str) 
         raise RobotError(f"{robot.name} has no [[payload_mount]]; add one to robot.toml to attach {mass} kg")
     for mount in robot.payload_mounts:
         # An empty hand carries a massless ball: all payloads share one MjData layout, so one Batch steps them together.
-        carried = mass if robot.carries_payload and side in ("both", mount.side) else 0.0
+        carried = mount.mass + (mass if robot.carries_payload and side in ("both", mount.side) else 0.0)
         radius = max((3 * carried / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3), 1e-3)
         parent = spec.body(mount.body)
         if parent is None:

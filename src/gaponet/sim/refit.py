@@ -16,12 +16,13 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
+from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec
 from gaponet.sim.axes import MAX_DELAY, SLOW, WIDE_KP, ZERO, Bounds, Values
 from gaponet.sim.free_runs import WINDOW, FreeRuns, cut
 from gaponet.sim.joint_runs import SOFT
 from gaponet.sim.multistart import STEP, Errors, descend
-from gaponet.sim.replay import Corrector
+from gaponet.sim.replay import Corrector, whole_errors
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
@@ -29,6 +30,8 @@ PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all togethe
 TOGETHER = 0.05  # of it, where all joints leave their values by the same share: a cold day, a slow bus …
 COMMON = ("damping", "frictionloss", "delay")  # … which does not turn zeros, nor soften gains
 ITERATIONS, ENOUGH = 4, 1e-3  # at most, and the share of the cost by which it falls in one that is not the last
+FOLDS = 4  # at most, of motions that judge
+ONE_COMMAND = 4.0  # s: a window so short asks too little to tell about another one
 KP = 0.2  # of a logarithm: a large change
 LATE = 0.005  # s: a first delay, since a delay of zero hides what it does
 MASSES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # kg: where the search for an unknown payload starts
@@ -43,6 +46,8 @@ class _Refitted:
         robot: The same robot with fitted parameters.
         before, after: RMS error of the windows, rad.
         payload_mass, payload_std: kg in each hand that is said to carry, where it was asked for.
+        judged: Mean |error| of motions, as the robot was and fitted to the other ones, (motions,) rad.
+        kept: Whether they are followed better then, by more than the standard error; never by one short motion a joint.
     """
 
     robot: RobotSpec
@@ -50,6 +55,8 @@ class _Refitted:
     after: float
     payload_mass: float | None = None
     payload_std: float | None = None
+    judged: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
+    kept: bool = True
 
 
 def refit(
@@ -60,6 +67,7 @@ def refit(
     corrector: Corrector | None = None,
     progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
     believed: bool = True,
+    judge: bool = False,
 ) -> _Refitted:
     """Fit FIELDS of all operated joints at once.
 
@@ -71,6 +79,7 @@ def refit(
         corrector: Corrects the targets on the way, as in replay.
         progress: Called with iterations done, at most, and the present RMS error in rad.
         believed: Whether kd is what the servos have.
+        judge: See how motions are followed that are not fitted; joints that were asked one short motion stay then.
 
     Raises:
         UsageError: An unknown payload, and recordings filed under several.
@@ -81,7 +90,13 @@ def refit(
             f"these recordings are filed under {', '.join(f'{p:g}' for p in payloads)} kg; an unknown payload must be "
             "one and the same: give recordings of one mass"
         )
-    runs = FreeRuns(cut(sequences, max(1, round(seconds / WINDOW))), robot, corrector=corrector)
+    parts = cut(sequences, max(1, round(seconds / WINDOW)))
+    judged = _judged(parts, robot, corrector, believed) if judge else (np.zeros(0), np.zeros(0))
+    kept, less = not judge or parts[0].duration > ONE_COMMAND, judged[0] - judged[1]
+    if len(less):
+        kept = float(less.mean()) > np.nan_to_num(standard_error(less))
+        parts = [parts[i] for turns in _turns(parts) for turn in turns for i in turn]
+    runs = FreeRuns(parts, robot, corrector=corrector)
     spare = np.zeros(runs.n) if believed else robot.kd[runs.op]
     problem = _Problem(runs, Bounds(robot, sequences).first, unknown_payload, spare)
     done = 0
@@ -97,7 +112,32 @@ def refit(
     )  # fmt: skip
     before, after = (problem.rms(p) for p in (problem.own(float(np.mean(payloads))), x[0, 0]))
     mass = {"payload_mass": float(x[0, 0, -1]), "payload_std": problem.jackknife(x)} if unknown_payload else {}
-    return _Refitted(problem.robot_of(x[0, 0]), before, after, **mass)
+    return _Refitted(problem.robot_of(x[0, 0]), before, after, **mass, judged=judged, kept=kept)
+
+
+def _turns(parts: list[Sequence]) -> list[list[list[int]]]:
+    """The motions of each set of joints that is recorded together, as numbers of windows; a motion that is alone is
+    taken apart into its windows where these are long, else left out, as nothing else can judge it."""
+    groups: dict[tuple[str, ...], dict[str, list[int]]] = {}
+    for i, p in enumerate(parts):
+        groups.setdefault(p.meta.unrecorded, {}).setdefault(p.meta.motion, []).append(i)
+    every = [list(motions.values()) for motions in groups.values()]
+    every = [[[i] for i in m[0]] if len(m) == 1 and parts[m[0][0]].duration > ONE_COMMAND else m for m in every]
+    return [turns for turns in every if len(turns) > 1]
+
+
+def _judged(
+    parts: list[Sequence], robot: RobotSpec, corrector: Corrector | None, believed: bool
+) -> tuple[Array, Array]:
+    """Mean |error| of motions, as the robot is and fitted to the others, (motions,) rad."""
+    every, found = _turns(parts), list[tuple[float, ...]]()
+    for k in range(min(FOLDS, max(map(len, every), default=0))):
+        out = [turn for turns in every for turn in turns[k::FOLDS]]
+        rest = [parts[i] for turns in every for turn in turns if turn not in out for i in turn]
+        both = robot, refit(rest, robot, len(rest) * WINDOW, corrector=corrector, believed=believed).robot
+        found += [tuple(whole_errors([parts[i] for i in turn], r).mean() for r in both) for turn in out]
+    before, after = np.array(found).reshape(-1, 2).T
+    return before, after
 
 
 class _Problem:
@@ -156,6 +196,7 @@ class _Problem:
     def robot_of(self, x: Array) -> RobotSpec:
         """The robot with these parameters; joints that are not operated keep theirs."""
         values = {f: v[0] for f, v in self.values(x[None]).items() if f in FIELDS}
+        values |= {f: np.maximum(values[f], 0.0) for f in ("delay", "frictionloss")}  # a bound is met but for rounding
         joints = enumerate(self.runs.robot.operated)
         return self.runs.robot.with_servos({j: {f: float(f"{v[i]:.6g}") for f, v in values.items()} for i, j in joints})
 

@@ -81,9 +81,10 @@ def replay(
 
 
 def whole_errors(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int = 0) -> Array:
-    """Mean |error| of each whole motion in free run, operated joints, (motions,) rad."""
-    twins, op = replay(sequences, robot, nthread=nthread, lock_idle=True), robot.operated_index
-    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]
+    """Mean |error| of each whole motion in free run, operated joints that it holds, (motions,) rad."""
+    twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
+    held = [[i for i in robot.operated_index if robot.joint_names[i] not in s.meta.unrecorded] for s in sequences]
+    errors = [np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t, op in zip(sequences, twins, held, strict=True)]
     return np.nan_to_num(np.array(errors), nan=np.pi)
 
 

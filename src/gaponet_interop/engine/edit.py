@@ -260,10 +260,10 @@ def _surroundings(source: Source, robot: RobotSpec, prefix: str, payload_mass: f
             figures = {f: text_of(*getattr(own, f"pair_{f}")[i]) for f in ("friction", "solref", "solimp")}
             words = " ".join(f'{k}="{v}"' for k, v in figures.items())
             source.append("contact", f'    <pair geom1="{name}" geom2="{table}" condim="3" {words}/>\n')
-    if payload_mass:
-        radius = (3 * payload_mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
-        for mount in robot.payload_mounts:
-            ball = f'<geom type="sphere" size="{text_of(radius)}" mass="{payload_mass}" contype="0" conaffinity="0"/>'
+    for mount in robot.payload_mounts:
+        if mass := payload_mass + mount.mass:
+            radius = (3 * mass / (4 * math.pi * PAYLOAD_DENSITY)) ** (1 / 3)
+            ball = f'<geom type="sphere" size="{text_of(radius)}" mass="{mass}" contype="0" conaffinity="0"/>'
             source.insert(body(prefix + mount.body, "payload_mount"), f'<body name="{prefix}payload_{mount.side}" '
                           f'pos="{text_of(*mount.pos)}">{ball}</body>')  # fmt: skip
     if option:

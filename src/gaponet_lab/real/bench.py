@@ -23,7 +23,7 @@ from gaponet.robot_folder import save_robot
 from gaponet_lab.real.adversaries import ADVERSARIES, Adversary
 from gaponet_lab.real.cards import Card, Cards, prepare
 from gaponet_lab.real.questions import Question, floor, questions
-from gaponet_lab.real.rivals import Method, can_hang, identified
+from gaponet_lab.real.rivals import Method, identified
 
 Said = Callable[[str], None]
 
@@ -193,8 +193,6 @@ def _nothing_to_go_on(method: str, folds: list[Question]) -> bool:
     first = folds[0]
     if method == "constant":
         return len({(s.meta.payload_mass, s.meta.unit_id) for s in first.train}) < 2
-    if method == "from_torque":
-        return not all(can_hang(q) for q in folds)
     return (method == "elsewhere" and first.before is None) or (method == "calibrated" and not first.few)
 
 

@@ -16,10 +16,10 @@ from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
 from gaponet_lab.real.questions import Question
-from gaponet_lab.real.rivals import Answer, Method, best, nominal
+from gaponet_lab.real.rivals import Answer, Method, identified, nominal
 
 RECIPE = TrainConfig(warm_start=WarmStartConfig(rounds=3), mixed_gains=True)
-BASES = {"": nominal, "identification + ": best}
+BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 TRAINED = (("", "shared_mlp"), ("", "gaponet"), ("identification + ", "gaponet"))
 
@@ -41,7 +41,7 @@ def _trained(question: Question, base: str, kind: str, steps: int, work: Path) -
         dataset = Dataset.create(run / "recordings", question.robot)
         parts: dict[str, dict[str, str]] = {"test": {}}
         for part in ("train", "val"):
-            mine: list[Sequence] = [start.load(s) for s in getattr(question, part)]
+            mine: list[Sequence] = getattr(question, part)
             hashes = {s.content_hash(): s for s in mine}
             found = [dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()]
             parts[part] = {e.id: e.hash for e in found}

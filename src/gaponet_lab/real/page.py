@@ -20,7 +20,6 @@ LOOKS = {  # method's title → colour, marker
     "delay + offset": (colour("delay_offset"), "s"),
     "identified elsewhere": (shade(colour("identified"), 0.5), "o"),
     "identification": (colour("identified"), "o"),
-    "identification from torque": (shade(colour("identified"), -0.4), "o"),
     "identified elsewhere, calibrated": (colour("calibrated"), "D"),
     "shared MLP": (colour("shared_mlp"), "^"),
     "GAPONet": (colour("gaponet"), "^"),

@@ -1,0 +1,96 @@
+"""What recorded torque says: gains, where a payload hangs, what hand the model lacks; and when it is believed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, recordings, write_arm
+from logs import arm_sequence, late, wave
+
+from gaponet.data.signals import differentiate, lowpass
+from gaponet.errors import RobotError
+from gaponet.robot import load_robot
+from gaponet.robot_folder import save_robot
+from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.identify import identify
+from gaponet.sim.model import build_model, model_hash
+from gaponet.sim.replay import replay
+from gaponet_lab.known.torque import TorqueFit
+
+
+def moved(robot, metres, hand):
+    """The robot with its payload hung elsewhere, and a hand."""
+    mount = robot.payload_mounts[0]
+    return replace(robot, payload_mounts=(replace(mount, pos=(mount.pos[0] + metres, *mount.pos[1:]), mass=hand),))
+
+
+def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    true = moved(robot, -0.06, 0.1)
+    windows = []
+    for mass in (0.0, 0.2, 0.4):
+        for s in recordings(robot, 2, rows=200):
+            model = build_model(true, mass, "both", s.dt)
+            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
+            qvel = differentiate(qpos, s.dt)
+            tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
+            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass))
+            windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
+    found = TorqueFit(windows, robot).hanging().payload_mounts[0]
+    assert found.pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)
+    assert found.mass == pytest.approx(0.1, abs=0.02)
+
+
+def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(arm):
+    rng, made = np.random.default_rng(0), []
+    for seed in range(4):
+        ctrl = wave(200, 2, hertz=0.5 + 0.1 * seed)
+        s = arm_sequence(arm, ctrl, late(ctrl, 3), f"m{seed}")
+        error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
+        tau = np.stack([7.0 * error[:, 0] - 0.3 * s.qvel[:, 0], rng.standard_normal(200)], axis=1)
+        made.append(replace(s, tau=tau + 0.01 * rng.standard_normal(tau.shape)))
+    said = TorqueFit(made, arm)
+    (kp, kd, explained), (_, _, noise) = said.gains().values()
+    assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
+    assert explained > 0.95 > 0.5 > noise
+    assert said.trusted
+    assert said.robot.kp[0] == pytest.approx(7.0, rel=0.03)
+    assert said.robot.kp[1] == arm.kp[1]
+    assert not TorqueFit([replace(s, tau=None) for s in made], arm).trusted
+
+
+def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    true = moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated})
+    windows = []
+    for motion in range(6):
+        for mass in (0.0, 0.2, 0.4):
+            ctrl = commands(60, motion)
+            one = arm_sequence(robot, ctrl, ctrl, f"m{motion}")
+            one = replace(one, meta=replace(one.meta, payload_mass=mass))
+            (twin,) = replay([one], true)
+            windows.append(replace(one, qpos=twin.qpos, qvel=twin.qvel, tau=twin.tau))
+    found = identify(windows[:12], robot, windows[12:], terms=())
+    (tried,) = found.tried
+    assert (found.chosen, tried.name, tried.kept, len(tried.before)) == ("torque", "torque", True, 2)
+    assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
+    assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
+    assert found.judged is not None
+    assert not (found.judged.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
+    silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=())
+    assert (silent.judged, silent.tried) == (None, ())
+    assert found.after < silent.after
+
+
+def test_a_hand_and_where_payloads_hang_are_kept_in_the_folder(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    true = replace(moved(robot, -0.06, 0.3), nominal=robot)
+    save_robot(true, tmp_path / "kept")
+    again = load_robot(tmp_path / "kept")
+    assert again.payload_mounts == true.payload_mounts
+    assert again.before_identification.payload_mounts == robot.payload_mounts
+    assert model_hash(again) == model_hash(true) != model_hash(robot)
+    text = (tmp_path / "kept" / "robot.toml").read_text().replace('identified_mount."hand"', "identified_mount.foot")
+    (tmp_path / "kept" / "robot.toml").write_text(text)
+    with pytest.raises(RobotError, match=r"names no \[\[payload_mount\]\]"):
+        load_robot(tmp_path / "kept")
