@@ -48,11 +48,12 @@ class DeltaLoop:
         of = np.empty(0, np.float32) if of is None else of
         nothing = Bound(zeros_like(of, num_envs, at.dim), zeros_like(of, num_envs, n), lambda: None)
         self.bound = network.bind(num_envs) if network else nothing
-        self.x, self.history = self.bound.x, History(config, n, self.bound.x)
-        self._host = isinstance(self.x, np.ndarray)
-        self._xp = library(self.x)
+        x = self.x = self.bound.x
+        self.history = History(config, n, x)
+        self._now, self._mass = [x[:, part] for part in (at.q, at.v, at.action)], x[:, at.payload.start]
+        self._host, self._xp = isinstance(x, np.ndarray), library(x)
         self.low, self.high = (
-            np.array(side, float) if self._host else self.x.new_tensor(side) for side in np.transpose(qpos_range)
+            np.array(side[None], float) if self._host else x.new_tensor(side) for side in np.transpose(qpos_range)
         )
         self.held = np.full(num_envs, config.delta_hold)  # control periods since the correction was decided
         self.kept = zeros_like(self.x, num_envs, n)  # the correction decided then
@@ -90,15 +91,15 @@ class DeltaLoop:
             ctrl: Target of the coming period, the same shape, rad.
             payload_mass: kg, one number or (num_envs,).
         """
-        x, at = self.x, self.layout
         if self.any_fresh:
             new = self.fresh.copy()
             self.begin(new, *(values[new][:, None] for values in (qpos, qvel, ctrl)))
-        x[:, at.q], x[:, at.v], x[:, at.action] = qpos, qvel, ctrl
+        for place, values in zip(self._now, (qpos, qvel, ctrl), strict=True):
+            place[...] = values
         self.history.write()
         if self.config.payload_input:
-            x[:, at.payload.start] = payload_mass / self.config.payload_max
-        return x
+            self._mass[...] = payload_mass / self.config.payload_max
+        return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
         """The correction for the coming control period; ask exactly once per period.
@@ -159,10 +160,10 @@ class DeltaLoop:
         return self.kept
 
     def _rows(self, *given: Any) -> tuple[Any, ...]:
-        rows = tuple(np.asarray(values) if self._host else values for values in given)
+        rows = tuple(map(np.asarray, given)) if self._host else given
         if self.num_envs == 1 and rows[0].ndim == 1:
-            rows = tuple(values[None] for values in rows)
-        if not rows[0].shape == rows[1].shape == rows[2].shape == (self.num_envs, self.n):
+            rows = tuple([values[None] for values in rows])
+        if not rows[0].shape == rows[1].shape == rows[2].shape == self.applied.shape:
             q, v, a = (tuple(np.shape(values)) for values in given)
             raise UsageError(
                 f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of {self.num_envs} robots "

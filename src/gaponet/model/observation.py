@@ -54,6 +54,8 @@ class History:
         self.inside = config.stride == 1
         held = self.place if self.inside else zeros_like(x, len(x), 3 * n * self.depth)
         self.frames = held.reshape(len(x), self.depth, 3 * n)  # a view, of a slice of columns too
+        self.newest = tuple(self.frames[:, 0, part : part + n] for part in (0, n, 2 * n))
+        self.older, self.younger = self.frames[:, 1:], self.frames[:, :-1]
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
         """Fill histories from real frames before the start, never with zeros.
@@ -69,13 +71,10 @@ class History:
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
-        frames, n = self.frames, self.n
         if self.depth > 1:
-            frames[:, 1:] = copy_of(frames[:, :-1])  # torch would overwrite what it has yet to read
-        newest = frames[:, 0]
-        newest[:, :n] = qpos
-        newest[:, n : 2 * n] = qvel
-        newest[:, 2 * n :] = u
+            self.older[...] = copy_of(self.younger)  # torch would overwrite what it has yet to read
+        for place, values in zip(self.newest, (qpos, qvel, u), strict=True):
+            place[...] = values
 
     def write(self) -> None:
         """Bring x up to date."""
