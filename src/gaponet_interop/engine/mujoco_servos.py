@@ -33,7 +33,8 @@ class Servos:
         import mujoco
 
         joints = facts[form]
-        column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in next(iter(joints.values()))}
+        numbers = [f for f, value in next(iter(joints.values())).items() if isinstance(value, int | float)]
+        column = {f: np.array([j.get(f, 0.0) for j in joints.values()]) for f in numbers}
         ids = [model.joint(prefix + name).id for name in joints]
         self.model, self.dof, self.at = model, model.jnt_dofadr[ids], model.jnt_qposadr[ids]
         self.servo = np.array([np.flatnonzero(model.actuator_trnid[:, 0] == j)[0] for j in ids])

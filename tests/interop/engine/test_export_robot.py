@@ -9,7 +9,7 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from arm import write_arm
+from arm import XML, write_arm
 
 from gaponet.cli.main import main
 from gaponet.errors import RobotError
@@ -163,6 +163,13 @@ def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_
     assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
     assert made.left["scene.xml with servo_law.py"] < 2e-5
     assert f'-    <general name="second" joint="elbow" {degrees}/>' in (tmp_path / "out/changes.diff").read_text()
+
+
+def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path, quick):
+    xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace("<option ", '<option timestep="0.005" ')
+    endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
+    made = export_robot(endless, "mjcf", tmp_path / "out")
+    assert made.left["robot.xml with servo_law.py"] < 2e-5
 
 
 def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(robot, lawful, tmp_path, quick):
