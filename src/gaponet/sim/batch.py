@@ -14,7 +14,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
-from gaponet.sim.servo import ServoLaw
+from gaponet.sim.servo import ServoLaw, present
 
 Array = np.ndarray
 
@@ -172,7 +172,7 @@ class BatchSim:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
         if self.law is not None:
-            rows = np.arange(self.num_envs)[ids]
+            rows, self.law.active = np.arange(self.num_envs)[ids], present(self.law.values)
             self.law.reset(rows, self.qpos[rows] if past is None else past[:, 0])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:

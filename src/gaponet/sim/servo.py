@@ -24,8 +24,8 @@ FINEST = 1e-9  # rad: of encoder_step
 
 
 def present(law: Law) -> Law:
-    """The part of a law that is not zero everywhere; what is not in a law is not computed."""
-    return {name: x for name, x in law.items() if x.any()}
+    """The part of a law that is not zero everywhere, no speed below SLOWEST; what is not in it is not computed."""
+    return {name: x.clip(min=SLOWEST) if name == "stribeck_speed" else x for name, x in law.items() if x.any()}
 
 
 def passing_friction(by_motor: Any, by_load: Any, torque: Any, load: Any) -> Any:
@@ -45,8 +45,7 @@ def friction_limit(law: Law, frictionloss: Any, qvel: Any, torque: Any, load: An
         by_motor, by_load = law.get("friction_motor", 0.0), law.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in law:
-        speed = law["stribeck_speed"].clip(min=SLOWEST) if "stribeck_speed" in law else SLOWEST
-        limit = limit + resting_friction(library(qvel).exp, law["stribeck"], speed, qvel)
+        limit = limit + resting_friction(library(qvel).exp, law["stribeck"], law.get("stribeck_speed", SLOWEST), qvel)
     return limit
 
 
@@ -124,6 +123,7 @@ class ServoLaw:
 
     Attributes:
         values: Name of LAW → (nsim, nu); may be written.
+        active: What of them is present, as of the simulations' last reset.
         frictionloss, bias: The model's, without what is added here, (nsim, nu) N·m; may be written.
         torque, load: The actuators' torque in the last physics step, and what gravity and Coriolis forces take from it,
             (nsim, nu) N·m. Together with the batch's own state all that the next step follows from.
@@ -137,23 +137,22 @@ class ServoLaw:
         self.batch, self.model = batch, model
         user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(LAW)))
         self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
-        self.dof = like(self._qpos, model.jnt_dofadr[model.actuator_trnid[:, 0]])
+        dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
+        self.dof = slice(dof[0], dof[-1] + 1) if (np.diff(dof) == 1).all() else like(self._qpos, dof)  # a view
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
         self.values: Law = {name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(LAW)}
         self.frictionloss, self.bias = copy_of(self._limit[:, self.dof]), copy_of(self._bias[:, :, 0])
         self.torque, self.load = (zeros_like(self._force, *self._force.shape) for _ in range(2))
-        self._lasting: Law | None = None
+        self.active = present(self.values)
 
     def take(self, other: ServoLaw, rows: Array) -> None:
-        """Be servos of another batch, its simulations `rows`; for good, so that nothing is looked up at each step."""
-        self.bias[:], self.frictionloss[:] = (
-            like(self.bias, other.bias[rows]),
-            like(self.bias, other.frictionloss[rows]),
-        )
+        """Be servos of another batch, its simulations `rows`."""
+        self.bias[:] = like(self.bias, other.bias[rows])
+        self.frictionloss[:] = like(self.bias, other.frictionloss[rows])
         self.values = {name: like(self.bias, x[rows]) for name, x in other.values.items()}
-        self._lasting = present(self.values)
+        self.active = present(self.values)
 
     def reset(self, ids: Any, target: Any) -> None:
         """Simulations `ids` were put into a state, under position targets (k, nu) rad."""
@@ -165,7 +164,7 @@ class ServoLaw:
 
     def before(self) -> None:
         """Set bias and friction for the next physics step."""
-        law, gain = present(self.values) if self._lasting is None else self._lasting, self._gain[:, :, 0]
+        law, gain = self.active, self._gain[:, :, 0]
         if "encoder_step" in law or "min_torque" in law:
             # Of a late servo (MuJoCo delays ctrl behind this) the least torque goes by the target that is under way.
             qpos = self._qpos[:, self.dof]
