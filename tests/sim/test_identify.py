@@ -64,12 +64,25 @@ def test_a_joint_behind_one_command_is_loaded_and_one_behind_many_is_stopped(tmp
     robot = write_arm(tmp_path)
     s = recordings(robot, 1, rows=200)[0]
     ctrl = np.zeros_like(s.ctrl)
-    ctrl[:, 0] = np.linspace(0.0, 0.8, len(ctrl))
+    ctrl[:, 0] = 0.8 * (1 - np.cos(np.linspace(0, 4 * np.pi, len(ctrl)))) / 2  # against it twice
     ctrl[100:, 1] = 0.5
     qpos = np.minimum(ctrl, 0.3)
     found = with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))])
     assert found.qpos_range[0, 1] == pytest.approx(0.3, abs=1e-3)
     np.testing.assert_array_equal(found.qpos_range[1], robot.qpos_range[1])
+
+
+def test_a_soft_joint_that_sticks_where_its_command_turned_has_met_no_stop(tmp_path):
+    robot = write_arm(tmp_path)
+    s = recordings(robot, 1, rows=400)[0]
+    ctrl = np.zeros_like(s.ctrl)
+    ctrl[:, 0] = 0.9 * np.sin(np.linspace(0, 6 * np.pi, len(ctrl)))
+    qpos = np.zeros_like(ctrl)
+    for t in range(1, len(ctrl)):  # a spring to the command that is as soft as friction is strong: 0.4 rad of play
+        qpos[t, 0] = np.clip(qpos[t - 1, 0], ctrl[t, 0] - 0.4, ctrl[t, 0] + 0.4)
+    pressed = (ctrl[:, 0] > qpos[:, 0].max() + 0.1) & (qpos[:, 0] > qpos[:, 0].max() - 0.005)
+    assert pressed.sum() >= 50  # as long as against a stop
+    assert with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))]).qpos_range[0, 1] == 1.5
 
 
 def test_what_is_told_of_limbs_is_told_of_their_joints():

@@ -573,24 +573,32 @@ def _inverse(normal: Array, size: Array) -> Array:
     return np.asarray(np.linalg.pinv(normal / each + held, rcond=1e-10, hermitian=True) / each)
 
 
-STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and differ there; rows that must show it
+STOPPED, OFTEN = 0.1, 50  # rad that commands go beyond a stop, and further there; rows that must show it
 
 
 def with_stops(robot: RobotSpec, sequences: ListOf[Sequence]) -> RobotSpec:
     """The robot with joint stops narrower than the MJCF's, where commands go on and the joint stays.
 
-    A joint that hangs far behind one command is loaded or stuck: several commands must have met the stop.
+    A joint that hangs far behind is loaded, or stuck as its command comes back: a stop is where a command went on by
+    STOPPED after the joint had come to its end, twice at least.
     """
     servos: dict[str, dict[str, float]] = {}
     for joint, i in zip(robot.operated, robot.operated_index, strict=True):
-        qpos, ctrl = (np.concatenate([getattr(s, f)[:, i] for s in sequences]) for f in ("qpos", "ctrl"))
         for name, sign in (("stop_low", -1.0), ("stop_high", 1.0)):
-            end = float((sign * qpos).max())
-            pressed = (sign * ctrl > end + STOPPED) & (sign * qpos > end - 0.005)
-            met = pressed.sum() >= OFTEN and np.ptp(ctrl[pressed]) > STOPPED
+            paths = [(sign * s.ctrl[:, i], sign * s.qpos[:, i]) for s in sequences]
+            end = max(float(qpos.max()) for _, qpos in paths)
+            against = [c for ctrl, qpos in paths for c in _against(ctrl, qpos, end)]
+            went_on = [c.max() - c[0] > STOPPED for c in against]
+            met = sum(map(len, against)) >= OFTEN and sum(went_on) > 1
             if met and sign * robot.qpos_range[i, int(sign > 0)] > end + 0.01:
                 servos.setdefault(joint, {})[name] = round(sign * end, 4)
     return robot.with_servos(servos) if servos else robot
+
+
+def _against(ctrl: Array, qpos: Array, end: float) -> list[Array]:
+    """Commands well beyond the end of a joint's way while it is there, each time by itself; all of one direction."""
+    rows = np.flatnonzero((ctrl > end + STOPPED) & (qpos > end - 0.005))
+    return np.split(ctrl[rows], np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []
 
 
 def _asked_stops(given: RobotSpec, met: RobotSpec) -> list[str]:
