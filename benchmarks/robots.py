@@ -7,7 +7,7 @@
 
 Each seed: a vendor's file that is wrong and logs of a plain simulator; gaponet robot new, import, doctor, identify; and
 benchmarks/plain_fit.py on the same dataset. Both are measured by gaponet gap on FRESH motions that are in no dataset
-that anything was fitted to, as many of each kind. One JSON line a robot.
+that anything was fitted to, as many of each kind. One JSON line a robot; each robot has a process of its own.
 """
 
 from __future__ import annotations
@@ -276,14 +276,14 @@ def main() -> None:
     rows = [json.loads(line) for line in journal.read_text().splitlines()] if journal.exists() else []
     seconds = args.seconds or (SMALL if args.small else None)
     rows = [r for r in rows if r["seed"] not in (args.seeds or ())]
-    process = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))  # imports are paid once
     for seed in args.seeds or range(args.first, args.first + args.robots):
         if any(r["seed"] == seed for r in rows):
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
         how = (seconds, args.small, args.named, args.spoil, not args.alone)
-        rows.append(process.submit(play, seed, folder, args.motions, *how).result())
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+            rows.append(process.submit(play, seed, folder, args.motions, *how).result())
         journal.write_text("".join(json.dumps(row) + "\n" for row in rows))
         r = rows[-1]
         print(
@@ -294,7 +294,6 @@ def main() -> None:
         )
         if not args.keep:
             shutil.rmtree(folder)
-    process.shutdown()
     text = "\n".join([*tables(rows), "", *losers(rows)]) + "\n"
     print(text)
     if args.page:

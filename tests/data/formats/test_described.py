@@ -213,6 +213,8 @@ def test_the_guess_for_a_strange_table_reads_it(tmp_path, arm, capsys):
         ("timestamp", "cmd_shoulder", "cmd_elbow", "q_shoulder", "q_elbow"),
         ("t", "shoulder.target", "elbow.target", "shoulder.position", "elbow.position"),
         ("time", "shoulder/command", "elbow/command", "shoulder/actual", "elbow/actual"),
+        ("time", "q_des_1", "q_des_2", "q_1", "q_2"),
+        ("time", "des_pos.shoulder", "des_pos.elbow", "pos.shoulder", "pos.elbow"),
     ],
 )
 def test_the_guess_knows_how_others_call_things(tmp_path, arm, capsys, names):

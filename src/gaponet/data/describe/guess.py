@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -99,16 +100,15 @@ def _channels(recording: Recording) -> dict[str, str]:
 
 
 def _patterns(name: str) -> list[str]:
-    """Each way to read a name as joint and word: shoulder_pan_des → {joint}_des; cmd_1 → cmd_{joint}."""
+    """Each way to read a name as joint and words: shoulder_pan_des → {joint}_des; q_des_1 → q_des_{joint}."""
+    words = list(re.finditer(r"[A-Za-z0-9]+", name))
     found = []
-    for match in re.finditer(r"[A-Za-z0-9]+", name):
-        word = match[0].lower()
-        if any(word in words for words in WORDS.values()):
-            before, after = name[: match.start()], name[match.end() :]
-            if after and not re.search("[A-Za-z0-9]", before):
-                found.append(name[: match.end()] + after[0] + "{joint}" if not after[0].isalnum() else "{joint}")
-            elif before:
-                found.append("{joint}" + name[match.start() - 1 :])
+    for known, run in groupby(words, lambda m: any(m[0].lower() in told for told in WORDS.values())):
+        first, *_, last = *(together := list(run)), together[-1]
+        if known and last.end() < len(name):
+            found.append(name[: last.end() + 1] + "{joint}")
+        if known and first.start():
+            found.append("{joint}" + name[first.start() - 1 :])
     return found or [name]
 
 
@@ -120,7 +120,8 @@ def _joints(recording: Recording, channels: dict[str, str]) -> list[str]:
     if "{joint}" not in pattern:
         return list(recording.signals.get(pattern) or ("0",))
     before, after = map(re.escape, pattern.split("{joint}"))
-    return [m[1] for c in recording.columns if (m := re.fullmatch(f"{before}(.+?){after}", c))]
+    kind = "qpos" if "qpos" in channels else "ctrl"
+    return [m[1] for c in recording.columns if (m := re.fullmatch(f"{before}(.+?){after}", c)) and _kind(c) == kind]
 
 
 def _names(channels: dict[str, str], joints: list[str], robot: RobotSpec) -> list[str]:

@@ -249,13 +249,15 @@ def _matching(recording: Recording, told: LogsFile, channel: str, taken: set[str
         return [(joint, f"{pattern}[{x}]" if own else pattern) for joint, x in zip(labels, own or "0", strict=True)]
     if pattern.count("{joint}") != 1:
         return []  # an array that this recording does not have
-    before, after = map(re.escape, pattern.split("{joint}"))
-    fits = re.compile(f"{before}(?P<joint>.+?){after}")
+    # q_{joint} reads q_des_1 as well: where another channel says more of a column's name, it is that channel's.
+    longer = [str(p) for c in CHANNELS if (p := told.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)]
+    own, *others = [re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}")))) for p in (pattern, *longer)]
     return [
         (m["joint"], column)
         for column in recording.columns
-        if column not in taken and (m := fits.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
-    ]
+        if column not in taken and (m := own.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
+        and not any(other.fullmatch(column) for other in others)
+    ]  # fmt: skip
 
 
 def _gain_columns(recording: Recording, told: LogsFile, name: str, ctrl: Columns) -> Columns:
