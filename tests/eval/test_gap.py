@@ -87,6 +87,14 @@ def test_causes_lead_from_the_nominal_simulator_to_the_identified_one(tmp_path):
     assert causes(robot) == []
 
 
+def test_a_servo_with_less_damping_than_its_files_kd_is_the_last_step_too(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    robot = replace(robot, kd=np.full_like(robot.kd, 0.5))
+    found = robot.with_servos({"elbow": {"damping": -0.3}})
+    assert found.kd[1] == pytest.approx(0.2)
+    assert model_hash(causes(found)[-1][1]) == model_hash(found)
+
+
 def test_what_a_step_removes_has_a_standard_error_over_motions(tmp_path):
     robot = write_arm(tmp_path / "arm")
     sequences = recordings(robot, 3, rows=50)

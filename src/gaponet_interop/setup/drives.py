@@ -68,7 +68,8 @@ def drives(
     if without:
         raise UsageError(
             f"{file} has no position gain for {some(without)}: give those of the controller that recorded the logs, "
-            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad)"
+            "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); where nobody knows them a guess will do, "
+            "gaponet identify finds them within a factor of 50"
         )
     return tuple(found)
 

@@ -251,11 +251,11 @@ def _matching(recording: Recording, told: LogsFile, channel: str, taken: set[str
         return []  # an array that this recording does not have
     # q_{joint} reads q_des_1 as well: where another channel says more of a column's name, it is that channel's.
     longer = [str(p) for c in CHANNELS if (p := told.get(c)) and "{joint}" in str(p) and len(str(p)) > len(pattern)]
-    own, *others = [re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}")))) for p in (pattern, *longer)]
+    mine, *others = [re.compile("(?P<joint>.+?)".join(map(re.escape, p.split("{joint}")))) for p in (pattern, *longer)]
     return [
         (m["joint"], column)
         for column in recording.columns
-        if column not in taken and (m := own.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
+        if column not in taken and (m := mine.fullmatch(column)) and column.startswith(COMMAND) <= (channel == "ctrl")
         and not any(other.fullmatch(column) for other in others)
     ]  # fmt: skip
 
