@@ -2,6 +2,7 @@
 
     python benchmarks/known.py virtual WORK --robots 100 --form right|wrong   VIRTUAL two-joint arms, a line each
     python benchmarks/known.py real ROBOT DAY OTHER_DAY WORK                  datasets of two days; ROBOT of the first
+    python benchmarks/known.py halves ROBOT DAY OTHER_DAY WORK                a fit on half of a day asked on the other
     python benchmarks/known.py table WORK                                     the tables of docs/results/known.md
 
 A virtual arm is drawn from the hard fleet; with the right form only its gain, damping, dry friction, delay and encoder
@@ -30,7 +31,7 @@ from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.axes import CLASSIC, Bounds
 from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import Clock, Fit
+from gaponet.sim.identify import Clock, Fit, identify
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
 from gaponet_lab.known.drift import drift
@@ -188,6 +189,39 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
     (work / "real.json").write_text(json.dumps(facts, indent=1))
 
 
+def halves(folder: Path, day: Path, other: Path, work: Path) -> None:
+    """Identified from each half of a day's motions and asked of the other, and of both days' logs under one name."""
+    data, there = Dataset(day), Dataset(other)
+    robot, logs = load_robot(folder), data.sequences(data.entries)
+    later, file = there.sequences(there.entries), work / "halves.json"
+    lines = json.loads(file.read_text()) if file.is_file() else []
+    for k in range(len(lines), 2):
+        mine, rest = logs[k::2], logs[1 - k :: 2]
+        fitted = identify(mine[::4] + mine[1::4] + mine[2::4], robot, mine[3::4], table=False, nthread=1)
+        save_robot(fitted.robot, work / f"half{k}")
+        half = load_robot(work / f"half{k}")
+        sure = known(half, mine[::4] + mine[1::4] + mine[2::4], mine[3::4], fitted.covariance, nthread=1)
+        sure.save(work / f"half{k}")
+        op, twins = half.operated_index, replay(rest, half, nthread=1)
+        error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(rest, twins, strict=True)])
+        asked = {"other half": rest, "half of it, half of another day": rest[::2] + later[1 - k :: 4]}
+        asked |= {"three quarters, a quarter of another day": rest[: len(rest) * 3 // 4] + later[1 - k :: 8]}
+        said = {}
+        for what, of in asked.items():
+            found = drift(half, sure, [replace(s, meta=replace(s.meta, motion=f"{s.meta.motion} {i}"))
+                                       for i, s in enumerate(of)], 1)  # fmt: skip
+            mine_too = {f"{s.meta.motion} {i}" for i, s in enumerate(of) if any(s is r for r in rest)}
+            aside = {a.recording for a in found.against}
+            moved = [(m.joint, m.field, m.by, m.sigmas) for m in found.moved]
+            said[what] = {"verdict": found.verdict, "moved": moved, "of": len(of)}
+            said[what] |= {"aside": len(aside), "aside, of the other day": len(aside - mine_too)}
+        inside = (error <= [j.band for j in sure.joints.values()]).mean(axis=0)
+        alone = (error <= [NORMAL_90 * j.predicted for j in sure.joints.values()]).mean(axis=0)
+        lines.append({"inside": inside.tolist(), "alone": alone.tolist(), "said": said})
+        file.write_text(json.dumps(lines, indent=1))
+        print(lines[-1], flush=True)
+
+
 def table(work: Path) -> None:
     """What was found, in Markdown."""
     for form in ("right", "wrong"):
@@ -219,7 +253,7 @@ def table(work: Path) -> None:
 def main() -> None:
     """As above."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("virtual", "real", "table"))
+    parser.add_argument("what", choices=("virtual", "real", "halves", "table"))
     parser.add_argument("paths", nargs="+", type=Path)
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--form", choices=("right", "wrong"), default="wrong")
@@ -227,8 +261,8 @@ def main() -> None:
     args.paths[-1].mkdir(parents=True, exist_ok=True)
     if args.what == "virtual":
         virtual(args.paths[0], args.robots, args.form)
-    elif args.what == "real":
-        real(*args.paths)
+    elif args.what in ("real", "halves"):
+        {"real": real, "halves": halves}[args.what](*args.paths)
     else:
         table(args.paths[0])
 
