@@ -103,9 +103,8 @@ def main() -> None:
             f"{size / 1e6:.2f} MB of logs each; not the same {len(moved)}, changed indeed {len(right)}"
         )
         for robot in sorted({*moved, *(r for r, what in named.items() if what and night == "night2")}):
-            print(
-                f"  {robot}: {named[robot] if night == 'night2' else 'nothing'} → {'; '.join(moved.get(robot, ['same']))}"
-            )
+            what = named[robot] if night == "night2" else "nothing"
+            print(f"  {robot}: {what} → {'; '.join(moved.get(robot, ['same']))}")
 
 
 if __name__ == "__main__":

@@ -101,9 +101,9 @@ class Knowledge:
         x, step = self.array(joint, "values"), 1e-6
         here = values_of(self.fields, x)
         ahead = values_of(self.fields, x + step * np.eye(len(x)))
-        own = self.array(joint, "covariance") if covariance is None else covariance
         slope = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
-        return {f: float(v) for f, v in here.items()}, slope @ own @ slope.T
+        about = self.array(joint, "covariance") if covariance is None else covariance
+        return {f: float(v) for f, v in here.items()}, slope @ about @ slope.T
 
 
 def seen(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:

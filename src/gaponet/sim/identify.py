@@ -450,11 +450,14 @@ class Fit:
             found = found.reshape(*found.shape[:2], -1)
         else:
             found = runs.run(values)
-        told = {"kp": TOLD if self.bounds.stated else BELIEF["kp"], "armature": BELIEF["armature"]}
+        told = BELIEF | ({"kp": TOLD} if self.bounds.stated else {})
         given = {f: np.where(self.bounds.first[f] > 0, self.bounds.first[f], np.nan) for f in told}
-        weight = self.noise / SOFT * np.sqrt(LASTS / max(self.runs.dt, 0.01))
-        far = [np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / v)) * weight / told[f] for f, v in given.items()]
+        far = [np.nan_to_num(np.log(np.maximum(values[f], 1e-9) / v)) * self._one() / told[f] for f, v in given.items()]
         return np.concatenate([found / np.float32(SOFT), np.stack(far, axis=-1)], axis=2, dtype=np.float32)
+
+    def _one(self) -> Array:
+        """The standard deviation of an error that counts as one beside a belief, (n,) in SOFT."""
+        return np.asarray(self.noise / SOFT * np.sqrt(LASTS / max(self.runs.dt, 0.01)))
 
     def robot(self, values: Values) -> RobotSpec:
         """The robot with these values."""
@@ -464,9 +467,8 @@ class Fit:
         )
 
     def uncertainty(self, values: Values) -> tuple[Std, Std]:
-        """Standard errors, joint → field, of the values and of those that are searched over kp: from the slopes at the
-        end and how much windows pull against each other (a sandwich estimate, windows as clusters), together with how
-        far one more step would go."""
+        """Standard errors, joint → field, of the values and of those that are searched over kp: from slopes,
+        windows that pull against each other, how wide a belief is that holds a value, and how far a step more goes."""
         names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
         axes, runs = Axes(self.bounds, names, values), self.runs if self.company is None else self.company
         x = axes.of(values)
@@ -476,16 +478,15 @@ class Fit:
         window = runs.window
         parts = max(1, -(-CLUSTERS // (int(window.max()) + 1)))  # of a window, where there are few
         order, turn = np.argsort(window, kind="stable"), np.zeros(len(window), int)
-        edges = np.flatnonzero(np.diff(window[order], prepend=-1))
-        count = np.diff(np.append(edges, len(window)))
-        turn[order] = np.concatenate([np.arange(c) * parts // c for c in count])
-        cluster = window * parts + turn
-        clusters = int(cluster.max()) + 1
+        turn[order] = np.concatenate([np.arange(c) * parts // c for c in np.unique(window, return_counts=True)[1]])
+        clusters = int((cluster := window * parts + turn).max()) + 1
         each = np.zeros((self.n, clusters, len(names)))
         np.add.at(each, (slice(None), cluster), pull[:, :-2])  # type: ignore[arg-type]
-        each = each - each.mean(axis=1, keepdims=True)
+        each -= each.mean(axis=1, keepdims=True)
+        believed = jac[:, -2:] * self._one()[:, None, None]
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
         spread = np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - len(names), 1))
+        spread += np.swapaxes(believed, -1, -2) @ believed
         # What no row has to say of a parameter is as unknown as before: then it is the file's, or nobody's.
         size = np.sqrt(np.einsum("...ii->...i", normal))
         lost = size < 3e-5
@@ -496,10 +497,9 @@ class Fit:
         ahead = [axes.values(x + 1e-3 * row) for row in np.eye(len(names))]
         by = {f: np.stack([(a[f] - values[f]) / 1e-3 for a in ahead], axis=-1) for f in names}
         std = {f: np.sqrt(np.einsum("np,npq,nq->n", g, cov, g)) + (np.abs(g) * lost).max(axis=1) for f, g in by.items()}
-        for f, error in self._stepped(values).items():
-            std[f] = np.hypot(std[f], error)
-        joints, wide = self.base.operated, cov + (1e3 * np.eye(len(names)) * lost[..., None, :])
-        wide = axes.unit[..., :, None] * wide * axes.unit[..., None, :]
+        std |= {f: np.hypot(std[f], error) for f, error in self._stepped(values).items()}
+        joints, unit = self.base.operated, axes.unit[..., None]
+        wide = unit * (cov + 1e3 * np.eye(len(names)) * lost[..., None, :]) * np.swapaxes(unit, -1, -2)
         self.covariance = {j: (names, wide[i]) for i, j in enumerate(joints)}
         found = {j: {f: float(std[f][i]) for f in names} for i, j in enumerate(joints)}
         return found, {j: {f: float(width[i, k]) for k, f in enumerate(names)} for i, j in enumerate(joints)}
