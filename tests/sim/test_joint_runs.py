@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from arm import TOML, recordings, write_arm
 
+from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.metrics import runs, summary
-from gaponet.robot import LAW
+from gaponet.robot import LAW, load_robot
 from gaponet.sim import joint_runs
 from gaponet.sim.identify import identify
 from gaponet.sim.joint_runs import JointRuns
@@ -79,3 +80,20 @@ def test_what_was_not_recorded_stands_still_and_counts_nowhere(tmp_path):
     total = summary(runs(windows, [t.qpos for t in replay(windows, robot)], robot), robot)
     assert total["mpjae"] == total["by_joint"][robot.joint_names[1]]["mpjae"]
     assert total["by_joint"][robot.joint_names[0]] == {}
+
+
+def test_no_joint_flies_away_where_gravity_is_stiffer_than_its_servo():
+    """The G1's waist bent, its servos softer and softer: at most from stop to stop."""
+    robot = load_robot("g1_29")
+    qpos = np.tile(np.float32(robot.qpos_home), (200, 1))
+    qpos[:, robot.index(["waist_roll_joint", "waist_pitch_joint"])] = 0.3
+    meta = SequenceMeta("g1_29", "unit", "bent", 0.0)
+    runs = JointRuns([Sequence(meta, robot.joint_names, 0.02, qpos, qpos, 0 * qpos)], robot)
+    candidates = (3, len(robot.operated))
+    values = {f: np.zeros(candidates) for f in FIRST} | {
+        "kp": np.repeat([[40.0], [10.0], [0.1]], candidates[1], axis=1)
+    }
+    way = np.ptp(robot.qpos_range[robot.operated_index], axis=1)
+    for errors in (runs.errors(values), runs._arrays(values)):
+        assert (np.abs(errors).max(axis=(2, 3)) <= way).all()
+        assert np.abs(errors[2]).max() > 0.3  # the softest falls

@@ -31,9 +31,7 @@ def mean_error(
 ) -> float:
     """MPJAE over the motions, rad; None for the simulator as it is."""
     n, op = len(robot.operated), robot.operated_index
-    corrector = None
-    if net is not None:
-        corrector = DeltaCorrector(_network(net, config.input_dim(n), n), config, robot)
+    corrector = None if net is None else DeltaCorrector(_network(net, config.input_dim(n), n), config, robot)
     twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
     return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]))
 

@@ -121,9 +121,9 @@ class WarmStart:
         """
         before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
         self.collect(follow_labels=self.done == 0)
-        x, y = torch.cat(self.pool_x), torch.cat(self.pool_y)
-        config, net = self.config, self.net
-        losses = np.zeros(config.gradient_steps)
+        self.pool_x, self.pool_y = [torch.cat(self.pool_x)], [torch.cat(self.pool_y)]  # once in memory
+        x, y, config, net = self.pool_x[0], self.pool_y[0], self.config, self.net
+        fits = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)  # read when all are done
         net.train()
         net.sample_sensors = True
         spent = 0.0
@@ -131,18 +131,19 @@ class WarmStart:
             progress = min(max((self.done + step / config.gradient_steps) / config.rounds, spent), 1.0)
             for group in self.optimiser.param_groups:
                 group["lr"] = config.learning_rate * 0.1**progress
-            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
+            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator).to(x.device)
             loss = (torch.nan_to_num(net(x[batch]) - y[batch]) ** 2).mean()
             self.optimiser.zero_grad()
             loss.backward()
             ranks.average(*(p.grad for p in self.trained if p.grad is not None))
             self.optimiser.step()
-            losses[step] = loss.item()
+            fits[step] = loss.detach()
             spent = tick()
         net.sample_sensors = False
         net.eval()
         self.done += 1
         self.rounds.append(before)
+        losses = fits.cpu().numpy()
         quarter = max(len(losses) // 4, 1)
         last, earlier = losses[-quarter:], losses[-2 * quarter : -quarter]
         return {"label_rmse": _rms(last), "label_rmse_before": _rms(earlier)}
