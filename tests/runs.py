@@ -60,3 +60,15 @@ def random_run(folder: Path, robot: RobotSpec, **how: object) -> GapModel:
     torch.save({"best_state": net.state_dict()}, folder / "checkpoint.pt")
     save_robot(robot, folder / "robot")
     return GapModel.load(folder)
+
+
+SMALL = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+
+
+def small_model(robot: RobotSpec, folder: Path) -> GapModel:
+    """A model that corrects by some ten mrad."""
+    torch.manual_seed(0)
+    net = build_network(SMALL, len(robot.operated))
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    export(net, folder, make_card(SMALL, robot, dt=[robot.dt]), drawn_states(net))
+    return GapModel.load(folder)

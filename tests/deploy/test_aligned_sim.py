@@ -5,29 +5,14 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-import torch
 from arm import TOML, commands, recordings, write_arm
+from runs import small_model
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
 from gaponet.errors import ModelError, UsageError
-from gaponet.model.artifact import GapModel, make_card
-from gaponet.model.config import ModelConfig
-from gaponet.model.deeponet import build_network
-from gaponet.model.export import drawn_states, export
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
-
-CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
-
-
-def small_model(robot, folder):
-    """A model that corrects by some ten mrad."""
-    torch.manual_seed(0)
-    net = build_network(CONFIG, len(robot.operated))
-    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
-    export(net, folder, make_card(CONFIG, robot, dt=[robot.dt]), drawn_states(net))
-    return GapModel.load(folder)
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 from arm import commands, write_arm
+from runs import small_model
 
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.errors import UsageError
 from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model
-
-from .test_aligned_sim import small_model
 
 gymnasium = pytest.importorskip("gymnasium")
 
@@ -33,14 +32,14 @@ def model(robot, tmp_path_factory):
 def test_the_tracking_environment_keeps_gymnasiums_rules(robot, model):
     from gymnasium.utils.env_checker import check_env
 
-    from gaponet.deploy.gym import TrackingEnv
+    from gaponet_interop.gym import TrackingEnv
 
     check_env(TrackingEnv(AlignedSim(robot, model), [commands(30, 0), commands(40, 1)]), skip_render_check=True)
 
 
 def test_gymnasium_makes_it_by_name():
     env = gymnasium.make(
-        "gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101", motions=["chirp-elbow_flex"], preview=1
+        "gaponet_interop.gym:gaponet/Tracking-v0", robot="so101", motions=["chirp-elbow_flex"], preview=1
     )
     observation, _ = env.reset(seed=0)
     assert observation.shape == env.observation_space.shape == (15,)
@@ -48,7 +47,7 @@ def test_gymnasium_makes_it_by_name():
 
 
 def test_worlds_side_by_side_move_as_each_alone_and_begin_anew_by_themselves(robot, model):
-    from gaponet.deploy.gym import TrackingEnv, TrackingVectorEnv
+    from gaponet_interop.gym import TrackingEnv, TrackingVectorEnv
 
     references, rng = [commands(6, 0), commands(9, 1)], np.random.default_rng(0)
     many = TrackingVectorEnv(AlignedSim(robot, model, num_envs=3), references)
@@ -74,14 +73,14 @@ def test_worlds_side_by_side_move_as_each_alone_and_begin_anew_by_themselves(rob
 
 def test_gymnasium_makes_worlds_side_by_side_by_name():
     env = gymnasium.make_vec(
-        "gaponet.deploy.gym:gaponet/Tracking-v0", num_envs=2, robot="so101", motions=["chirp-elbow_flex"]
+        "gaponet_interop.gym:gaponet/Tracking-v0", num_envs=2, robot="so101", motions=["chirp-elbow_flex"]
     )
     assert env.reset(seed=0)[0].shape == (2, 20)
     assert env.step(env.action_space.sample())[1].shape == (2,)
 
 
 def test_an_idle_policy_asks_the_simulator_for_the_reference(robot, model):
-    from gaponet.deploy.gym import TrackingEnv
+    from gaponet_interop.gym import TrackingEnv
 
     reference = commands(30, 0)
     env, sim = TrackingEnv(AlignedSim(robot, model), [reference]), AlignedSim(robot, model)
@@ -100,7 +99,7 @@ def test_an_idle_policy_asks_the_simulator_for_the_reference(robot, model):
 
 
 def test_motions_of_another_width_are_refused(robot, model):
-    from gaponet.deploy.gym import TrackingEnv
+    from gaponet_interop.gym import TrackingEnv
 
     with pytest.raises(UsageError, match=r"motions \(T, 2\)"):
         TrackingEnv(AlignedSim(robot, model), [np.zeros((10, 3))])
@@ -108,7 +107,7 @@ def test_motions_of_another_width_are_refused(robot, model):
 
 @pytest.mark.parametrize(("stiffer", "atol"), [(1.0, 1e-6), (2.0, 5e-3)])
 def test_a_wrapped_environment_moves_as_the_aligned_simulator(robot, model, stiffer, atol):
-    from gaponet.deploy.gym import AlignedActions
+    from gaponet_interop.gym import AlignedActions
 
     class Plain(gymnasium.Env):
         """A MuJoCo environment as users write them."""

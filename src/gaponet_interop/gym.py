@@ -150,7 +150,7 @@ def _tracking(
     num_envs: int | None = None,
     **options: Any,
 ) -> TrackingEnv | TrackingVectorEnv:
-    """gymnasium.make("gaponet.deploy.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
+    """gymnasium.make("gaponet_interop.gym:gaponet/Tracking-v0", robot="so101"): follow the library's motions.
 
     Args:
         robot: Name, or folder with a slash; an identified one is played as identified.
@@ -168,9 +168,8 @@ def _tracking(
     return kind(AlignedSim(spec, network, payload_mass, num_envs=num_envs), references, **options)
 
 
-gymnasium.register(
-    "gaponet/Tracking-v0", entry_point="gaponet.deploy.gym:_tracking", vector_entry_point="gaponet.deploy.gym:_tracking"
-)
+MADE = "gaponet_interop.gym:_tracking"
+gymnasium.register("gaponet/Tracking-v0", entry_point=MADE, vector_entry_point=MADE)
 
 
 class AlignedActions(gymnasium.Wrapper):
