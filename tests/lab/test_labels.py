@@ -58,3 +58,25 @@ def test_samples_that_are_there_twice_are_one_recording_and_two_moving_joints_ar
     both = Log("arm", ("elbow", "wrist"), {"ctrl": Channel(time, two), "qpos": Channel(time, two)}, "both")
     with pytest.raises(LogError, match="2 joints are commanded to move"):
         estimate([("both", both)], MASSES, UNITS, {})
+
+
+def test_a_recording_whose_commands_were_written_down_late_is_named_by_its_torque():
+    rng, logs, odd = np.random.default_rng(1), [], {3, 11}
+    for i in range(16):
+        time = 0.02 * np.arange(60)
+        ctrl = np.clip(0.5 + 0.2 * (i % 2) * np.sin(9 * time) - 1.0 + 1.2 * time, -0.5, 0.9)
+        qpos = np.interp(time - 0.06, time, ctrl) - 0.02 * (i % 4) - 1e-3 * i
+        qvel = np.gradient(qpos, time)
+        tau = 40.0 * (np.interp(time - 0.02, time, ctrl) - qpos) - 1.5 * qvel + 0.05 * rng.standard_normal(60)
+        late = 2 if i in odd else 0
+        state = {"qpos": qpos, "qvel": qvel, "tau": tau}
+        channels = {c: Channel(time[: 60 - late], x[: 60 - late, None]) for c, x in state.items()}
+        channels["ctrl"] = Channel(time[: 60 - late], ctrl[late:, None])
+        logs.append((f"take {i}", Log("arm", ("elbow",), channels, f"motor.npz#{i}")))
+    found = estimate(logs, MASSES, UNITS, {})
+    assert {i for i, r in enumerate(found.recordings) if abs(r.late) > 0.01} == odd
+    assert [r.late for r in found.recordings if abs(r.late) > 0.01] == pytest.approx([0.04, 0.04], abs=0.006)
+    assert [line.partition(":")[0] for line in found.remarks] == ["take 3", "take 11"]
+    for _, log in logs:  # where torque is something else, nothing is said
+        log.channels["tau"] = Channel(log.channels["tau"].time, rng.standard_normal((len(log.channels["tau"].time), 1)))
+    assert not estimate(logs, MASSES, UNITS, {}).remarks

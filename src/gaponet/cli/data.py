@@ -179,11 +179,8 @@ def _labels(
          ", ".join(f"{u:+.2f}" for u in c.units), "yes" if c.told else "no"]
         for c in found.cells
     ])  # fmt: skip
-    if a := found.agreement:
-        screen.say(
-            f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
-            f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
-        )
+    for line in found.remarks:
+        screen.say(line)
     screen.say(
         f"written: {out / 'labels.csv'!s}; next: gaponet import {logs} --robot {robot} --logs {out / 'logs.toml'}"
     )

@@ -5,6 +5,9 @@ equal commands is a + b·m: m is one of the payloads that were in the room, b is
 command is fitted on its own, by expectation and maximisation over all pairs of unit and payload, each as likely.
 Recordings that follow each other with equal torque are repetitions of one unit, and units are told by the order of
 their torques, which is thought to be the same at every payload; one joint's first unit need not be another's.
+
+Torque also tells the time: it is kp (command − position) − kd velocity of the command in force, so a recording whose
+commands were written down late, or early, shows to a quarter of a period, whatever it carries.
 """
 
 from __future__ import annotations
@@ -30,6 +33,8 @@ SAME_END = 0.05  # of the widest command of a joint: ends that are nearer are on
 SETTLE = 0.1  # s
 ALIKE = 3.0  # standard deviations of a repetition within which neighbours are repetitions
 LEVER, APART = 0.3, 2.5  # N·m per kg, and bands apart in their widths, from which a joint tells its payload
+FEW, ROUNDS, EXPLAINED = 4, 4, 0.9  # recordings; of the search; of the torque's variance, by the servo's law
+LATE, STEP, WIDEST = 0.015, 0.005, 0.08  # s: beside the others; steps and range of the search
 KILOGRAMS = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
 
 
@@ -44,6 +49,8 @@ class Labelled:
         known: kg, where a file's name says it.
         payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
         copy: The name of a recording with the same samples that came before.
+        follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
+        late: By how much its torque follows the command later than that of the joint's other recordings, s.
     """
 
     name: str
@@ -55,6 +62,8 @@ class Labelled:
     unit: int = 0
     told: bool = False
     copy: str = ""
+    follows: Array | None = field(default=None, repr=False)
+    late: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +87,20 @@ class Labels:
     cells: list[Cell]
     payloads: tuple[float, ...]
     agreement: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is to be said of them, in sentences."""
+        a, late = self.agreement, [r for r in self.recordings if abs(r.late) > LATE]
+        told = [
+            f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
+            f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
+        ] if a else []  # fmt: skip
+        return told + [
+            f"{r.name}: its torque follows the command {abs(r.late) * 1e3:.0f} ms {'later' if r.late > 0 else 'sooner'}"
+            f" than in the other recordings of {r.joint}: clocks of command and state are apart; it is left out"
+            for r in late
+        ]
 
 
 def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]) -> Labels:
@@ -103,7 +126,9 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
             first.known = one.known if first.known is None else first.known
         found.append(one)
     own = [r for r in found if not r.copy]
-    cells = [_fit(part, payloads, units) for part in _by_command(own)]
+    for joint in dict.fromkeys(r.joint for r in own):
+        _clocks([r for r in own if r.joint == joint and r.follows is not None])
+    cells = [_fit(part, payloads, units) for part in _by_command([r for r in own if abs(r.late) <= LATE])]
     first_of = {r.name: r for r in own}
     for r in found:
         if r.copy:
@@ -141,9 +166,48 @@ def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
         )
     later = time[: len(values)] >= time[0] + after
     told = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
+    follows = None
+    if "tau" in log.channels:
+        clock = ctrl.time
+        at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
+        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
+        follows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
     kilograms = KILOGRAMS.search(Path(log.source.partition("#")[0]).stem)
     known = float(kilograms[1].replace("p", ".")) if kilograms else None
-    return Labelled(name, joint, float(ctrl.values[-1, j]), (values[later], told), known)
+    return Labelled(name, joint, float(ctrl.values[-1, j]), (values[later], told), known, follows=follows)
+
+
+def _clocks(part: list[Labelled]) -> None:
+    """Say of each recording of a joint how much later than in the others its torque follows the command."""
+    shifts = np.arange(-WIDEST, WIDEST + STEP / 2, STEP)
+
+    def rows(r: Labelled, shift: float) -> Array:  # command − position, −velocity, 1, torque
+        time, ctrl, qpos, qvel, tau = r.follows  # type: ignore[misc]
+        inside = (time - WIDEST >= time[0]) & (time + WIDEST <= time[-1])
+        return np.stack([np.interp(time - shift, time, ctrl) - qpos, -qvel, np.ones_like(tau), tau])[:, inside]
+
+    def left(x: Array) -> Array:  # N·m, of each recording and shift
+        return np.array([np.abs(np.tensordot(m[:, :3], x, (1, 0)) - m[:, 3]).mean(axis=1) for m in every])
+
+    def law(k: int) -> tuple[float, Array]:  # kp, kd and a constant, of the half that they suit best
+        suited = np.arange(len(part))
+        for _ in range(ROUNDS):
+            rows = np.concatenate([every[i][k] for i in suited], axis=1)
+            x = np.linalg.lstsq(rows[:3].T, rows[3])[0]
+            costs = left(x)[:, k]
+            suited = np.argsort(costs)[: max(FEW, len(part) // 2)]
+        return float(np.median(costs)), x
+
+    if len(part) < FEW:
+        return
+    every = [np.stack([rows(r, s) for s in shifts]) for r in part]  # (shifts, 4, k) each
+    _, x = min((law(k) for k in range(len(shifts))), key=lambda one: one[0])
+    late = left(x).argmin(axis=1).tolist()
+    rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, late, strict=True)])
+    torque = np.concatenate([m[0, 3] for m in every])
+    if rest.var() < (1 - EXPLAINED) * torque.var() and x[0] > 0:
+        for r, k in zip(part, late, strict=True):
+            r.late = round(float(shifts[k] - np.median(shifts[late])), 4)
 
 
 def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
@@ -272,7 +336,7 @@ def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
             "unit" if r.known is not None else "unit, payload" if r.told else "unit, payload (not told by this joint)"
         )
         sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
-                        "yes" if r.copy else "no"])  # fmt: skip
+                        "yes" if r.copy or abs(r.late) > LATE else "no"])  # fmt: skip
     write_text(folder / "labels.csv", text.getvalue())
     lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
     lines += [f"rate = {rate:g}"] if rate else []
