@@ -50,7 +50,7 @@ class Labelled:
         payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
         copy: The name of a recording with the same samples that came before.
         follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
-        late: By how much its torque follows the command later than that of the joint's other recordings, s.
+        late: How much later its torque follows the command than in the other recordings of the joint, s.
     """
 
     name: str
