@@ -17,7 +17,7 @@ METHODS = {  # name, colour
     "nominal": ("nominal simulator", "#8c8c8c"),
     "delay_offset": ("delay + offset", "#d99000"),
     "identified": ("identification", "#2a9d6f"),
-    "inverse": ("inverse labels", "#12465b"),
+    "inverse": ("labels alone", "#12465b"),
     "shared_mlp": ("MLP", "#3b7dd8"),
     "mlp": ("MLP, full coupling", "#7a8fe0"),
     "transformer": ("Transformer", "#56c1e8"),

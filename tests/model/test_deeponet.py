@@ -56,18 +56,33 @@ def test_features_do_not_change_when_all_positions_shift_but_the_pose_itself():
     assert difference[2:].max() < 1e-5
 
 
-def test_sampling_sensors_changes_the_answer_and_the_mean_does_not():
+def test_noise_on_the_inputs_changes_the_answer_and_none_does_not():
     config = ModelConfig()
     net = build_network(config, 2)
     torch.nn.init.normal_(net.trunk[-1].weight)
     data = x(config, 2)
     assert torch.equal(net(data), net(data))
-    net.sample_sensors = True
+    net.features.noise = 0.4
     assert not torch.equal(net(data), net(data))
 
 
-def test_joints_meet_only_through_their_sensors():
+def test_a_joint_is_told_the_posture_of_the_others_but_not_their_past():
     config, n = ModelConfig(sensors="off", history=2), 3
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight)
+    a = x(config, n)
+    b = a.clone()
+    b[:, 2 * n + 1 : -n - 1 : n] += 0.5  # joint 1's past
+    changed = (net(b) - net(a)).abs().max(dim=0).values
+    assert changed[1] > 1e-3
+    assert changed[[0, 2]].max() == 0
+    b = a.clone()
+    b[:, n + 1] += 0.5  # its speed
+    assert (net(b) - net(a)).abs().max(dim=0).values.min() > 1e-4
+
+
+def test_joints_meet_only_through_their_sensors():
+    config, n = ModelConfig(coupling="joint", sensors="off", history=2), 3
     net = build_network(config, n)
     torch.nn.init.normal_(net.trunk[-1].weight)
     a = x(config, n)

@@ -7,7 +7,6 @@ from arm import TOML, XML, commands, record, write_arm
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Inertia, Period
 from gaponet.sim.model import build_model
-from gaponet.training.inverse import inverse_targets
 
 CONDITION = Condition(0.2, "both", 0.02)
 
@@ -32,18 +31,6 @@ def test_it_gives_back_the_command_where_friction_is_known(tmp_path):
     sequence, inverse = smooth(robot), ClosedForm.of(BatchSim(robot, [CONDITION]))
     told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 0.0)])
     np.testing.assert_allclose(told, sequence.ctrl[:-1], atol=2e-4)
-
-
-def test_it_is_the_label_of_the_warm_start(tmp_path):
-    robot = write_arm(tmp_path, xml=XML.replace('frictionloss="0.05"', 'frictionloss="0.01"'))
-    sequence, inverse = smooth(robot), ClosedForm.of(BatchSim(robot, [CONDITION]))
-    low, high = (0.5 * (x[:-1] + x[1:]) for x in inverse_targets(sequence, robot))  # over a period, not at its start
-    moving = (np.abs(sequence.qvel[:-1]) > 0.1).all(axis=1)
-    told = np.concatenate([inverse([p], p.qpos) for p in periods(sequence, 1.0)])
-    inside = slice(20, -20)  # filters know neither the past nor the future of a recording
-    far = np.maximum(low - told, told - high)[inside][moving[inside]]
-    assert moving.sum() > 20
-    assert far.max() < 1e-3
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 10])

@@ -13,7 +13,7 @@ from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
-    warm_start=WarmStartConfig(disturbance=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
+    warm_start=WarmStartConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
     rates=(50.0, 100.0),
 )  # fmt: skip
 

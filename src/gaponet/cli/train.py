@@ -13,7 +13,9 @@ from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
+from gaponet.eval.verdict import WORTH
 from gaponet.model.config import Kind
+from gaponet.robot_folder import KEPT
 from gaponet.training.config import TrainConfig
 
 
@@ -55,7 +57,14 @@ def train(
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
-    screen.say(f"model in {trained.path}; next: gaponet eval {out} {quote(dataset)}")
+    error = val.get("error", 0.0)
+    screen.say(f"the network adds {mrad(val['added'])} ± {mrad(error)} mrad on validation motions (paired)")
+    helps = val["added"] > max(error, WORTH * val["start"])
+    step = f"gaponet eval {out} {quote(dataset)}"
+    if not helps and val["start"] != val["nominal"]:
+        step = f"gaponet export {quote(str(out / KEPT))} --to mjcf"
+        screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
+    screen.say(f"model in {trained.path}; next: {step}")
     shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")
     screen.result({k: card[k] for k in shown})
 

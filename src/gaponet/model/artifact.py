@@ -103,7 +103,7 @@ class _Card(TypedDict):
     excess_delay: NotRequired[float]
     parity_rad: NotRequired[float]
     motions: NotRequired[dict[str, tuple[str, ...]]]
-    val_mpjae: NotRequired[dict[Literal["model", "nominal", "start"], Number]]
+    val_mpjae: NotRequired[dict[Literal["model", "nominal", "start", "added", "error"], Number]]
     sensor_r2: NotRequired[_SensorR2 | None]
     versions: NotRequired[dict[str, str]]
     sha256: NotRequired[dict[str, Sha256]]

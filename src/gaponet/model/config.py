@@ -27,8 +27,7 @@ class ModelConfig:
     """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as
     its branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form.
     transformer: attention over the past frames and the present. fno: Fourier neural operator over the same time axis.
-    inverse: the mlp fitted once to the inverse labels on the recorded motions, without roll-outs of its own and without
-    PPO."""
+    inverse: the mlp fitted once to the labels on the recorded motions, without roll-outs of its own and without PPO."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1
@@ -54,9 +53,10 @@ class ModelConfig:
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""
-    coupling: Literal["joint", "full"] = "joint"
-    """joint: branch and trunk are shared by the joints and take one joint at a time; postures never recorded do not
-    lead them astray (docs/log.md). full: the paper's, every joint sees every joint. The mlp is always full."""
+    coupling: Literal["posture", "joint", "full"] = "posture"
+    """posture: branch and trunk are shared by the joints; the branch sees a joint's own past, and of all joints
+    position, speed and how far behind their targets they are. joint: its own alone. full: the paper's, every joint sees
+    every joint. The mlp is always full."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
@@ -101,7 +101,7 @@ class ModelConfig:
     @property
     def joint_wise(self) -> bool:
         """Whether one joint at a time passes through branch and trunk."""
-        return self.kind in OPERATORS and self.coupling == "joint"
+        return self.kind in OPERATORS and self.coupling != "full"
 
     def observation_dim(self, n: int) -> int:
         """2n + 3nH (+ 1 with payload)."""

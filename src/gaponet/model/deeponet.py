@@ -42,8 +42,9 @@ class _SensorPredictor(nn.Module):
 class OperatorNet(DeltaNet):
     """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), a DeepONet.
 
-    Coupling "joint": one branch and one trunk, shared by all joints, take what belongs to a joint and its name.
-    What other joints do reaches it through its sensors. Coupling "full": the paper's, every joint sees every joint.
+    Coupling "joint": one branch and one trunk, shared by all joints, take what belongs to a joint and its name; what
+    other joints do reaches it through its sensors. "posture": the branch is told q, q̇ and a − q of all joints as well.
+    "full": the paper's, every joint sees every joint.
     """
 
     which: Tensor
@@ -62,16 +63,14 @@ class OperatorNet(DeltaNet):
         self.branch: nn.Module = dense(inputs, config.branch_hidden, outputs)
         self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
-        # Supervised fitting samples the predictor (sample_sensors), so that the branch does not trust a number that the
-        # predictor is unsure of. PPO and run time take its mean: PPO's ratio needs a policy mean that is the same when
-        # asked twice.
 
     @staticmethod
     def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
         """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
         payload = int(config.payload_input)
         if config.joint_wise:
-            return 2 * config.num_probes, 2 + 3 * config.history + payload, 1 + payload
+            others = 3 * n if config.coupling == "posture" else 0
+            return 2 * config.num_probes, 2 + 3 * config.history + payload + others, 1 + payload
         return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
 
     def prepare(self, x: Tensor) -> Tensor:
@@ -91,10 +90,7 @@ class OperatorNet(DeltaNet):
 
     def sensors(self, z: Tensor) -> Tensor:
         """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
-        if not self.sample_sensors:
-            return self.predictor.mean(z)
-        mean, log_var = self.predictor(z)
-        return mean + torch.randn_like(mean) * (0.5 * log_var).exp()
+        return self.predictor.mean(z)
 
     def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self.features.layout
@@ -112,6 +108,9 @@ class OperatorNet(DeltaNet):
             see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
         if self.sees_observation:
             see += [self.features.joint_wise(z), *payload]
+            if self.config.coupling == "posture":
+                all_joints = torch.cat([z[:, at.state], z[:, at.action]], dim=1)
+                see.append(all_joints.unsqueeze(1).expand(-1, n, 3 * n))
         ask = [which, z[:, at.action].unsqueeze(2), *payload]
         return torch.cat(see, dim=2), torch.cat(ask, dim=2)
 

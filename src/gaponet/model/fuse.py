@@ -67,11 +67,12 @@ def _full(net: OperatorNet) -> dict[str, Array]:
 def _joint(net: OperatorNet) -> dict[str, Array]:
     n, dim, config = net.n, net.features.dim, net.config
     depth, payload = 2 + 3 * config.history, int(config.payload_input)
-    known = depth + payload + 1
+    others = [*range(2 * n), *range(dim - n, dim)] if config.coupling == "posture" else []
+    known = depth + payload + 1 + len(others)
     width, names = known + n, known + np.arange(n)
     own = np.arange(depth) * n  # columns of joint 0; those of joint j are j further on
     columns = np.concatenate(
-        [np.concatenate([own + j, np.full(payload, depth * n), [dim - n + j]]) for j in range(n)]
+        [np.concatenate([own + j, np.full(payload, depth * n), [dim - n + j], others]) for j in range(n)]
     ).astype(int)
     weights = _named(_features(net, columns), n)
     alone = isinstance(net, SharedMLP)  # one net is a branch whose trunk answers 1
@@ -95,8 +96,9 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         parts.append(w[n : n + sensed])
     seen = _rows(w[:n] + b, names, width)
     if net.sees_observation:
-        seen += _rows(w[n + sensed : net.branch_inputs], np.arange(depth + payload), width)
-    asked = np.array([known - 1] + [known - 2] * payload)
+        told = [*range(depth + payload), *range(depth + payload + 1, known)]
+        seen += _rows(w[n + sensed : net.branch_inputs], np.array(told), width)
+    asked = np.array([depth + payload] + [depth] * payload)
     if alone:
         query = w[net.branch_inputs :]
         seen += _rows(query[:n], names, width) + _rows(query[n:], asked, width)
@@ -168,12 +170,12 @@ def _limit(net: OperatorNet | DeltaMLP) -> float:
 def _scaled(layers: Layers, net: OperatorNet | DeltaMLP) -> Layers:
     """The last layer in units of Δ_max / gain."""
     weight, bias = layers[-1]
-    factor = float(net.bounded.gain) / _limit(net)
+    factor = float(net.bounded.gain * net.bounded.unit) / _limit(net)
     return [*layers[:-1], (weight * factor, bias * factor)]
 
 
 def _bias(net: OperatorNet) -> Array:
-    return net.bias.detach().double().numpy() * float(net.bounded.gain) / _limit(net)
+    return net.bias.detach().double().numpy() * float(net.bounded.gain * net.bounded.unit) / _limit(net)
 
 
 def _name(part: str, layers: Layers) -> dict[str, Array]:

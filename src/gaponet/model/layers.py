@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from gaponet.model.config import ModelConfig
 from gaponet.model.observation import Layout
 
+CLAMP = 5.0  # standard deviations: a feature further off is taken to be here
+
 
 def dense(inputs: int, hidden: Sequence[int], outputs: int, zero: bool = False) -> nn.Sequential:
     """Linear layers with ELU between; with `zero` it starts by answering 0."""
@@ -60,6 +62,10 @@ class Features(nn.Module):
     A lag of 10 mrad is invisible in absolute joint angles that span a radian; relative to q_t it is the signal.
     """
 
+    noise = 0.0
+    """σ of what is added while a network is fitted to labels, in standard deviations of each feature. Without it a
+    network reads the label off what the label did: off targets applied before, or off how far a joint is behind."""
+
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
         self.n, self.history = n, config.history
@@ -77,7 +83,8 @@ class Features(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
-        return self.standardise(self.relative(x)).clamp(-5.0, 5.0)
+        z = self.standardise(self.relative(x)).clamp(-CLAMP, CLAMP)
+        return z + self.noise * torch.randn_like(z) if self.noise else z
 
     def joint_wise(self, z: Tensor) -> Tensor:
         """State and past of each joint, (B, dim) → (B, n, 2 + 3H)."""
@@ -85,20 +92,27 @@ class Features(nn.Module):
 
 
 class _Bounded(nn.Module):
-    """Δ_max · tanh(gain · y / Δ_max): near the identity for small corrections, never more than Δ_max.
+    """Δ_max · tanh(gain · unit · y / Δ_max): near gain · unit · y for small corrections, never more than Δ_max.
 
-    The gain is 1 while training; training/validation.py lowers it where less of a correction does better.
+    The unit, rad, is what labels usually are, so that y is a number near 1 whatever the robot. The gain is 1 while
+    training; training/validation.py lowers it where less of a correction does better.
     """
 
     gain: Tensor
+    unit: Tensor
 
     def __init__(self, delta_max: float) -> None:
         super().__init__()
         self.delta_max = delta_max
         self.register_buffer("gain", torch.tensor(1.0))
+        self.register_buffer("unit", torch.tensor(1.0))
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+        state.setdefault(prefix + "unit", torch.tensor(1.0))  # checkpoints of before there was one
+        super()._load_from_state_dict(state, prefix, *rest)
 
     def forward(self, y: Tensor) -> Tensor:
-        return self.delta_max * torch.tanh(self.gain * y / self.delta_max)
+        return self.delta_max * torch.tanh(self.gain * self.unit * y / self.delta_max)
 
 
 class DeltaNet(nn.Module):
@@ -109,15 +123,13 @@ class DeltaNet(nn.Module):
 
     predictor: Any
     """A network that answers in the simulator's place: fitted before all else (training/sensor_fit.py), then frozen."""
-    sample_sensors: bool
-    """True while supervised fitting asks it."""
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
         self.bounded = _Bounded(config.delta_max)
-        self.predictor, self.sample_sensors = None, False
+        self.predictor = None
 
     def fit_inputs(self, x: Tensor) -> None:
         """Take the statistics of inputs from samples of x."""

@@ -30,25 +30,27 @@ class RewardConfig:
 
 @dataclass(frozen=True)
 class WarmStartConfig:
-    """Supervised start: regress the inverse labels on states that the policy visits itself."""
+    """Supervised start: regress the labels on states that they and the policy itself lead to."""
 
-    rounds: Annotated[int, Interval(ge=0, le=100000)] = 10
-    """Roll-outs of the present policy; 0 starts PPO from an untrained network."""
+    rounds: Annotated[int, Interval(ge=0, le=100000)] = 3
+    """Roll-outs: the first led by the labels, then by the present policy; 0 starts PPO from an untrained network."""
     patience: Annotated[int, Interval(ge=1, le=100000)] = 3
     """Rounds after which PPO takes over if none was better than no correction, as from an identified simulator."""
     num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations per round."""
     steps: Annotated[int, Interval(ge=1, le=10000000)] = 400
     """Control periods per round."""
-    disturbance: Annotated[float, Interval(ge=0, le=1e6)] = 0.003
-    """Noise on the applied corrections, white and slow, σ in rad."""
+    rows: Annotated[int, Interval(ge=1, le=10**12)] = 200_000
+    """Recorded rows that are labelled, at most, of all motions, payloads and units alike."""
+    noise: Annotated[float, Interval(ge=0, le=100)] = 0.4
+    """Noise on what the network is shown while it is fitted, σ in standard deviations of each input."""
     batch_size: Annotated[int, Interval(ge=1, le=10000000)] = 1024
     """Samples per gradient step."""
-    gradient_steps: Annotated[int, Interval(ge=0, le=10000000)] = 300
+    gradient_steps: Annotated[int, Interval(ge=0, le=10000000)] = 1000
     """Gradient steps per round."""
-    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
-    """AdamW step size, decayed to a tenth over the rounds."""
-    weight_decay: Annotated[float, Interval(ge=0, le=1e6)] = 0.01
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 2e-3
+    """AdamW step size, decayed to a hundredth over each round."""
+    weight_decay: Annotated[float, Interval(ge=0, le=1e6)] = 1.0
     """AdamW weight decay."""
     sensor_states: Annotated[int, Interval(ge=1, le=10000000)] = 2048
     """States at which the simulator is asked, once for each probe, to fit the sensor predictor."""

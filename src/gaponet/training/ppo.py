@@ -139,8 +139,9 @@ class Learner:
     def learn(self, batch: _Batch) -> None:
         """Fit the critic and, once it explains the returns, move the actor."""
         config, explored = self.config, batch.explored
-        own = batch.advantage - (explored * batch.advantage).sum(0) / explored.sum(0)
-        batch.advantage = own / ((explored * own**2).sum(0) / explored.sum(0)).sqrt().clamp_min(1e-8)
+        count = explored.sum(0).clamp_min(1.0)  # few environments may leave a joint without any
+        own = batch.advantage - (explored * batch.advantage).sum(0) / count
+        batch.advantage = own / ((explored * own**2).sum(0) / count).sqrt().clamp_min(1e-8)
         distances = []
         for _ in range(config.epochs):
             for rows in torch.randperm(len(own)).to(own.device).chunk(config.mini_batches):

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from gaponet.data.pair import require_disjoint
-from gaponet.data.sequence import SequenceMeta, require_same_gains
+from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains
 from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.errors import ModelError, UsageError
@@ -44,12 +44,12 @@ from gaponet.training import ranks
 from gaponet.training.budget import Budget, Status
 from gaponet.training.config import TrainConfig, command
 from gaponet.training.env import DeltaEnv
-from gaponet.training.inverse import inverse_labels
 from gaponet.training.kept import Kept, StateDict
+from gaponet.training.labels import trajectory_labels
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import Learner, Update
 from gaponet.training.sensor_fit import fit_inputs
-from gaponet.training.validation import choose_gain, mean_error
+from gaponet.training.validation import added, choose_gain, errors
 from gaponet.training.warm_start import WarmStart, recipe
 
 VALIDATION_RUNS = 24  # free runs per validation at most, of every payload, unit and rate
@@ -155,9 +155,13 @@ class Trainer:
 
     def _warm_start(self) -> None:
         config = recipe(self.own)
-        env = self._env(config.num_envs, 10**9, self.config.seed)
-        limit = 0.99 * self.config.model.delta_max
-        labels = inverse_labels(self.train_set, self.robot, limit)
+        self.stage = "labels"
+        self._tick()
+        part = self.parts["train"]
+        some = spread(part, max(1, config.rows * len(part) // sum(e.rows for e in part)))
+        labelled = self.dataset.sequences(some, optional=False)
+        env = self._env(config.num_envs, 10**9, self.config.seed, sequences=labelled)
+        labels = trajectory_labels(labelled, self.robot, 0.99 * self.config.model.delta_max, self.own.threads)
         warm = WarmStart(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
         if self.kept.rounds_done == 0:
@@ -220,7 +224,7 @@ class Trainer:
         self.kept.anew = bool(recipe(self.config).rounds) and self._in_vain()
         if not self.kept.anew:
             return best
-        fitted_before = ("predictor.", "points.", "features.", "answers.")
+        fitted_before = ("predictor.", "features.", "bounded.")
         return {k: v if k.startswith(fitted_before) else self.untrained[k] for k, v in best.items()}
 
     def _in_vain(self) -> bool:
@@ -252,12 +256,19 @@ class Trainer:
         net.eval()
         env = self._env(max(64, len(self._conditions())), 10, 0, "cpu")
         self.loggers.close()
-        export(net, self.out / "model", self._card(), env.get_observations()["actor"].numpy())
+        what = self.val_set, self.robot, self.config.model
+        before, after = (errors(*what, network, self.own.threads) for network in (None, net))
+        adds, error = added(self.val_set, before, after)
+        card = self._card({"added": adds} | ({} if np.isnan(error) else {"error": error}))
+        export(net, self.out / "model", card, env.get_observations()["actor"].numpy())
 
-    def _env(self, num_envs: int, episode_steps: int, seed: int, device: str | None = None) -> DeltaEnv:
+    def _env(
+        self, num_envs: int, episode_steps: int, seed: int, device: str | None = None,
+        sequences: list[Sequence] | None = None,
+    ) -> DeltaEnv:  # fmt: skip
         c = self.own
         how = c.reward, _seed(seed), c.threads, device or c.device
-        return DeltaEnv(self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
+        return DeltaEnv(sequences or self.train_set, self.robot, c.model, num_envs, episode_steps, *how)
 
     # ---- validation, checkpoints, card
 
@@ -268,7 +279,7 @@ class Trainer:
         """
         what = self.config.model, net, self.own.threads
         robot = self.robot if net is not None else self.robot.nominal or self.robot
-        return ranks.mean_over(self.val_set, lambda own: mean_error(own, robot, *what))
+        return ranks.mean_over(self.val_set, lambda own: float(errors(own, robot, *what).mean()))
 
     def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
@@ -322,7 +333,7 @@ class Trainer:
     def _conditions(self) -> set[Condition]:
         return {Condition.of(s, self.robot) for s in self.train_set}
 
-    def _card(self) -> dict[str, Any]:
+    def _card(self, worth: dict[str, float]) -> dict[str, Any]:
         seen = self.train_set
         assert self.baseline is not None
         return make_card(
@@ -336,7 +347,8 @@ class Trainer:
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
-            val_mpjae={"model": self.kept.best, "nominal": self.nominal, "start": self.kept.progress[0]["val_mpjae"]},
+            val_mpjae={"model": self.kept.best, "nominal": self.nominal, "start": self.kept.progress[0]["val_mpjae"]}
+            | worth,
             sensor_r2=self.kept.sensor_r2,
             seed=self.config.seed,
             gain=self.kept.best_state["bounded.gain"].item(),

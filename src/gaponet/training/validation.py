@@ -14,7 +14,9 @@ from collections.abc import Sequence as ListOf
 import numpy as np
 import torch
 
+from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.metrics import standard_error
 from gaponet.model.backends import FunctionNetwork, Network, NumpyNetwork
 from gaponet.model.config import ModelConfig
 from gaponet.model.corrector import DeltaCorrector
@@ -26,14 +28,21 @@ from gaponet.sim.replay import replay
 GAINS = (0.75, 0.5, 0.25)  # beside 1
 
 
-def mean_error(
+def errors(
     sequences: ListOf[Sequence], robot: RobotSpec, config: ModelConfig, net: DeltaNet | None, nthread: int
-) -> float:
-    """MPJAE over the motions, rad; None for the simulator as it is."""
+) -> Array:
+    """MPJAE of each recording, (k,) rad; None for the simulator as it is."""
     n, op = len(robot.operated), robot.operated_index
     corrector = None if net is None else DeltaCorrector(_network(net, config.input_dim(n), n), config, robot)
     twins = replay(sequences, robot, corrector, nthread, lock_idle=True)
-    return float(np.mean([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)]))
+    return np.array([np.abs(t.qpos - s.qpos)[1:, op].mean() for s, t in zip(sequences, twins, strict=True)], float)
+
+
+def added(sequences: ListOf[Sequence], before: Array, after: Array) -> tuple[float, float]:
+    """How much less the error is after than before, (k,) rad each: mean and standard error over motions (paired)."""
+    motions = np.array([s.meta.motion for s in sequences])
+    less = np.array([(before - after)[motions == m].mean() for m in sorted(set(motions.tolist()))])
+    return float(less.mean()), standard_error(less)
 
 
 def choose_gain(net: DeltaNet, error: Callable[[], float], whole: float) -> float:

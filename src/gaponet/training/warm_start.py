@@ -1,19 +1,22 @@
-"""Supervised start: regress the inverse labels on states that the policy visits itself (DAgger, Ross et al. 2011).
+"""Supervised start: regress the labels on states that they and the policy itself lead to (DAgger, Ross et al. 2011).
 
-Fitted on recorded states alone, a policy meets other states as soon as it errs and errs more. So each round rolls the
-present policy out, labels every visited state with u* − a of its row (training/inverse.py: right wherever the state is,
-the plant being stable about u*), adds it to the pool and fits on the whole pool. The pool of the first round is driven
-by the labels themselves and only seeds the second; the inverse-label baseline stops after it.
+The first round is led by the labels; each later one rolls the present policy out. Every visited state gets the label of
+its row (training/labels.py: the plant is stable about it, so it holds where the state has drifted), joins the pool, and
+the whole pool is fitted under noise on the inputs. What the labels did shows in the states that they led to: a network
+that is shown them exactly reads the answer there, and is worse than none when it leads itself
+(docs/results/unnamed.md).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from torch.nn.functional import huber_loss
 
 from gaponet.arrays import Array, indices, library
 from gaponet.model.layers import DeltaNet
@@ -22,17 +25,19 @@ from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.sensor_fit import Report, fit_inputs
 
+HUBER = 0.5  # of what labels usually are: beyond it a label counts as its distance, not its square
+
 
 def recipe(config: TrainConfig) -> WarmStartConfig:
     """The warm start of a kind of model.
 
-    The inverse-label baseline has one round, on recorded motions that the labels lead along, undisturbed, with the
-    gradient steps of all rounds together.
+    The label baseline has one round, on recorded motions that the labels lead along, with the gradient steps of all
+    rounds together.
     """
     warm = config.warm_start
     if config.model.kind != "inverse" or not warm.rounds:
         return warm
-    return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps, disturbance=0.0)
+    return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps)
 
 
 class WarmStart:
@@ -52,7 +57,9 @@ class WarmStart:
     ) -> None:
         """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.config = net, env, config
-        self.labels: Any = env.sim.array(_held_labels(labels, env.config.delta_hold))
+        held = _held_labels(labels, env.config.delta_hold)
+        self.labels: Any = env.sim.array(held)
+        self.unit = float(np.sqrt(np.nanmean(np.square(held)))) or 1.0
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -66,6 +73,7 @@ class WarmStart:
         """Before the first round: statistics of inputs, and on them the sensor predictor, where labels lead along."""
         self.collect(follow_labels=True)
         self.pool_y.clear()
+        self.net.bounded.unit.fill_(self.unit)
         states = self.config.sensor_states
         self.report = fit_inputs(self.net, self.env, self.pool_x.pop(), states, self.seed, self.nthread)
 
@@ -75,7 +83,6 @@ class WarmStart:
         env.reset()
         net.eval()
         xs, ys = [], []
-        disturbance = np.zeros((env.num_envs, env.num_actions), np.float32)
         hold = env.config.delta_hold
         for _ in range(0, self.config.steps, hold):
             x = env.get_observations()["actor"]
@@ -87,37 +94,22 @@ class WarmStart:
             else:
                 with torch.inference_mode():
                     delta = net(x)
-            applied = env.sim.array(delta) + env.sim.array(self._disturb(disturbance))
             for _ in range(hold):
-                env.advance(applied)
+                env.advance(delta)
             ended = indices(env.ended())
             if ended.size:
                 env.reset(ended)
         self.pool_x.append(torch.cat(xs))
         self.pool_y.append(torch.cat(ys))
 
-    def _disturb(self, slow: Array) -> Array:
-        """Noise on the applied correction, white plus slow steps (updated in place); a quarter of the robots has none.
-
-        A policy that sees its own past targets can learn to lean on them; disturbed, it learns what the label is
-        whatever they were, and does not amplify its own noise on poses that it has not seen.
-        """
-        sigma, rng, shape = self.config.disturbance, self.env.rng, slow.shape
-        change = rng.random(shape) < 0.02
-        slow[change] = rng.normal(0, sigma, change.sum())
-        noise = slow + rng.normal(0, sigma, shape).astype(np.float32)
-        noise[: len(noise) // 4] = 0.0
-        return noise
-
-    def round(self, tick: Callable[[], float]) -> dict[str, float]:
+    def round(self, tick: Callable[[], object]) -> dict[str, float]:
         """Collect with the present policy, fit on the pool.
 
         Returns:
             RMSE of the labels, rad, over the last quarter of the gradient steps and over the quarter before it: a fit
             that is done has both alike.
 
-        tick is called after every gradient step and returns the share of the budget spent: whichever is further, rounds
-        or budget, lowers the step size.
+        tick is called after every gradient step.
         """
         before = {"net": {k: x.clone() for k, x in self.net.state_dict().items()}, "rng": self.env.rng_state}
         self.collect(follow_labels=self.done == 0)
@@ -125,21 +117,21 @@ class WarmStart:
         x, y, config, net = self.pool_x[0], self.pool_y[0], self.config, self.net
         fits = torch.zeros(config.gradient_steps, dtype=torch.double, device=x.device)  # read when all are done
         net.train()
-        net.sample_sensors = True
-        spent = 0.0
+        net.features.noise = config.noise
         for step in range(config.gradient_steps):
-            progress = min(max((self.done + step / config.gradient_steps) / config.rounds, spent), 1.0)
+            done = step / config.gradient_steps
             for group in self.optimiser.param_groups:
-                group["lr"] = config.learning_rate * 0.1**progress
+                group["lr"] = config.learning_rate * (0.01 + 0.99 * (0.5 + 0.5 * math.cos(math.pi * done)))
             batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator).to(x.device)
-            loss = (torch.nan_to_num(net(x[batch]) - y[batch]) ** 2).mean()
+            missed = torch.nan_to_num(net(x[batch]) - y[batch])
+            loss = huber_loss(missed / self.unit, torch.zeros_like(missed), delta=HUBER)
             self.optimiser.zero_grad()
             loss.backward()
             ranks.average(*(p.grad for p in self.trained if p.grad is not None))
             self.optimiser.step()
-            fits[step] = loss.detach()
-            spent = tick()
-        net.sample_sensors = False
+            fits[step] = missed.detach().square().mean()
+            tick()
+        net.features.noise = 0.0
         net.eval()
         self.done += 1
         self.rounds.append(before)
