@@ -159,6 +159,16 @@ def _spoken(spec: mujoco.MjSpec, model: mujoco.MjModel, kept: list[str], pose: n
             frozen.append(f"{name or 'unnamed'} {f'at {pose[at]:.3g} {unit}' if unit else f'where {path.name} has it'}")
     if frozen:
         said.append(f"frozen: {', '.join(frozen)}")
+    for e in spec.equalities:
+        pair = [name for name in (e.name1, e.name2) if name in kept]
+        if e.type == mujoco.mjtEq.mjEQ_JOINT and len(pair) == 1 and e.name2:
+            other = e.name2 if e.name1 in pair else e.name1
+            said.append(
+                f"{other} moves with {pair[0]} and is held still here: kp, friction and armature that are "
+                f"identified of {pair[0]} are those of its own link alone, as much smaller as both are heavier"
+            )
+    if (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE).any():
+        said.append("the base is held still here: fasten the robot while it is recorded, a base that hangs swings")
     dropped = {"actuator": model.nu, "keyframe": model.nkey, "sensor": model.nsensor}
     gone = ", ".join(f"{count} {kind}(s)" for kind, count in dropped.items() if count)
     if gone:

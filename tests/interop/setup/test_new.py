@@ -62,6 +62,19 @@ def test_base_fingers_and_leg_are_frozen_and_the_arm_weighs_what_it_did(tmp_path
     assert any("left_slide at 0.03 m" in note and "hip at -0.4 rad" in note for note in made.notes)
 
 
+def test_a_finger_that_follows_another_and_a_base_that_hangs_are_said_to_be_held(tmp_path):
+    body = '<body><joint name="{0}" axis="1 0 0" range="-1 1"/><geom type="sphere" size=".02" pos="0 0 .1"/>{1}</body>'
+    file = tmp_path / "fingers.xml"
+    file.write_text(
+        f'<mujoco><worldbody><body><freejoint/><geom size=".1"/>{body.format("thumb", body.format("tip", ""))}</body>'
+        '</worldbody><equality><joint joint1="tip" joint2="thumb"/></equality>'
+        '<actuator><position joint="thumb" kp="2"/></actuator></mujoco>'
+    )
+    notes = make(tmp_path, file).notes
+    assert any(note.startswith("tip moves with thumb and is held still here") for note in notes)
+    assert any("the base is held still here" in note for note in notes)
+
+
 def test_frozen_joints_stand_where_the_keyframe_says(tmp_path):
     made = make(tmp_path, joints=ARM, keyframe="low")
     assert max(furthest(made)) < 1e-9
