@@ -47,6 +47,7 @@ from gaponet_robots.virtual.unit import VirtualRobot
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import TOML, XML, write_arm
 
+NORMAL_90 = 1.645
 HELD, NOISE = 0.3, 4e-4  # kg of the known payload, rad of the encoder
 FIRST_ARM = 2001  # of the fleet's units: of no other benchmark
 SETS = {"nothing more": 0.0, "chosen, 32 s": 32.0, "at random, 32 s": 32.0, "at random, 64 s": 64.0}
@@ -226,8 +227,14 @@ def table(work: Path) -> None:
             test = [1e3 * (x[n]["test"] - x["at random, 32 s"]["test"]) for x in lines if "test" in x[n]]
             cells.append(f"{np.mean(test):+.2f} ± {np.std(test, ddof=1) / len(test) ** 0.5:.2f}" if test else "")
             print(f"| {n} | {' | '.join(cells)} |")
-        said = [v for x in lines for v in x.get("said", {}).values()]
-        print(f"said of joints: {len(said)}; first: {said[:1]}")
+        if file.stem.startswith("right"):  # the truth is known, and of the form that is fitted
+            z = np.array([np.array(x[n]["off"]) / np.array(x[n]["errors"]) for x in lines for n in names])
+            held = (np.abs(z) < NORMAL_90).mean(axis=(0, 1))
+            print(
+                "within 1.645 standard errors: " + ", ".join(f"{f} {s:.0%}" for f, s in zip(CLASSIC, held, strict=True))
+            )
+        for said in sorted({f"{j}: {v}" for x in lines for j, v in x.get("said", {}).items()})[:4]:
+            print(f"said: {said}")
 
 
 def main() -> None:

@@ -119,7 +119,7 @@ def check(
     screen.result({
         "verdict": found.verdict, "advice": found.advice, "recordings": len(sequences), "seconds": found.seconds,
         "moved": [_plain(m) for m in found.moved], "largest": {j: _plain(m) for j, m in found.largest.items()},
-        "against": [vars(a) for a in found.against], "threshold": found.threshold,
+        "against": [vars(a) for a in found.against], "threshold": found.threshold, "far": found.far,
     })  # fmt: skip
     if found.verdict != "same":
         sys.stdout.flush()

@@ -32,6 +32,7 @@ MINORITY = 0.4  # of the recordings: so many that say something else are set asi
 SHARED = ("delay",)  # of one bus: all joints' move together
 EVERY = "every joint"
 WARM = ("damping", "frictionloss", "stribeck")
+FAR = 2.5  # times what the model left when it was identified, in half of the windows: no longer this robot
 ELSE = 0.4  # of all joints: so many with kp or several numbers moved are another robot's
 
 Verdict = str  # same, drifted, contradictory
@@ -73,7 +74,7 @@ class Against:
 @dataclass(frozen=True)
 class Drift:
     """What was found; the largest change of every joint, whether it counts or not; recordings that were set aside since
-    they differ from the others."""
+    they differ from the others; joints that are FAR from the model, and how many times what it left."""
 
     verdict: Verdict
     moved: tuple[Moved, ...]
@@ -82,6 +83,7 @@ class Drift:
     advice: str
     threshold: float
     seconds: float
+    far: Mapping[str, float]
 
 
 def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
@@ -98,6 +100,8 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
     if not says.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*known.fields, PLAY), robot.operated
+    times = {j: float(np.median(e)) / max(known.joints[j].left, 1e-9) for j, e in zip(joints, says.left, strict=True)}
+    far = {j: by for j, by in times.items() if by > FAR}
     scatter = np.stack([np.maximum(known.array(j, "scatter"), 1.0) for j in joints])
     against = _contradictions(says.by_recording(), scatter, known, joints, fields)
     aside = {a.recording for a in against}
@@ -120,9 +124,11 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
         found, first = one.explained(threshold)
         moved += found
         largest |= {one.name: first} if first else {}
-    verdict = "contradictory" if contradictory else "drifted" if moved else "same"
+    verdict = "contradictory" if contradictory else "drifted" if moved or far else "same"
     seconds = float(sum(s.duration for s in sequences))
-    return Drift(verdict, tuple(moved), largest, against, _advice(verdict, moved, against, joints), threshold, seconds)
+    return Drift(
+        verdict, tuple(moved), largest, against, _advice(verdict, moved, against, joints, far), threshold, seconds, far
+    )
 
 
 def widened(normal: Array, scatter: Array) -> Array:
@@ -254,7 +260,9 @@ def _farthest(
     return worst
 
 
-def _advice(verdict: Verdict, moved: ListOf[Moved], against: ListOf[Against], joints: ListOf[str]) -> str:
+def _advice(
+    verdict: Verdict, moved: ListOf[Moved], against: ListOf[Against], joints: ListOf[str], far: Mapping[str, float]
+) -> str:
     """What to do."""
     if verdict == "same":
         return "nothing to do"
@@ -263,6 +271,12 @@ def _advice(verdict: Verdict, moved: ListOf[Moved], against: ListOf[Against], jo
         return (
             f"these recordings contradict each other ({names}): another robot's are among them, or something changed "
             "on the way; check them apart, calibrate with none of this"
+        )
+    if not moved:
+        told = ", ".join(f"{j} {by:.1f} times" for j, by in far.items())
+        return (
+            f"no number explains how far these logs are from the model ({told} what it left): another robot, payload "
+            "or controller, or a part that gives way; look at it, then identify again"
         )
     by = {j: [m for m in moved if m.joint == j] for j in joints}
     odd = [j for j, ms in by.items() if len(ms) > 1 or any(m.field == "kp" for m in ms)]

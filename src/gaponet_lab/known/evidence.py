@@ -33,20 +33,22 @@ PLAY = "play"  # of gear or motor, rad: no parameter of the simulator, but what 
 @dataclass(frozen=True)
 class Evidence:
     """What recordings say near a robot's values, of n joints, C clusters, Q fields and play: pulls (n, C, Q) and slopes
-    squared (n, C, Q, Q) on the axes; rows that count (n); of which recording a cluster is (C), and their names."""
+    squared (n, C, Q, Q) on the axes; rows that count (n); of which recording a cluster is (C), and their names; the RMS
+    error of each of W windows (n, W), rad."""
 
     pulls: Array
     normals: Array
     rows: Array
     recording: Array
     names: tuple[str, ...]
+    left: Array
 
     def by_recording(self) -> Evidence:
         """The same with one cluster of each recording."""
         order = np.arange(len(self.names))
         pick = (self.recording == order[:, None]).astype(float)
         pulls, normals = np.einsum("rc,ncq->nrq", pick, self.pulls), np.einsum("rc,ncqp->nrqp", pick, self.normals)
-        return Evidence(pulls, normals, self.rows, order, self.names)
+        return Evidence(pulls, normals, self.rows, order, self.names, self.left)
 
     def without(self, names: Collection[str]) -> Evidence:
         """The same without these recordings."""
@@ -56,7 +58,7 @@ class Evidence:
         left = tuple(name for name in self.names if name not in names)
         order = np.array([left.index(self.names[r]) for r in self.recording[keep]])
         rows = self.rows * keep.mean()  # windows are as long as each other
-        return Evidence(self.pulls[:, keep], self.normals[:, keep], rows, order, left)
+        return Evidence(self.pulls[:, keep], self.normals[:, keep], rows, order, left, self.left)
 
     def scatter(self) -> Array:
         """Variance of the clusters' sum of pulls over that of independent rows, (n, Q)."""
@@ -123,7 +125,9 @@ def evidence(
     names = [f"{p.meta.motion}{f' ({p.meta.repetition})' * bool(p.meta.repetition)}" for p in parts]
     own = dict.fromkeys(names)
     of = np.array([list(own).index(name) for name in names])
-    return Evidence(pulls, normals, runs.rows, of[window], tuple(own))
+    error = SOFT * here.reshape(bounds.n, *runs.counted.shape)
+    far = np.sqrt(np.square(error).sum(axis=-1) / np.maximum(runs.counted.sum(axis=-1), 1))
+    return Evidence(pulls, normals, runs.rows, of[window], tuple(own), far)
 
 
 def known(

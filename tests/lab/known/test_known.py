@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import commands, record, write_arm
+from arm import TOML, XML, commands, record, write_arm
 
 from gaponet import api
 from gaponet.cli.main import main
@@ -14,6 +14,7 @@ from gaponet.errors import RobotError
 from gaponet.eval.knowledge import Knowledge, values_of
 from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
+from gaponet_lab.known.drift import drift
 from gaponet_lab.known.evidence import known
 
 TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
@@ -177,3 +178,17 @@ def test_a_slow_bus_is_one_change_of_every_joint(arm, folder, tmp_path, capsys):
 def test_logs_that_cannot_be_read_are_an_error(folder, tmp_path, capsys):
     assert main(["check", str(folder), str(tmp_path / "nothing")]) == 2
     assert "nothing" in capsys.readouterr().err
+
+
+def test_another_arm_that_no_number_explains_is_not_the_same(arm, folder, monkeypatch, tmp_path):
+    """Its links are twice as heavy; even where no change of a number counts it is not called the same."""
+    xml = XML.replace('mass="0.3"', 'mass="0.6"').replace('mass="0.2"', 'mass="0.4"')
+    heavy, robot = write_arm(tmp_path / "heavy", TOML, xml), load_robot(folder)
+    mine = Knowledge.load(robot)
+    fresh = drift(robot, mine, played(arm, 70, 6), 1)
+    assert (fresh.verdict, fresh.far) == ("same", {})
+    monkeypatch.setattr("gaponet_lab.known.drift.FELT", 1e9)
+    found = drift(robot, mine, played(heavy, 70, 6), 1)
+    assert found.verdict == "drifted"
+    assert "no number explains how far these logs are from the model" in found.advice
+    assert set(found.far) <= set(arm.operated)
