@@ -195,16 +195,18 @@ def tables(rows: list[Row]) -> list[str]:
             + f"{np.median(took):.0f} | {took.max():.0f} | {np.median(theirs):.0f} |"
         )  # fmt: skip
     said += ["", "Seconds are of the processor, commands as a whole.", "",
-             "| parameter, servos of the form | within 2 standard errors | median distance from the truth |",
-             "|---|---:|---:|"]  # fmt: skip
+             "| parameter, servos of the form | within 2 standard errors | median distance from the truth | called not "
+             "determined |", "|---|---:|---:|---:|"]  # fmt: skip
     for field in FIELDS:
         parts = [r for r in rows if not r["laws"] and field in r.get("sigmas", {})]
         sigmas = np.concatenate([[], *(r["sigmas"][field] for r in parts)])
         if len(sigmas):
             far = np.concatenate([[], *(r["relative"].get(field, []) for r in parts)])
             size = f"{np.median(far):.1%}" if len(far) else "–"
-            said.append(f"| {field} | {np.mean(sigmas <= 2):.0%} of {len(sigmas)} | {size} |")
-    return said
+            unknown = sum(r["undetermined"].get(field, 0) for r in parts)
+            said.append(f"| {field} | {np.mean(sigmas <= 2):.0%} of {len(sigmas)} | {size} | {unknown} |")
+    false = [f"{r['seed']} ({e.removeprefix('error ')})" for r in rows for e in r["doctor"] if e.startswith("error")]
+    return [*said, "", f"Errors that doctor sees in these good logs: {', '.join(false) or 'none'}."]
 
 
 def losers(rows: list[Row]) -> list[str]:

@@ -485,7 +485,8 @@ class Fit:
         each -= each.mean(axis=1, keepdims=True)
         believed = jac[:, -2:] * self._one()[:, None, None]
         normal = (np.swapaxes(jac, -1, -2) @ (weight[..., None] * jac)).astype(float)
-        spread = np.swapaxes(each, -1, -2) @ each * (clusters / max(clusters - len(names), 1))
+        few = clusters / max(clusters - len(names), 1)  # squared, as a jackknife of so few clusters has it
+        spread = np.swapaxes(each, -1, -2) @ each * few**2
         spread += np.swapaxes(believed, -1, -2) @ believed
         # What no row has to say of a parameter is as unknown as before: then it is the file's, or nobody's.
         size = np.sqrt(np.einsum("...ii->...i", normal))
