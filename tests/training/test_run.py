@@ -268,7 +268,7 @@ def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, ro
         return 0.6 if trainer.stage == "warm start" else 0.5
 
     monkeypatch.setattr(Trainer, "validate", error)
-    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=9, patience=2), validate_every=1,
+    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=2), validate_every=1,
                      ppo=replace(SMALL.ppo, critic_warmup=3))  # fmt: skip
     model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
     rounds, updates = [s for s in seen if s[0] == "warm start"], [s for s in seen if s[0] == "ppo"]
@@ -276,8 +276,8 @@ def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, ro
     assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
     assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
     assert GapModel.how_trained(model.card) == (
-        f"2 of 9 rounds of the supervised start, worse than no correction; {len(updates) - 1} updates of PPO from the "
-        "untrained network"
+        f"supervised start (2 rounds), worse than no correction; {len(updates) - 1} updates of PPO from the untrained "
+        "network"
     )
 
 

@@ -34,8 +34,6 @@ class WarmStartConfig:
 
     rounds: Annotated[int, Interval(ge=0, le=100000)] = 3
     """Roll-outs: the first led by the labels, then by the present policy; 0 starts PPO from an untrained network."""
-    patience: Annotated[int, Interval(ge=1, le=100000)] = 3
-    """Rounds after which PPO takes over if none was better than no correction, as from an identified simulator."""
     num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations per round."""
     steps: Annotated[int, Interval(ge=1, le=10000000)] = 400

@@ -17,15 +17,13 @@ from scipy.ndimage import gaussian_filter1d
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
-from gaponet.sim.replay import Progress, replay
+from gaponet.sim.replay import replay
 
 ITERATIONS, GAIN = 6, 0.6
 LEAD, SMOOTH = 0.1, 0.06  # s: how much later a correction shows, σ of the filter
 
 
-def trajectory_labels(
-    sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0, progress: Progress | None = None
-) -> Array:
+def trajectory_labels(sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0) -> Array:
     """Δa* of the operated joints within ±limit rad, (rows of all recordings, n); NaN where a joint was not recorded.
 
     Of every recording the iteration that followed it best.
@@ -41,8 +39,6 @@ def trajectory_labels(
         best = [min(pair, key=lambda x: x[0]) for pair in zip(best, found, strict=True)]
         if iteration < ITERATIONS:
             deltas = [_bettered(*x, limit) for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)]
-        if progress is not None:
-            progress(iteration + 1, ITERATIONS + 1)
     labels = np.concatenate([d for _, d in best]).astype(np.float32)
     silent = [np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences]
     return np.where(np.concatenate(silent), np.nan, labels).astype(np.float32)

@@ -172,9 +172,7 @@ class Trainer:
         if self.kept.warm is not None and self._spent() < 1:
             warm.set_state(self.kept.warm)
             torch.set_rng_state(self.rng)
-        while (
-            warm.done < config.rounds and self._spent() < 1 and not (warm.done >= config.patience and self._in_vain())
-        ):
+        while warm.done < config.rounds and self._spent() < 1:
             fit = warm.round(self._tick)
             self.kept.sensor_r2 = warm.report
             self.kept.rounds_done, self.kept.warm = warm.done, warm.state()
