@@ -21,8 +21,7 @@ from gaponet.errors import UsageError
 from gaponet.sim.batch import BatchSim, CommandHistory
 from gaponet.sim.servo import ServoLaw
 
-# Contacts of a simulation whose links touch, constraints of each; with MuJoCo's 1e-10 all worlds wait for the slowest.
-CONTACTS, ROWS, TOLERANCE = 48, 4, 1e-8
+CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
 LATE = {"history": "history", "time": "time"}
 LAW = {"servo_torque": "servo_torque", "servo_load": "servo_load"}
@@ -48,7 +47,7 @@ class _Worlds:
                 raise UsageError(f"{sim.robot.name}: mujoco_warp refuses it ({error}); use --device cpu") from None
             self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
             self.model.opt.timestep = warp.array(timestep, dtype=float)
-            self.model.opt.tolerance = warp.array([TOLERANCE], dtype=float)  # put_model's is 1e-6 at least
+            self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
         for name, x in own.items():
             view = self.expand(name)
             view.copy_(torch.tensor(x).reshape(view.shape))
