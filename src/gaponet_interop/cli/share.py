@@ -14,13 +14,19 @@ Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
 
 
 @like(move.push)
-def push(path: Folder, address: Address, private: Flag = False, replace: Flag = False, json: Json = False) -> None:
+def push(
+    path: Folder, address: Address, private: Flag = False, replace: Flag = False, prune: Flag = False,
+    json: Json = False,
+) -> None:  # fmt: skip
     """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
     screen = Out(json)
-    moved = move.push(path, address, private, replace)
+    moved = move.push(path, address, private, replace, prune)
     screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {address}", moved.kind)
+    if moved.facts["pruned"]:
+        screen.say(f"{moved.facts['pruned']} files of earlier pushes were removed")
     screen.say(f"Back: gaponet pull {address} {path.name}")
-    screen.result({"kind": moved.kind, "address": address, "files": moved.files, "bytes": moved.size})
+    screen.result({"kind": moved.kind, "address": address, "files": moved.files, "bytes": moved.size}
+                  | moved.facts)  # fmt: skip
 
 
 @like(move.pull)

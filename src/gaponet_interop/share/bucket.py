@@ -3,7 +3,7 @@
     PLACE/sha256/<hash>   the files, each under its hash: written again only where its content is another
     PLACE/gaponet.json    which of them belong together, and their names; written last
 
-No object is renamed or appended to. What an earlier push left and no index names stays there.
+No object is renamed or appended to. What an earlier push left and no index names stays there until it is pruned.
 """
 
 from __future__ import annotations
@@ -11,17 +11,30 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaponet_interop.share.errors import RemoteError
-from gaponet_interop.share.target import BLOCK, INDEX, LARGEST_INDEX, Anew, ChangedError, Kind, Part, part_of, reaching
+from gaponet_interop.share.target import (
+    BLOCK,
+    INDEX,
+    LARGEST_INDEX,
+    Anew,
+    ChangedError,
+    Index,
+    Kind,
+    Part,
+    part_of,
+    reaching,
+)
 
 if TYPE_CHECKING:
     from pyarrow import NativeFile
 
 OBJECTS = "sha256"
+SETTLED = 86_400  # s: younger files may be of a push that is under way
 PATIENCE = 20  # s that a request to gs:// is tried again; 15 minutes where nobody says, s3:// gives up after 6
 
 
@@ -91,6 +104,18 @@ class Bucket:
                 while left and (block := content.read(min(BLOCK, left))):
                     file.write(block)
                     left -= len(block)
+
+    def prune(self, index: Index) -> int:
+        from pyarrow.fs import FileSelector
+
+        named, before = {part.sha256 for part in index.files.values()}, time.time() - SETTLED
+        with reaching(self.address, *self._errors):
+            there = self.files.get_file_info(FileSelector(f"{self.root}/{OBJECTS}", allow_not_found=True))
+            left = [one for one in there if one.is_file and one.base_name not in named]
+            gone = [one.path for one in left if one.mtime is not None and one.mtime.timestamp() < before]
+            for path in gone:
+                self.files.delete_file(path)
+        return len(gone)
 
     def open(self, path: str, part: Part) -> NativeFile:
         """A file of the index, to read pieces of it.

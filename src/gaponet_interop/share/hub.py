@@ -16,7 +16,7 @@ from typing import Any
 
 from gaponet_interop.formats.lerobot_set import VERSION as LEROBOT_TAG
 from gaponet_interop.share.errors import RemoteError
-from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, Kind, Part, reaching
+from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, Index, Kind, Part, reaching
 
 TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
 MOST = 50_000  # files of a repository that are listed
@@ -97,6 +97,9 @@ class Hub:
                 with suppress(RevisionNotFoundError):
                     self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=TYPES[kind])
                 self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=TYPES[kind])
+
+    def prune(self, index: Index) -> int:
+        return 0  # a commit takes them away, and the repository's history keeps them
 
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         if self.sizes.get(path) != part.size:

@@ -44,7 +44,7 @@ class Moved:
     facts: dict[str, Any]
 
 
-def push(path: str | Path, address: str, private: bool = False, replace: bool = False) -> Moved:
+def push(path: str | Path, address: str, private: bool = False, replace: bool = False, prune: bool = False) -> Moved:
     """Put a dataset or a run where others can pull it, with a card; one that is there already is brought up to date.
 
     Args:
@@ -52,6 +52,8 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
         address: USER/NAME on the Hugging Face Hub, or s3://, gs:// or file:// and a folder.
         private: Readable by its owner alone, where a new repository of the Hub is made for it.
         replace: Also where something is there of which this is no newer state; every file is sent anew.
+        prune: Remove from a bucket what earlier pushes left there, a day old or older. Who pulls an earlier state
+            at that moment starts again.
 
     Raises:
         RemoteError: The place cannot be reached or written, or holds something else.
@@ -85,7 +87,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
                     raise
                 content = target.index(kind)
                 there = _read(target, content)
-    return Moved(kind, address, path, len(files), index.size, {})
+    return Moved(kind, address, path, len(files), index.size, {"pruned": target.prune(index) if prune else 0})
 
 
 def pull(address: str, out: str | Path) -> Moved:

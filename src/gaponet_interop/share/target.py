@@ -104,6 +104,9 @@ class Target(Protocol):
             ChangedError: Another index is there now; it stays.
         """
 
+    def prune(self, index: Index) -> int:
+        """Remove files that this index does not name and that no push under way can have brought; returns how many."""
+
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         """Copy one file of the index into a folder, under its path; its hash is the caller's to look at."""
 

@@ -1,7 +1,9 @@
 """Dataset → LeRobotDataset v3.0, so that it comes back from data.formats.lerobot with the same content hashes.
 
 A LeRobot set has one rate and the same features in every frame; a dataset with several rates or choices of channels
-becomes several sets, in folders of their own. One Parquet row group per episode, files of about 100 MB.
+becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
+of its last episode says, so that a dataset that grew has its earlier files again, byte by byte, and a push sends the
+last one and what is new: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more.
 
     beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
                             features.<name>.info.unit: SI
@@ -35,7 +37,8 @@ if TYPE_CHECKING:
 
 Group = tuple[float, tuple[str, ...]]  # dt, channels
 
-FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults
+FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
+USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
 ROWS = 200  # episodes in a row group of meta/episodes
 INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
          "task_index": "int64"}  # fmt: skip
@@ -80,20 +83,21 @@ class _Set:
 
     def write(self, entries: list[Entry], tell: Tell) -> int:
         """Write all episodes and the metadata; returns the number of frames."""
-        writer, size = None, 0
+        writer, size, total, ended = None, 0, 0, False
         try:
             for entry in entries:
                 sequence = self.dataset.read(entry)
                 columns = self._columns(sequence)
                 bytes_now = sum(x.nbytes for x in columns.values())
-                if writer is not None and size + bytes_now > FILE_MB * 1e6:
+                if writer is not None and (ended or size + bytes_now > FILE_MB * 1e6):
                     writer.close()
                     writer, size = None, 0
                     self._next_file()
                 if writer is None:
                     writer = self._open()
                 writer.write_table(self._table(columns))
-                size += bytes_now
+                size, total = size + bytes_now, total + bytes_now
+                ended = int(entry.hash[:8], 16) / 2**32 < bytes_now / max(USUAL_MB * 1e6, SHARE * total)
                 self._note(entry, columns)
                 tell(entry.meta.motion)
             self._flush()

@@ -116,6 +116,24 @@ def test_many_episodes_are_spread_over_files(dataset, arm, tmp_path, monkeypatch
     same(dataset, back(tmp_path / "out", arm, tmp_path / "again"))
 
 
+def test_of_a_dataset_that_grew_all_files_but_the_last_are_the_same(arm, tmp_path, monkeypatch):
+    monkeypatch.setattr(lerobot_export, "USUAL_MB", 0.01)
+    data = Dataset.create(tmp_path / "data", arm)
+
+    def exported(name, motions):
+        for motion in motions:
+            ctrl = wave(50, 2) + 0.001 * len(data)
+            data.append(arm_sequence(arm, ctrl, late(ctrl, 1), motion, 0.0))
+        export_lerobot(data, tmp_path / name)
+        return {f.name: f.read_bytes() for f in sorted((tmp_path / name / "data").rglob("*.parquet"))}
+
+    before = exported("first", [f"walk {i}" for i in range(30)])
+    after = exported("second", ["one more"])
+    assert len(before) > 3
+    assert all(after[name] == content for name, content in [*before.items()][:-1])
+    same(data, back(tmp_path / "second", arm, tmp_path / "again"))
+
+
 def test_what_is_too_much_to_hold_is_read_twice(dataset, arm, tmp_path, monkeypatch):
     monkeypatch.setattr("gaponet.data.importer.HOLD", 2000)
     export_lerobot(dataset, tmp_path / "out")

@@ -198,6 +198,22 @@ def largest(folder):
     return max((folder / "bucket" / "sha256").iterdir(), key=lambda file: file.stat().st_size)
 
 
+def test_what_earlier_pushes_left_is_pruned_once_it_is_a_day_old(dataset, arm, tmp_path):
+    place, objects = f"file://{tmp_path}/bucket", tmp_path / "bucket" / "sha256"
+    push(dataset.path, place)
+    add(dataset, arm, ["new"])
+    push(dataset.path, place)
+    grown = len(list(objects.iterdir()))
+    young = push(dataset.path, place, prune=True)
+    assert young.facts["pruned"] == 0
+    for file in objects.iterdir():
+        os.utime(file, (0, 0))
+    old = push(dataset.path, place, prune=True)
+    assert old.facts["pruned"] == grown - len(list(objects.iterdir())) > 0
+    pull(place, tmp_path / "back")
+    same(dataset, Dataset(tmp_path / "back"))
+
+
 def test_a_damaged_object_is_mended_by_pushing_again_and_by_replace(dataset, arm, tmp_path):
     address, whole = f"file://{tmp_path}/bucket", {}
     push(dataset.path, address)
