@@ -137,7 +137,9 @@ def fleet(
     workers: int = 0,
     json: Json = False,
 ) -> None:
-    """A fleet's nightly job: check every robot, calibrate those that drifted, one page of who, by what, since when.
+    """Check many robots, calibrate those that drifted, one page of them.
+
+    A fleet's nightly job: who drifted, by what, since when.
 
     The same command again goes on where it was. The exit code is 0 where all are the same, else 1.
 
