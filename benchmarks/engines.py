@@ -1,12 +1,12 @@
 """An identified robot in other people's engines: what its exports leave there, beside what it leaves here.
 
     make engines                                         # once: environments of their own in ~/.cache/gaponet
-    python benchmarks/engines.py ROBOT WORK [--data DATASET]
+    python benchmarks/engines.py ROBOT WORK [--data DATASET] [--test]
 
 Exports the robot for MuJoCo, MJX, mjlab, Isaac Lab and Newton, once fitted without its law, and runs the check.py
 beside each export in that engine's environment, without gaponet. Prints a row per engine: mean |error| on the
 validation motions that travel (five of 30 s at most), there and in gaponet, and what the export says that it leaves
-out. What is found in WORK is kept.
+out; --test adds what the MJCF leaves on the test motions, all of their length. What is found in WORK is kept.
 """
 
 from __future__ import annotations
@@ -19,11 +19,14 @@ from pathlib import Path
 
 import tyro
 
+from gaponet.data.store import Dataset
+from gaponet.eval.candidate import read_origin
 from gaponet.files import write_text
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet_interop.engine import folder as exporting
-from gaponet_interop.engine.forms import plain_form, recordings_of
+from gaponet_interop.engine.forms import comparable, left, plain_form, recordings_of
+from gaponet_interop.engine.mujoco_servos import read
 
 CACHE = Path.home() / ".cache" / "gaponet"
 CHECKS = {  # environment → export, check, what runs in it
@@ -55,11 +58,26 @@ def checked(python: Path, check: str, package: str, folder: Path) -> dict[str, s
     return json.loads(kept.read_text())
 
 
+def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> None:
+    """Print what each form leaves of the test motions that the robot's own folder names."""
+    origin = read_origin(robot)
+    assert origin is not None
+    dataset = Dataset.opened(str(robot / origin["dataset"]))
+    hashes = set(origin["parts"]["test"].values())
+    motions = comparable(dataset.sequences([e for e in dataset.entries if e.hash in hashes]), spec, 0.0)
+    facts = read(exported / "facts.json")
+    forms = {"in gaponet": left(motions, spec), "in gaponet, without the law": left(motions, plain)}
+    for form, what in (("joints", "MJCF with servo_law.py"), ("plain", "MJCF alone")):
+        forms[what] = exporting._played(exported / facts["file"], facts, motions, spec, form)
+    print(f"\n{len(motions)} test motions: " + ", ".join(f"{k} {1e3 * x:.2f} mrad" for k, x in forms.items()))
+
+
 def main(
     robot: tyro.conf.Positional[Path],
     work: tyro.conf.Positional[Path],
     data: str | None = None,
     environments: Path = CACHE,
+    test: bool = False,
 ) -> None:
     """Print a table in Markdown.
 
@@ -68,6 +86,7 @@ def main(
         work: Folder for the exports.
         data: Dataset; default the one that the robot was identified from.
         environments: Where each engine's environment lies.
+        test: Also ask the test motions.
     """
     spec, recordings = load_robot(robot), recordings_of(robot, data, load_robot(robot))
     assert recordings is not None, "no recordings: give --data"
@@ -89,6 +108,8 @@ def main(
                 print(
                     f"| {package} {got['version']} | {form} | {there} | {here} | {got['s']} | {left_out} |", flush=True
                 )
+    if test:
+        tested(spec, plain, robot, work / "mjcf")
 
 
 if __name__ == "__main__":

@@ -101,10 +101,15 @@ class Aligner:
 
 
 class AlignedAction:
-    """What JointPositionAction of both engines becomes: before it among the base classes."""
+    """What JointPositionAction of both engines becomes: before it among the base classes.
+
+    Attributes:
+        told: What servos of worlds that begin anew were told until then, (num_envs, joints) rad; None: to stay there.
+    """
 
     folder: Path
     payload_mass: float | None
+    told: Tensor | None = None
     _processed_actions: Tensor
 
     def align(self, entity: Any, ids: Any, names: list[str], offset: float = 0.0, form: str = "joints") -> None:
@@ -123,11 +128,11 @@ class AlignedAction:
         data, ids = self._aligned.data, self._columns
         q, v = (getattr(x, "torch", x)[:, ids] for x in (data.joint_pos, data.joint_vel))  # Isaac Lab 3 wraps tensors
         bias = data.encoder_bias[:, ids] if hasattr(data, "encoder_bias") else 0.0  # mjlab takes it off again
-        self.begin(q)
+        self.begin(q, q if self.told is None else self.told)
         self._processed_actions = self.aligner(q, v, self._processed_actions - bias) + bias + self.servo_offset
 
-    def begin(self, qpos: Tensor) -> None:
-        """Worlds that are fresh now begin in this state."""
+    def begin(self, qpos: Tensor, told: Tensor) -> None:
+        """Worlds that are fresh now begin in this state, under this command."""
 
     def reset(self, env_ids: Any = None, **other: Any) -> None:
         super().reset(env_ids, **other)  # type: ignore[misc]
@@ -153,9 +158,9 @@ def mjlab_action(folder: str | Path, payload_mass: float | None = None, check: b
             self.law = ServoLaw(env.sim, self._entity, cfg.entity_name, names, read_facts(self.folder))
             hold_friction(env.sim, cfg.entity_name, self.folder)
 
-        def begin(self, qpos: Tensor) -> None:
-            self.late.begin(self.aligner.past.fresh, qpos)
-            self.law.begin(self.aligner.past.fresh)
+        def begin(self, qpos: Tensor, told: Tensor) -> None:
+            self.late.begin(self.aligner.past.fresh, told)
+            self.law.begin(self.aligner.past.fresh, told - qpos)
 
         def apply_actions(self) -> None:
             super().apply_actions()
@@ -221,11 +226,11 @@ class LateServos:
         self.any = bool(self.mine.any())
         vars(self).update({k: x.to(sim.device) for k, x in vars(self).items() if isinstance(x, Tensor)})
 
-    def begin(self, fresh: Tensor, qpos: Tensor) -> None:
-        """The command under way in fresh worlds is to stay at qpos, (num_envs, names) rad."""
+    def begin(self, fresh: Tensor, told: Tensor) -> None:
+        """The command under way in fresh worlds, (num_envs, names) rad."""
         if self.any:
             history, time = self.sim.data.history, self.sim.data.time
-            begun = self.base + self.timed * time[:, None] + self.held * qpos[:, self.source]
+            begun = self.base + self.timed * time[:, None] + self.held * told[:, self.source]
             history[:] = torch.where(fresh[:, None] & self.mine, begun, history[:])
 
 
@@ -252,10 +257,10 @@ class ServoLaw:
 
         entity.update = updated
 
-    def begin(self, fresh: Tensor) -> None:
-        """Fresh worlds stand where they are."""
+    def begin(self, fresh: Tensor, apart: Tensor) -> None:
+        """Fresh worlds stand so far from what they were told, (num_envs, joints) rad."""
         if self.law:
-            self.torque = torch.where(fresh[:, None], self.bias, self.torque)
+            self.torque = torch.where(fresh[:, None], self.bias + self.kp * apart, self.torque)
             self.load = torch.where(fresh[:, None], self.sim.data.qfrc_bias[:, self.dof], self.load)
 
     def before(self, ctrl: Tensor) -> None:
@@ -281,11 +286,10 @@ class DelayedAction:
         self.share = torch.tensor(delay_weights(delay, step), device=me.device, dtype=torch.float)[:, None]
         self.under_way = torch.zeros(len(self.share), me.num_envs, len(delay), device=me.device)
 
-    def begin(self, qpos: Tensor) -> None:
-        """What is under way in fresh worlds keeps them at qpos."""
+    def begin(self, qpos: Tensor, told: Tensor) -> None:
+        """What is under way in fresh worlds."""
         me: Any = self
-        stay = qpos + me.servo_offset
-        self.under_way = torch.where(me.aligner.past.fresh[:, None], stay, self.under_way)
+        self.under_way = torch.where(me.aligner.past.fresh[:, None], told + me.servo_offset, self.under_way)
 
     def apply_actions(self) -> None:
         me: Any = self

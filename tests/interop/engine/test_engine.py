@@ -242,8 +242,8 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
     asked = servo_torque(terms, kp, ctrl + robot.offset, q)
     np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
-    found.begin(torch.ones(20, dtype=torch.bool))
-    np.testing.assert_allclose(found.torque, np.tile(kp * robot.offset, (20, 1)), atol=1e-6)
+    found.begin(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
+    np.testing.assert_allclose(found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6)
 
 
 def isaac_lab(monkeypatch):
@@ -300,7 +300,7 @@ def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_
 
     term = Late()
     term.late([0.007, 0.0], 0.005)
-    term.begin(torch.zeros(2, 2))
+    term.begin(torch.ones(2, 2), torch.zeros(2, 2))
     term.aligner.past.fresh = torch.tensor([False, False])
     term._processed_actions = torch.ones(2, 2)
     told = []

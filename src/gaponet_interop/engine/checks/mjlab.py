@@ -46,6 +46,7 @@ for row, target in enumerate(ctrl):
             for field, x in zip(("qpos", "qvel"), start, strict=True):
                 x[world] = torch.tensor(played[motion][field][0])
         env.reset(env_ids=torch.tensor(list(begun)))
+    term.told = target[:, asked]  # a recording begins under a command that has stood for long; training, at rest
     env.step(target[:, asked])
     qpos.append(robot.data.joint_pos[:, order].clone().numpy())
 error = turns.error(qpos, [names.index(name) for name in facts["corrected"]])
