@@ -1,0 +1,80 @@
+"""Control steps per second of a robot on a GPU: bare mujoco_warp, gaponet's simulations, and those with resets.
+
+    python benchmarks/gpu.py [--device cuda] [--robot so101] [--seconds 5] 1024 4096 16384
+
+For each number of simulations, of a servo as stated and of one with a law (Stribeck friction, friction by load). "bare"
+is the CUDA graph of one control period launched again and again; in "resets" one simulation in a hundred begins anew
+in every period. benchmarks/gpu.sh runs it with a training behind it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+import warp
+
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.warp import WarpSim
+
+LAW = {"stribeck": 0.02, "stribeck_speed": 0.05, "friction_motor": 0.1, "friction_external": 0.1}
+
+
+def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
+    """Control steps a second of all simulations, after a first period that compiles."""
+    period()
+    warp.synchronize()
+    periods, began = 0, time.perf_counter()
+    while time.perf_counter() - began < seconds:
+        period()
+        periods += 1
+        if periods % 20 == 0:
+            warp.synchronize()
+    warp.synchronize()
+    return num_envs * periods / (time.perf_counter() - began)
+
+
+def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dict[str, float]:
+    """Speeds by name, control steps/s."""
+    sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 1), device)
+    home = sim.array(np.tile(robot.qpos_home, (num_envs, 1)))
+    some = sim.array(np.arange(0, num_envs, 100))
+    target = home + 0.1
+
+    def begin(ids: torch.Tensor) -> None:
+        sim.reset(ids, home[ids], torch.zeros_like(home[ids]), past=home[ids][:, None])
+
+    def with_resets() -> None:
+        begin(some)
+        sim.step(target)
+
+    begin(torch.arange(num_envs, device=home.device))
+    turns: dict[str, Callable[[], object]] = {"gaponet": lambda: sim.step(target), "resets": with_resets}
+    if sim._worlds[0].law is None:
+        turns = {"bare": sim._worlds[0].step} | turns
+    return {name: rate(turn, num_envs, seconds) for name, turn in turns.items()}
+
+
+def main() -> None:
+    """Measure and print one JSON line for each size and servo."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sizes", type=int, nargs="+")
+    parser.add_argument("--device", default="cuda", choices=("cuda", "warp-cpu"))
+    parser.add_argument("--robot", default="so101")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each measurement")
+    args = parser.parse_args()
+    stated = load_robot(args.robot)
+    for size in args.sizes:
+        for servo, robot in (("stated", stated), ("law", stated.with_servos(dict.fromkeys(stated.operated, LAW)))):
+            found = {k: round(v) for k, v in measure(robot, size, args.device, args.seconds).items()}
+            memory = torch.cuda.max_memory_reserved() >> 20 if args.device == "cuda" else 0
+            print(json.dumps({"num_envs": size, "servo": servo, "torch_mb": memory} | found), flush=True)
+
+
+if __name__ == "__main__":
+    main()
