@@ -71,6 +71,11 @@ def _turned(s: Sequence) -> Sequence:
     return replace(s, qpos=s.qpos + np.array([5e-3, 0], np.float32))
 
 
+def _kept(work: Path) -> list[Path]:
+    """Files of arms with both nights."""
+    return [f for f in (work / "out").glob("arm-*.json") if len(json.loads(f.read_text())) == 2]
+
+
 def main() -> None:
     """As above."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -84,14 +89,17 @@ def main() -> None:
                    str(work / "out"), "--night", night, "--workers", "1", "--json"]  # fmt: skip
         if night == "night2" and args.kill:
             begun = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            time.sleep(20)
+            while begun.poll() is None and len(_kept(work)) < len(named) // 3:
+                time.sleep(0.1)
             begun.kill()
             begun.wait()
-            kept = [f for f in (work / "out").glob("arm-*.json") if len(json.loads(f.read_text())) == 2]
-            print(f"killed after 20 s: {len(kept)} of {len(named)} were kept")
+            print(f"killed: {len(_kept(work))} of {len(named)} were kept")
+            kept = {f: f.stat().st_mtime_ns for f in _kept(work)}
         began = time.monotonic()
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
         said = json.loads(done.stdout)["robots"]
+        if night == "night2" and args.kill:
+            print(f"asked again of those: {sum(f.stat().st_mtime_ns != then for f, then in kept.items())}")
         took, calibrated = np.array([n["took"] for n in said.values()]), [n["calibrated"] for n in said.values()]
         moved = {r: n["moved"] for r, n in said.items() if n["verdict"] != "same"}
         right = [r for r in moved if night == "night2" and named[r]]
