@@ -87,7 +87,7 @@ def trees(bench: Bench, robot: RobotSpec, labels: Array, seed: int) -> Trees:
 def trained(bench: Bench, robot: RobotSpec, folder: Path, kind: str, seed: int, budget: str) -> Array:
     """Errors of a run on the test motions, rad."""
     if not (folder / "model" / "card.json").is_file():
-        run("train", bench.data.path, "--robot", bench.work / robot.folder.name, "--out", folder, "--model", kind,
+        run("train", bench.data.path, "--robot", robot.folder, "--out", folder, "--model", kind,
             "--budget", budget, "--seed", seed, "--holdout-units", UNIT,
             *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
     return bench.errors(robot, GapModel.load(folder).corrector(robot))
