@@ -38,12 +38,13 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
         free = [j for j in robot.joint_names if j not in found]
         maps = []
         for name, _ in strange:
-            close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.3)
+            close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
             maps.append(f"--map {name}={close[0] if close else '…'}")
             free = [j for j in free if j not in close]
         raise JointMismatchError(
             f"{where} names joints {', '.join(n for n, _ in strange)}, but robot '{robot.name}' has: "
-            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml"
+            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml; what is no joint of "
+            'this robot is left out by ignore = ["NAME", …] there'
         )
     if len(set(found)) != len(found):
         raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map or [names]")
