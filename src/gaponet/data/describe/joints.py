@@ -43,8 +43,8 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             free = [j for j in free if j not in close]
         raise JointMismatchError(
             f"{where} names joints {', '.join(n for n, _ in strange)}, but robot '{robot.name}' has: "
-            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml; what is no joint of "
-            'this robot is left out by ignore = ["NAME", …] there'
+            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml; "
+            'what is no joint of this robot is left out by ignore = ["NAME", …] there'
         )
     if len(set(found)) != len(found):
         raise JointMismatchError(f"{where}: two names map to one joint: {', '.join(found)}; mend --map or [names]")
