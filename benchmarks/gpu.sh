@@ -1,5 +1,5 @@
 #!/bin/sh
-# What a GPU makes of gaponet, in about ten minutes and without a network (pip install "gaponet[warp,robots]" and a CUDA
+# What a GPU makes of gaponet, meant for ten minutes (never timed on one), and without a network (pip install "gaponet[warp,robots]" and a CUDA
 # build of torch are there already):
 #     benchmarks/gpu.sh OUT
 # Steps a second beside bare mujoco_warp, then one training on the GPU and the same on the CPU, both measured by
