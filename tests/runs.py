@@ -69,6 +69,6 @@ def small_model(robot: RobotSpec, folder: Path) -> GapModel:
     """A model that corrects by some ten mrad."""
     torch.manual_seed(0)
     net = build_network(SMALL, len(robot.operated))
-    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.03)
     export(net, folder, make_card(SMALL, robot, dt=[robot.dt]), drawn_states(net))
     return GapModel.load(folder)
