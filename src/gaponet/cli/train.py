@@ -13,7 +13,7 @@ from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
-from gaponet.eval.verdict import WORTH
+from gaponet.eval.verdict import Added
 from gaponet.model.config import Kind
 from gaponet.robot_folder import KEPT
 from gaponet.training.config import TrainConfig
@@ -57,11 +57,10 @@ def train(
         f"{mrad(val['nominal'])} ({val['model'] / val['nominal']:.2f}); {card['steps']:,} control steps in "
         f"{card['seconds']:.0f} s: {GapModel.how_trained(card)}" + (" (interrupted)" if card["interrupted"] else "")
     )
-    error = val.get("error", 0.0)
-    screen.say(f"the network adds {mrad(val['added'])} ± {mrad(error)} mrad on validation motions (paired)")
-    helps = val["added"] > max(error, WORTH * val["start"])
+    worth = Added("identified", val["added"], val.get("error", 0.0), val["start"])
+    screen.say(f"the network adds {mrad(worth.less)} ± {mrad(worth.error)} mrad on validation motions (paired)")
     step = f"gaponet eval {out} {quote(dataset)}"
-    if not helps and val["start"] != val["nominal"]:
+    if not worth.helps and val["start"] != val["nominal"]:
         step = f"gaponet export {quote(str(out / KEPT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
     screen.say(f"model in {trained.path}; next: {step}")

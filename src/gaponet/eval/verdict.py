@@ -19,7 +19,7 @@ WORTH = 0.02  # share of what is left that a network must remove, besides its st
 Scores = dict[str, Any]  # method → its metrics (metrics.summary)
 
 
-class _Added(NamedTuple):
+class Added(NamedTuple):
     """What a network removes of the error of the best method without one, rad.
 
     Attributes:
@@ -40,14 +40,14 @@ class _Added(NamedTuple):
         return self.less > max(np.nan_to_num(self.error), WORTH * self.left)
 
 
-def added(methods: Scores, own: str) -> _Added:
+def added(methods: Scores, own: str) -> Added:
     """What the network of method `own` adds."""
     base = "identified" if own.startswith(IDENTIFIED) else min(
         (name for name in ALONE if name in methods), key=lambda name: methods[name]["mpjae"]
     )  # fmt: skip
     before, after = (methods[name] for name in (base, own))
     apart = [before["by_motion"][m]["mpjae"] - after["by_motion"][m]["mpjae"] for m in before["by_motion"]]
-    return _Added(base, before["mpjae"] - after["mpjae"], standard_error(np.array(apart)), before["mpjae"])
+    return Added(base, before["mpjae"] - after["mpjae"], standard_error(np.array(apart)), before["mpjae"])
 
 
 def verdict(methods: Scores) -> list[str]:

@@ -8,6 +8,7 @@ and a network fitted to it leaves more (docs/results/unnamed.md).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
 
@@ -23,15 +24,18 @@ ITERATIONS, GAIN = 6, 0.6
 LEAD, SMOOTH = 0.1, 0.06  # s: how much later a correction shows, σ of the filter
 
 
-def trajectory_labels(sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0) -> Array:
+def trajectory_labels(
+    sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0, tick: Callable[[], object] = bool
+) -> Array:
     """Δa* of the operated joints within ±limit rad, (rows of all recordings, n); NaN where a joint was not recorded.
 
-    Of every recording the iteration that followed it best.
+    Of every recording the iteration that followed it best; tick is called in each.
     """
     op = robot.operated_index
     deltas = [np.zeros((len(s), len(op))) for s in sequences]
     best = [(np.inf, d) for d in deltas]
     for iteration in range(ITERATIONS + 1):
+        tick()
         told = [_told(s, d, op) for s, d in zip(sequences, deltas, strict=True)]
         runs = replay(told, robot, nthread=nthread, lock_idle=True)
         errors = [(s.qpos - run.qpos)[:, op].astype(float) for s, run in zip(sequences, runs, strict=True)]

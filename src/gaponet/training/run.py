@@ -156,12 +156,13 @@ class Trainer:
     def _warm_start(self) -> None:
         config = recipe(self.own)
         self.stage = "labels"
-        self._tick()
         part = self.parts["train"]
         some = spread(part, max(1, config.rows * len(part) // sum(e.rows for e in part)))
         labelled = self.dataset.sequences(some, optional=False)
         env = self._env(config.num_envs, 10**9, self.config.seed, sequences=labelled)
-        labels = trajectory_labels(labelled, self.robot, 0.99 * self.config.model.delta_max, self.own.threads)
+        labels = trajectory_labels(
+            labelled, self.robot, 0.99 * self.config.model.delta_max, self.own.threads, self._tick
+        )
         warm = WarmStart(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
         warm.report = self.kept.sensor_r2
         if self.kept.rounds_done == 0:
