@@ -269,20 +269,20 @@ def identify(
             "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
             "val_mpjae": {name: float(e.mean()) for name, e in val_errors.items()},
         })  # fmt: skip
-        _keep_known(Path(out), data.sequences(parts["train"]), val, found.covariance, None)
+        _keep_known(Path(out), data.sequences(parts["train"]), val, found.covariance, None, found.judged)
     return Identification(found, val_errors, time.monotonic() - began)
 
 
 def _keep_known(
-    folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance, before: Knowledge | None
-) -> None:
+    folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance, before: Knowledge | None,
+    judged: RobotSpec | None = None,
+) -> None:  # fmt: skip
     """Write how sure a robot folder's values are, where a part that can tell is installed."""
     from gaponet.robot_folder import KNOWN
 
-    known = offered("PROVIDES").get("what is known of a robot")
     (folder / KNOWN).unlink(missing_ok=True)
-    if known:
-        named(known)(load_robot(folder), sequences, judges, covariance, before).save(folder)
+    if known := offered("PROVIDES").get("what is known of a robot"):
+        named(known)(load_robot(folder), sequences, judges, covariance, before, judged).save(folder)
 
 
 def train(

@@ -81,7 +81,7 @@ def _real(
     if steps:
         from gaponet_lab.real.networks import networks
 
-        methods |= networks(steps, out / "trainings")
+        methods |= networks(steps)
     found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets)
     screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
     for name, agreement in found["labels"].items():

@@ -136,6 +136,7 @@ def known(
     judges: ListOf[Sequence],
     covariances: Mapping[str, tuple[list[str], Array]] = {},
     before: Knowledge | None = None,
+    judged: RobotSpec | None = None,
     nthread: int = 0,
 ) -> Knowledge:
     """What is known of a robot after it was fitted to recordings.
@@ -148,6 +149,7 @@ def known(
             known before give it.
         before: What was known of the robot that the fit began from. What these recordings deny of it is forgotten: its
             variance grows by how far the values moved beyond their own.
+        judged: The robot that the judges say something of, where `robot` was fitted to them, too, afterwards.
         nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
@@ -159,11 +161,7 @@ def known(
         old = np.stack([before.array(j, "scatter") for j in robot.operated])
         scatter = (before.clusters * old + clusters * scatter) / (before.clusters + clusters)
     step, step_covariance = says.step(np.maximum(scatter, 1.0))
-    judged = judges or sequences
-    twins = replay(judged, robot, nthread=nthread, lock_idle=True)
-    op = robot.operated_index
-    left = np.concatenate([(t.qpos - s.qpos)[1:, op] for s, t in zip(judged, twins, strict=True)])
-    joints = {}
+    left, joints = _left(judges or sequences, judged or robot, nthread), {}
     for i, joint in enumerate(robot.operated):
         own = step_covariance[i, :-1, :-1]
         if before:
@@ -178,7 +176,7 @@ def known(
             own = inverted(inverted(own) + np.diag(believed(fields, values[joint]) ** -2))
         normal = says.normals[i].sum(axis=0)[:-1, :-1]
         predicted = SOFT * float(np.sqrt(max(np.trace(own @ normal), 0.0) / max(says.rows[i], 1)))
-        error = np.abs(left[:, i])
+        error = left[joint]
         rest = before and not judges and before.joints[joint]
         joints[joint] = JointKnown(
             _plain(values[joint]), _plain(own), _plain(step[i]), _plain(step_covariance[i]), _plain(scatter[i]),
@@ -194,6 +192,18 @@ def known(
         "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
     }  # fmt: skip
     return Knowledge(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
+
+
+def _left(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, Array]:
+    """Joint → |error| of every row that holds it, motions in free run, rad; where none does, the worst joint's."""
+    twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
+    pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, twins, strict=True)]
+    found = {}
+    for j, i in zip(robot.operated, robot.operated_index, strict=True):
+        if mine := [error[:, i] for silent, error in pairs if j not in silent]:
+            found[j] = np.concatenate(mine)
+    worst = max(found.values(), key=lambda error: float(np.square(error).mean()), default=np.zeros(1))
+    return {j: found.get(j, worst) for j in robot.operated}
 
 
 def _plain(x: Array) -> Any:

@@ -8,7 +8,7 @@ import json
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,7 @@ from gaponet.data.json_file import finite
 from gaponet.errors import GAPONetError, UsageError
 from gaponet.files import write_text
 from gaponet.metrics import standard_error
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.robot import RobotSpec
 from gaponet_lab.real.adversaries import ADVERSARIES, Adversary
 from gaponet_lab.real.cards import Card, Cards, prepare
 from gaponet_lab.real.questions import Question, floor, questions
@@ -32,7 +31,8 @@ Said = Callable[[str], None]
 class Row:
     """What a method leaves of a question: mean |error| of each independent motion, (motions,) rad.
 
-    `nominal` is the same of the nominal simulator, in the same order; `seconds` is what fitting and asking took.
+    `nominal` is the same of the nominal simulator, in the same order; `seconds` is what fitting and asking took;
+    `notes` are the answers' own.
     """
 
     set: str
@@ -45,6 +45,7 @@ class Row:
     splits: tuple[str, ...]
     by_payload: dict[str, float]
     seconds: float
+    notes: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: mrad, with the standard error over motions, of differences paired."""
@@ -54,7 +55,7 @@ class Row:
             "standard_error": 1e3 * standard_error(self.error), "of_nominal": self.error.mean() / self.nominal.mean(),
             "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(self.error),
             "recordings": self.recordings, "floor_mrad": 1e3 * self.floor, "splits": self.splits,
-            "by_payload_mrad": self.by_payload, "seconds": round(self.seconds, 1),
+            "by_payload_mrad": self.by_payload, "seconds": round(self.seconds, 1), "notes": self.notes,
         })  # fmt: skip
 
 
@@ -104,11 +105,7 @@ class Bench:
             if told:
                 labels[card.name] = told.agreement
             for name in card.questions:
-                folds = list(questions(name, dataset, robot, self.before(card)))
-                kept = self._identified(card.name)
-                if name == card.questions[0] and not self.adversary and (kept / "robot.toml").is_file():
-                    folds[0].made["identified"] = load_robot(kept)  # as another set asked for it
-                rows += self.ask(card, name, folds)
+                rows += self.ask(card, name, list(questions(name, dataset, robot, self.before(card))))
             seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)
         return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in here}, "labels": labels,
                 "left_out": left_out, "adversary": self.adversary,
@@ -122,19 +119,19 @@ class Bench:
         other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_there(c)), None)
         return functools.partial(self._elsewhere, other.name) if other else None
 
-    def _identified(self, name: str) -> Path:
-        return self.work / "identified" / name
-
     @functools.cache  # noqa: B019
     def _elsewhere(self, name: str) -> RobotSpec:
-        kept = self._identified(name)
-        if not (kept / "robot.toml").is_file():
-            card = next(c for c in self.cards.set if c.name == name)
-            dataset, robot, _ = prepare(card, self.data, self.work)
-            save_robot(identified(next(questions(card.questions[0], dataset, robot, None))).robot, kept)
-        return load_robot(kept)
+        card = next(c for c in self.cards.set if c.name == name)
+        dataset, robot, _ = prepare(card, self.data, self.work)
+        first = next(questions(card.questions[0], dataset, robot, None))
+        return identified(self._at_work(card, first, "")).robot
 
     __hash__ = object.__hash__
+
+    def _at_work(self, card: Card, question: Question, adversary: str) -> Question:
+        """The question with a folder of its own, so that what was identified or trained for it is not again."""
+        name = "-".join(filter(None, (card.name, question.split, adversary)))
+        return replace(question, work=self.work / "made" / name)
 
     def ask(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
         """Every method on every fold; those that have nothing to go on are left out."""
@@ -142,11 +139,11 @@ class Bench:
         noise = float(np.mean([f for q in folds if (f := floor(q)) == f] or [np.nan]))
         splits = tuple(q.split for q in folds)
         change: Adversary = ADVERSARIES.get(self.adversary, lambda q: q)
-        folds = [change(q) for q in folds]
+        folds = [self._at_work(card, change(q), self.adversary) for q in folds]
         for method, (title, answer) in self.methods.items():
             if _nothing_to_go_on(method, folds):
                 continue
-            found: list[tuple[list[float], float]] = []
+            found: list[tuple[list[float], float, str]] = []
             try:
                 for q in folds:
                     found.append(self._once(card, q, method, answer))
@@ -155,25 +152,26 @@ class Bench:
                 continue
             by_motion: dict[str, list[float]] = {}
             by_payload: dict[str, list[float]] = {}
-            for q, (errors, _) in zip(folds, found, strict=True):
+            for q, (errors, _, _) in zip(folds, found, strict=True):
                 for s, motion, e in zip(q.test, q.motion, errors, strict=True):
                     by_motion.setdefault(motion, []).append(e)
                     by_payload.setdefault(f"{s.meta.payload_mass:g}", []).append(1e3 * e)
             left = np.array([np.mean(v) for v in by_motion.values()])
             first = rows[0].error if rows else left
             masses = {k: float(np.mean(v)) for k, v in sorted(by_payload.items())}
-            count, took = sum(len(errors) for errors, _ in found), sum(s for _, s in found)
-            rows.append(Row(card.name, name, title, left, first, count, noise, splits, masses, took))
+            count, took = sum(len(errors) for errors, _, _ in found), sum(s for _, s, _ in found)
+            notes = tuple(note for _, _, note in found if note)
+            rows.append(Row(card.name, name, title, left, first, count, noise, splits, masses, took, notes))
             self.say(f"{card.name}, {name}: {title} leaves {1e3 * left.mean():.2f} of {1e3 * first.mean():.2f} mrad")
         return rows
 
-    def _once(self, card: Card, question: Question, method: str, answer: Method) -> tuple[list[float], float]:
-        """Mean |error| of each test recording, rad, over the joints that it holds, and s; kept below `work`."""
+    def _once(self, card: Card, question: Question, method: str, answer: Method) -> tuple[list[float], float, str]:
+        """Mean |error| of each test recording, rad, over the joints that it holds, s, and a note; kept below `work`."""
         words = (card.name, question.name, question.split, method, self.adversary)
         file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words).strip()) + ".json")
         if file.is_file():
             kept = json.loads(file.read_text(encoding="utf-8"))
-            return kept["errors"], kept["seconds"]
+            return kept["errors"], kept["seconds"], kept.get("note", "")
         began = time.monotonic()
         answered = answer(question)
         errors = answered.errors(question.test)
@@ -185,8 +183,9 @@ class Bench:
             for j in found.operated
         }
         mounts = [m.pos for m in found.payload_mounts]
-        write_text(file, json.dumps({"errors": errors, "seconds": seconds, "servos": servos, "mounts": mounts}))
-        return errors, seconds
+        told = {"errors": errors, "seconds": seconds, "note": answered.note, "servos": servos, "mounts": mounts}
+        write_text(file, json.dumps(told))
+        return errors, seconds, answered.note
 
 
 def _nothing_to_go_on(method: str, folds: list[Question]) -> bool:

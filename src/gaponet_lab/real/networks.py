@@ -5,48 +5,68 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
-from gaponet.data.sequence import Sequence
+import numpy as np
+
 from gaponet.data.store import Dataset
+from gaponet.errors import UsageError
+from gaponet.eval.verdict import Added
 from gaponet.files import write_text
 from gaponet.model.artifact import GapModel
 from gaponet.model.config import ModelConfig
 from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
-from gaponet_lab.real.questions import Question
+from gaponet_lab.real.questions import Question, rehearsal
 from gaponet_lab.real.rivals import Answer, Method, identified, nominal
 
-RECIPE = TrainConfig(warm_start=WarmStartConfig(rounds=3), mixed_gains=True)
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 TRAINED = (("", "shared_mlp"), ("", "gaponet"), ("identification + ", "gaponet"))
+ROUNDS, ENVIRONMENTS = 2, 256  # of the supervised start
+WHOLE = 600_000  # control steps from which training is that of gaponet train; fewer are a supervised start alone
 
 
-def networks(steps: int, work: Path) -> dict[str, tuple[str, Method]]:
-    """Methods that train for so many control steps, three rounds of supervision first; runs lie below `work`."""
+def networks(steps: int) -> dict[str, tuple[str, Method]]:
+    """Methods that train for so many control steps."""
     made: dict[str, tuple[str, Method]] = {}
     for base, kind in TRAINED if steps else ():
         title = base + TITLES[kind]
-        made[title] = title, partial(_trained, base=base, kind=kind, steps=steps, work=work)
+        made[f"{title} {steps}"] = title, partial(_trained, base=base, kind=kind, steps=steps)
     return made
 
 
-def _trained(question: Question, base: str, kind: str, steps: int, work: Path) -> Answer:
+def _recipe(steps: int) -> TrainConfig:
+    """How a network is trained for so many control steps; a short training also labels no more rows than that."""
+    warm = WarmStartConfig()
+    if steps < WHOLE:
+        each = max(steps // (ROUNDS * ENVIRONMENTS), 1)
+        warm = replace(warm, rounds=ROUNDS, num_envs=ENVIRONMENTS, steps=each, rows=steps, gradient_steps=500)
+    return TrainConfig(warm_start=warm, mixed_gains=True)
+
+
+def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
+    """The simulator with its network, or without where `gaponet train` says that it adds nothing."""
+    if question.work is None:
+        raise UsageError(f"{question.name}: networks need a folder to be trained in")
     start = BASES[base](question)
-    run = work / f"{question.split}-{base.partition(' ')[0]}{kind}"
+    run = question.work / f"{base.partition(' ')[0]}{kind}-{steps}"
     training, split = run / "training", run / "parts.json"
     if not (training / "model" / "card.json").is_file():
         dataset = Dataset.create(run / "recordings", question.robot)
         parts: dict[str, dict[str, str]] = {"test": {}}
-        for part in ("train", "val"):
-            mine: list[Sequence] = getattr(question, part)
+        for part, mine in zip(("train", "val"), rehearsal(question), strict=True):
             hashes = {s.content_hash(): s for s in mine}
             found = [dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()]
             parts[part] = {e.id: e.hash for e in found}
         write_text(split, json.dumps({"parts": parts}))
-        config = replace(RECIPE, model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
+        config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         half_way = (training / "checkpoint.pt").is_file()
         Trainer(dataset, start.robot, training, config, Budget(steps=steps), half_way).run()
-    return replace(start, corrector=GapModel.load(training).corrector(start.robot))
+    model = GapModel.load(training)
+    val = model.card["val_mpjae"]
+    worth = Added(base, val["added"], val.get("error", np.nan), val["start"])
+    told = f"{100 * worth.less / worth.left:.0f} % less on validation"
+    if not worth.helps:
+        return replace(start, note=f"left out: {told}")
+    return replace(start, corrector=model.corrector(start.robot), note=told)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -30,7 +31,8 @@ class Question:
     """One question: name; recordings for training, validation and testing; `few` of the test's own, to calibrate with.
 
     `motion` says of each test recording which independent motion it is of; `split` is the hash of both sides; `before`
-    makes the robot as it was identified elsewhere; `made` is what methods share.
+    makes the robot as it was identified elsewhere; `made` is what methods share, `work` a folder of the question's own
+    where they may keep it.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Question:
     few: list[Sequence] = field(default_factory=list)
     before: Callable[[], RobotSpec] | None = None
     made: dict[str, object] = field(default_factory=dict)
+    work: Path | None = None
 
     @property
     def known(self) -> list[Sequence]:
@@ -113,9 +116,12 @@ def _joint(entry: Entry) -> str:
     return entry.meta.motion.split("-to")[0] if unknown else ""
 
 
-def rehearsal(known: list[Sequence]) -> tuple[list[Sequence], list[Sequence]]:
-    """Recordings to learn from, and one command of each joint that has several, to be asked, among those known."""
-    judges = set()
+def rehearsal(question: Question) -> tuple[list[Sequence], list[Sequence]]:
+    """Recordings to learn from, and others that judge: where joints were recorded one at a time, a command of each
+    joint that has several."""
+    known, judges = question.known, set()
+    if len({s.meta.unrecorded for s in known}) == 1:
+        return question.train, question.val
     for unrecorded in {s.meta.unrecorded for s in known}:
         motions = hash_order(s.meta.motion for s in known if s.meta.unrecorded == unrecorded)
         judges |= set(motions[:1] if len(motions) > 1 else [])

@@ -11,7 +11,8 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot_folder import save_robot
 from gaponet.sim.free_runs import WINDOW
 from gaponet.sim.identify import identify
 from gaponet.sim.refit import refit
@@ -25,12 +26,14 @@ SECONDS = 30.0  # of the test's own session that calibration may use
 class Answer:
     """A simulator: robot, what corrects its targets, what is added to positions.
 
-    `corrector` is reset and asked as gaponet.sim.replay.Corrector says; `shift` returns (n,) rad of all joints.
+    `corrector` is reset and asked as gaponet.sim.replay.Corrector says; `shift` returns (n,) rad of all joints; `note`
+    says what a reader of the table must know.
     """
 
     robot: RobotSpec
     corrector: Corrector | None = None
     shift: Callable[[Sequence], Array] | None = None
+    note: str = ""
 
     def positions(self, sequences: list[Sequence]) -> list[Array]:
         """Free runs, (T, n) rad each."""
@@ -114,7 +117,12 @@ METHODS: dict[str, tuple[str, Method]] = {
 
 
 def _identify(question: Question) -> RobotSpec:
-    """The command's result, judged on a command of each joint where joints were recorded one at a time."""
-    alone = len({s.meta.unrecorded for s in question.known}) > 1
-    train, val = rehearsal(question.known) if alone else (question.train, question.val)
-    return identify(train, question.robot, val).robot
+    """The command's result, kept where the question has a folder."""
+    kept = question.work and question.work / "identified"
+    if kept and (kept / "robot.toml").is_file():
+        return load_robot(kept)
+    train, val = rehearsal(question)
+    found = identify(train, question.robot, val).robot
+    if kept:
+        save_robot(found, kept)
+    return found

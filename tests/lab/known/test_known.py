@@ -84,6 +84,19 @@ def test_what_logs_do_not_show_is_as_sure_as_before_them(arm):
     assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
 
 
+def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_that_they_judged(arm, folder):
+    robot, judges = load_robot(folder), played(arm, 20, 2)
+    alone = [replace(s, meta=replace(s.meta, notes={"held_at_home": ["elbow"]})) for s in judges]
+    both, one, none = (known(robot, judges, some, nthread=1).joints for some in (judges, [judges[0], alone[1]], alone))
+    assert one["elbow"].left == pytest.approx(known(robot, judges, judges[:1], nthread=1).joints["elbow"].left, rel=0.2)
+    assert one["elbow"].left > 0.5 * both["elbow"].left  # rows that do not hold it are no zeros
+    assert none["elbow"].band == none["shoulder"].band > 0.0
+    off = robot.with_servos({"elbow": {"offset": 0.05}})
+    judged = known(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
+    assert judged.left > 10 * both["elbow"].left
+    assert judged.values == both["elbow"].values
+
+
 def test_more_seconds_make_it_surer_and_are_told(arm, folder):
     robot = load_robot(folder)
     mine = Knowledge.load(robot)

@@ -59,10 +59,21 @@ def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(
     assert not TorqueFit([replace(s, tau=None) for s in made], arm).trusted
 
 
-def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    true = moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated})
-    windows = []
+def test_noise_of_position_and_speed_softens_no_gain(arm):
+    rng, made = np.random.default_rng(0), []
+    for seed in range(12):
+        ctrl = wave(120, 2, hertz=0.5 + 0.1 * seed)
+        s = arm_sequence(arm, ctrl, late(ctrl, 4), f"m{seed}")
+        error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
+        noisy = [x + spread * rng.standard_normal(x.shape) for x, spread in ((s.qpos, 0.01), (s.qvel, 0.3))]
+        made.append(replace(s, tau=48.0 * error - 1.0 * s.qvel, qpos=noisy[0], qvel=noisy[1]))
+    for kp, kd, _ in TorqueFit(made, arm).gains().values():
+        assert (kp, kd) == (pytest.approx(48.0, rel=0.03), pytest.approx(1.0, rel=0.1))
+
+
+def loaded(robot):
+    """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload hung elsewhere."""
+    true, windows = moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}), []
     for motion in range(6):
         for mass in (0.0, 0.2, 0.4):
             ctrl = commands(60, motion)
@@ -70,6 +81,12 @@ def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_p
             one = replace(one, meta=replace(one.meta, payload_mass=mass))
             (twin,) = replay([one], true)
             windows.append(replace(one, qpos=twin.qpos, qvel=twin.qvel, tau=twin.tau))
+    return windows
+
+
+def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    windows = loaded(robot)
     found = identify(windows[:12], robot, windows[12:], terms=())
     (tried,) = found.tried
     assert (found.chosen, tried.name, tried.kept, len(tried.before)) == ("torque", "torque", True, 2)
@@ -80,6 +97,20 @@ def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_p
     silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=())
     assert (silent.judged, silent.tried) == (None, ())
     assert found.after < silent.after
+
+
+def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_judged_it(tmp_path, monkeypatch):
+    robot, own = write_arm(tmp_path / "arm"), TorqueFit.fit
+    windows = loaded(robot)
+
+    def astray(self, how):
+        found = own(self, how)
+        return found.with_servos({"elbow": {"offset": 0.1}}) if len(self.sequences) == len(windows) else found
+
+    monkeypatch.setattr(TorqueFit, "fit", astray)
+    found = identify(windows[:12], robot, windows[12:], terms=())
+    assert (found.chosen, found.judged) == ("torque", None)
+    assert abs(found.robot.offset).max() < 0.05
 
 
 def test_a_hand_and_where_payloads_hang_are_kept_in_the_folder(tmp_path):
