@@ -235,6 +235,21 @@ def test_a_command_is_known_again_and_others_are_not_taken_for_it(again):
     assert alike([sketch(again(first), dt), *(sketch(walk(400, seed), 0.02) for seed in range(4, 60))]) == []
 
 
+def steps(*targets, rests=40):
+    """From home to one place after the other, (T, 2) rad."""
+    return np.repeat(np.array([(0.1, -0.2), *targets]), rests, axis=0)
+
+
+def test_motions_that_rest_at_one_place_are_not_one():
+    """A motion of three places, two of which all motions have, is none of them; slower or once more it is the same."""
+    park, there = (0.0, 0.0), (0.5, 0.3)
+    walks = [np.concatenate([steps(), walk(400, seed), steps(park)]) for seed in range(4, 8)]
+    others = [steps((0.7, 0.1), park), steps((-0.4, 0.3), park), steps(), *walks]
+    assert alike([sketch(x, 0.02) for x in (steps(there, park), *others)]) == []
+    assert alike([sketch(steps(there, park), 0.02), sketch(steps(there, park, rests=70), 0.02)]) == [(0, 1)]
+    assert alike([sketch(steps(there), 0.02), sketch(steps(there, rests=70), 0.02)]) == [(0, 1)]
+
+
 def test_motions_with_equal_commands_are_one_motion_for_every_split(arm, tmp_path):
     """lift_0kg and lift_1kg are told the same: one in training would show the other's test commands."""
     data = Dataset.create(tmp_path / "data", arm)

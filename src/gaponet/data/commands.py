@@ -19,13 +19,15 @@ from gaponet.arrays import Array
 SAMPLE, MOMENTS = 32, 24  # rows and moments kept
 STEP = 1e-5  # rad; rows nearer than this are one
 SHARED = 0.3  # of the sampled rows, from which two commands are one; 0.5 where one is at twice the rate
+SEVERAL = 2  # rows at the least: motions that stop at one place are not one
 LIKE, LONG = 0.004, 0.01  # outlines differ by less than this share of their range, and durations by this share
 LATE = 0.1  # moments by which one may have begun later
 ODD = 2  # moments that may differ more: a step is a row early or late
 
 
 class Sketch(TypedDict):
-    """What is kept of commands: a sample of the distinct rows, hashed; s between first and last change; the outline."""
+    """What is kept of commands: a sample of the distinct rows, hashed, without the one that they begin with, as many
+    motions begin alike; s between first and last change; the outline."""
 
     rows: Annotated[list[Annotated[int, Interval(ge=0, lt=2**32)]], Len(1, SAMPLE)]
     seconds: Annotated[float, Interval(ge=0, le=1e8)]
@@ -37,13 +39,14 @@ def sketch(ctrl: Array, dt: float) -> Sketch:
     steps = np.round(np.asarray(ctrl, float) / STEP).astype(np.int64)
     draw = np.random.default_rng(0)
     weights = draw.integers(1, 2**62, ctrl.shape[1], dtype=np.int64) | 1
-    mixed = np.unique((steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
+    mixed = ((steps * weights).sum(axis=1).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)
+    moved = mixed[mixed != mixed[0]]
     changed = np.flatnonzero((steps[1:] != steps[:-1]).any(axis=1))
     first, last = (int(changed[0]), int(changed[-1]) + 1) if len(changed) else (0, len(ctrl) - 1)
     curve = np.asarray(ctrl, float) @ draw.normal(size=ctrl.shape[1])
     outline = np.interp(np.linspace(first, last, MOMENTS), np.arange(len(ctrl)), curve)
     return {
-        "rows": np.unique(mixed)[:SAMPLE].tolist(),
+        "rows": np.unique(moved if len(moved) else mixed)[:SAMPLE].tolist(),
         "seconds": round(float(last - first) * dt, 4),
         "outline": [round(float(x), 5) for x in outline],
     }
@@ -74,7 +77,7 @@ def _same_rows(samples: list[set[int]]) -> Iterator[tuple[int, int]]:
     common = (there @ there.T).tocoo()
     for i, j, n in zip(common.row.tolist(), common.col.tolist(), common.data.tolist(), strict=True):
         a, b = samples[i], samples[j]
-        if i < j and n >= SHARED * min(len(a), len(b)):
+        if i < j and (a == b or n >= max(SEVERAL, SHARED * min(len(a), len(b)))):
             least = set(sorted(a | b)[: min(len(a), len(b))])
             if len(a & b & least) >= SHARED * len(least):
                 yield i, j

@@ -16,6 +16,7 @@ from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import stdtrit
 
 from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
@@ -44,11 +45,12 @@ ENOUGH, LITTLE = 2e-3, 2e-4  # of the whole robot's cost, of the limbs': a fall 
 POLISH = 2  # iterations of the whole robot with a term of the law
 CLUSTERS = 24  # parts of the recordings that are thought independent of each other, at least
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
+SURE = 0.84  # of Student's distribution, one side: one standard error where motions are many
 HALF = 0.29  # standard deviation of what lies anywhere within one step
 LASTS = 4.0  # s of recording that count as one independent measurement beside a belief
 BELIEF = {"kp": 0.5, "armature": 1.5}  # standard deviation of the logarithm of a file's value
 TOLD = 0.1  # the same of a kp that recordings state
-BETTER = 0.99  # of the given robot's error: less is an improvement
+BETTER, ALONE_BETTER = 0.01, 0.1  # of an error: a fall by more is an improvement, on several motions and on one
 PARTS = {"joints": 0.3, "whole": 0.4}  # of a budget; terms of the law share what is left
 TERMS: dict[str, tuple[str, ...]] = {
     "stribeck": ("stribeck", "stribeck_speed"),
@@ -89,9 +91,11 @@ class Tried:
 
     @property
     def kept(self) -> bool:
-        """Whether it fell by more than its standard error."""
-        fell, error = self.gain
-        return fell > (0.0 if np.isnan(error) else error)
+        """Whether it fell by more than a hundredth and its standard error, which is wider where motions are few
+        (Student's); on one motion by more than a tenth."""
+        (fell, error), few = self.gain, len(self.before) - 1
+        least = float(self.before.mean()) * (BETTER if few else ALONE_BETTER)
+        return fell > (max(least, error * stdtrit(few, SURE)) if few else least)
 
 
 @dataclass(frozen=True)
@@ -309,18 +313,21 @@ class _Judge:
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
     def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
-        """Name and values of what does best; an earlier one where it is not beaten by more than a hundredth."""
-        names = list(candidates)
+        """Name and values of what does best: the earlier fit where it is not beaten by more than a hundredth; what was
+        chosen joint by joint, and any fit beside the given robot, where it is surely better."""
+        given, *names = candidates
         joints = np.array([self.by_joint(v) for v in candidates.values()])
         which = joints.argmin(axis=0)
         if len(set(which.tolist())) > 1:  # what did best for each joint: may do best for all
             fields = set.intersection(*(set(v) for v in candidates.values()))
             rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
             candidates = candidates | {"mixed": {f: x[which, np.arange(len(which))] for f, x in rows.items()}}
-        costs = {name: float(self.errors(v).mean()) for name, v in candidates.items()}
-        name = names[0]
-        for other in candidates:
-            name = other if costs[other] < BETTER * costs[name] else name
+        costs, name = {name: self.errors(v) for name, v in candidates.items()}, names[0]
+        for other in names:
+            name = other if costs[other].mean() < (1 - BETTER) * costs[name].mean() else name
+        if "mixed" in candidates and Tried("mixed", costs[name], costs["mixed"]).kept:
+            name = "mixed"
+        name = name if Tried(name, costs[given], costs[name]).kept else given
         return name, candidates[name]
 
 
