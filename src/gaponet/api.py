@@ -258,7 +258,7 @@ def identify(
             data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update, seconds, stops
         )
         given, left = (whole_errors(val, one, threads) for one in (spec, found.judged or found.robot))
-        if not found.better or left.mean() > BETTER * given.mean():
+        if not found.better or left.mean() > (1 - BETTER) * given.mean():
             raise NoGainError(found.no_gain(spec, given, left))
         save_robot(found.robot, Path(out))
         nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
@@ -501,7 +501,7 @@ def calibrate_robot(
             sequences = [replace(s, meta=replace(s.meta, payload_mass=mass)) for s in sequences]
         errors = {name: whole_errors(sequences, r) for name, r in (("before", spec), ("after", found.robot))}
         before, after = (1e3 * float(e.mean()) for e in errors.values())
-        if after > BETTER * before:
+        if after > (1 - BETTER) * before:
             raise NoGainError(
                 f"nothing is written: over all {len(sequences)} recording(s) the fit leaves {after:.2f} mrad, "
                 f"{spec.name} as it is known {before:.2f}; give longer logs (--seconds), or keep the robot as it is"

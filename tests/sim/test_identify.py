@@ -9,7 +9,7 @@ from arm import TOML, recordings, write_arm
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
 from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import _Limbs, identify, with_stops
+from gaponet.sim.identify import Tried, _Limbs, identify, with_stops
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +92,20 @@ def test_what_is_told_of_limbs_is_told_of_their_joints():
     x = np.arange(30.0).reshape(2, 5, 3)
     assert limbs.pack(x).shape == (2, 2, 9)
     np.testing.assert_array_equal(limbs.unpack(limbs.pack(x)), x)
+
+
+@pytest.mark.parametrize(
+    ("falls", "kept"),
+    [
+        ((0.09,), False),  # of one motion, of an error of 1
+        ((0.12,), True),
+        ((0.005,) * 12, False),  # sure, and nothing
+        ((0.01, 0.05), False),  # two that disagree so much say little
+        ((0.03, 0.04), True),
+        ((0.3, -0.05, 0.05, 0.02, 0.01, 0.06), True),
+        ((0.3, -0.2, 0.05, 0.02, -0.1, 0.06), False),
+    ],
+)
+def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, kept):
+    before = np.ones(len(falls))
+    assert Tried("load", before, before - falls).kept is kept

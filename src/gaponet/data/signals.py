@@ -199,14 +199,16 @@ class Response:
         parts = [np.stack([getattr(r, f) for r in found]).astype(float) for f in ("own", "cross", "power")]
         own, cross, power = (x[use].sum(axis=(0, 1)) for x in parts)
         quick = Response.sharp(found)
-        onset, fits = np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
+        onset, early, fits = np.full(n, np.nan), np.full(n, np.nan), np.zeros((len(found), PARTS, len(SHIFTS)))
         for j in range(n):
             if own[j, 0] <= 0 or power[j] <= 0:
                 continue
             weights = np.linalg.solve(toeplitz(own[j]) + RIDGE * own[j, 0] * np.eye(lags), cross[j])
-            left = power[j] - weights @ cross[j]
+            left, first = power[j] - weights @ cross[j], round(BEFORE / step)
             if left > FOLLOWS * power[j] or weights.sum() < 0.3:
                 continue
+            later = toeplitz(own[j, :-first]) + RIDGE * own[j, 0] * np.eye(lags - first)
+            early[j] = (power[j] - cross[j, first:] @ np.linalg.solve(later, cross[j, first:])) / left
             way = np.cumsum(weights) / weights.sum()
             first = int(np.argmax(way > 0.05))
             if quick[j]:
@@ -217,7 +219,7 @@ class Response:
             square = np.fft.irfft(np.abs(spread) ** 2, 2 * lags, axis=1)[:, :lags]  # of the weights with themselves
             square[:, 1:] *= 2
             fits += (parts[1][:, :, j] @ moved.T - 0.5 * parts[0][:, :, j] @ square.T) / left
-        return _Following(onset, _peaks(fits), _peaks(fits.sum(axis=1)))
+        return _Following(onset, early, _peaks(fits), _peaks(fits.sum(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -227,11 +229,13 @@ class _Following:
     Attributes:
         onset: Time after which a joint has made a twentieth of the way, (n) s; NaN where it does not follow, or is
             told to move so smoothly that this is not known.
+        early: What is left unexplained without weights of commands to come, over what is left with them, (n).
         shifts: How much later each part of each recording follows than all, (recordings, PARTS) s; whole: all parts
             of each together, (recordings).
     """
 
     onset: Array
+    early: Array
     shifts: Array
     whole: Array
 

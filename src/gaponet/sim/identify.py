@@ -95,7 +95,7 @@ class Tried:
         (Student's); on one motion by more than a tenth."""
         (fell, error), few = self.gain, len(self.before) - 1
         least = float(self.before.mean()) * (BETTER if few else ALONE_BETTER)
-        return fell > (max(least, error * stdtrit(few, SURE)) if few else least)
+        return bool(fell > (max(least, error * stdtrit(few, SURE)) if few else least))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ ROUNDS = 6  # of shifts and of what all follow
 FEW = 4  # recordings that say nothing of one among them
 LATE, FAR = 0.012, 4.0  # s, and times the usual scatter, by which a recording follows later than the others
 FIRST = -0.015  # s: joints that begin so long before their command
+EARLY = 1.08  # times as much unexplained without commands to come, from which joints begin before them
 LONG, APART = 0.1, 0.05  # s: dead time worth a warning; of one joint beyond the others'
 DEAD_TIMES = (
     (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
@@ -38,7 +39,10 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     found, own = [*_late(every, _operated(every, robot))], _operated(same, robot)
     odd = {f.values["motion"] for f in found}
     told = Response.following(own, [s.motion not in odd for s in same])
-    onset = float(np.nanmedian(told.onset)) if np.isfinite(told.onset).any() else np.nan
+    known = np.isfinite(told.onset)
+    onset = float(np.median(told.onset[known])) if known.any() else np.nan
+    if known.any() and np.median(told.early[known]) < EARLY:
+        onset = max(onset, 0.0)
     apart = SURE * _scatter(told.onset - onset)
     if onset < FIRST - step or onset < -max(-FIRST / 3, step, apart):
         text = (
@@ -110,11 +114,12 @@ def _late(surveys: list[Survey], own: list[Response]) -> Iterator[Finding]:
 def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
     between = np.array([s.response.duration for s in surveys]) * (1 - 1 / shifts.shape[1])
     slope = (shifts[:, -1] - shifts[:, 0]) / between
-    slope = slope[np.isfinite(slope)]
+    bent = (shifts[:, -1] + shifts[:, 0] - 2 * shifts[:, 1]) / between / np.sqrt(3)  # of one that drifts: chance
+    slope, bent = slope[np.isfinite(slope)], bent[np.isfinite(bent)]
     if len(slope) < FEW:
         return
     drift = float(np.median(slope))
-    error = max(_scatter(slope - drift), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
+    error = max(_scatter(slope - drift), _scatter(bent), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
     if abs(drift) > max(DRIFT, SURE * error):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
