@@ -91,11 +91,12 @@ class Tried:
 
     @property
     def kept(self) -> bool:
-        """Whether it fell by more than a hundredth and its standard error, which is wider where motions are few
-        (Student's); on one motion by more than a tenth."""
-        (fell, error), few = self.gain, len(self.before) - 1
-        least = float(self.before.mean()) * (BETTER if few else ALONE_BETTER)
-        return bool(fell > (max(least, error * stdtrit(few, SURE)) if few else least))
+        """Whether it fell by more than a hundredth, and motions by more of their own than the standard error of that,
+        wider where they are few (Student's); on one motion by more than a tenth."""
+        few, least = len(self.before) - 1, BETTER if len(self.before) > 1 else ALONE_BETTER
+        share = (self.before - self.after) / np.maximum(self.before + self.after, 1e-12)
+        sure = not few or share.mean() > stdtrit(few, SURE) * standard_error(share)
+        return bool(sure and self.gain[0] > least * self.before.mean())
 
 
 @dataclass(frozen=True)
@@ -313,9 +314,9 @@ class _Judge:
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
     def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
-        """Name and values of what does best: the earlier fit where it is not beaten by more than a hundredth; what was
-        chosen joint by joint, and any fit beside the given robot, where it is surely better."""
-        given, *names = candidates
+        """Name and values of what does best: an earlier one where it is not beaten by more than a hundredth; what was
+        chosen joint by joint where that is surely better."""
+        names = list(candidates)
         joints = np.array([self.by_joint(v) for v in candidates.values()])
         which = joints.argmin(axis=0)
         if len(set(which.tolist())) > 1:  # what did best for each joint: may do best for all
@@ -327,7 +328,6 @@ class _Judge:
             name = other if costs[other].mean() < (1 - BETTER) * costs[name].mean() else name
         if "mixed" in candidates and Tried("mixed", costs[name], costs["mixed"]).kept:
             name = "mixed"
-        name = name if Tried(name, costs[given], costs[name]).kept else given
         return name, candidates[name]
 
 

@@ -24,7 +24,7 @@ DEAD_TIMES = (
     (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
-DRIFT, SURE = 3e-4, 4.5  # s a second, and standard errors
+DRIFT, SURE, OWN = 3e-4, 4.5, 0.7  # s a second, standard errors, and how much of one motions' own differences are
 NOTCH = 1.5  # depth, natural logarithm of power
 WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 GAP = 2.5  # periods without a sample
@@ -119,7 +119,7 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
     if len(slope) < FEW:
         return
     drift = float(np.median(slope))
-    error = max(_scatter(slope - drift), _scatter(bent), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
+    error = max(OWN * _scatter(slope - drift), _scatter(bent), 2e-3 / float(between.max()) / np.sqrt(len(slope)))
     if abs(drift) > max(DRIFT, SURE * error):
         text = (
             f"to its end each recording follows its commands {'later' if drift > 0 else 'sooner'} "
