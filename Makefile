@@ -43,9 +43,10 @@ faults: setup
 live: setup
 	$(BIN)/python tests/robots/control/live.py --minutes 10 $(LIVE)
 
-# Programs on the DDS version of Unitree's SDK (Python 3.10, made in ~/.cache/gaponet) at the other end: three minutes.
+# At the other end, in environments of their own in ~/.cache/gaponet: programs on the DDS version of Unitree's SDK (Python
+# 3.10), rclpy of ROS 2 Jazzy and Kilted (Python 3.12): five minutes.
 peers: setup
-	$(BIN)/python -m pytest -m peers -s tests/robots/control
+	$(BIN)/python -m pytest -m peers -s tests/robots
 
 # MuJoCo, MJX, mjlab, Isaac Lab and Newton (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
 # and mjlab and Isaac Lab train in one: half an hour.

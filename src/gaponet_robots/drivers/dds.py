@@ -91,6 +91,8 @@ class Bus:
             f'<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="{interface}"{multicast}/>'
             f"</Interfaces><AllowMulticast>{'spdp' if lonely else 'true'}</AllowMulticast></General>"
             f"<Discovery>{discovery if lonely else ''}</Discovery>"
+            # of Fast DDS, ROS 2's: its descriptions of types do not come through, and nothing would be matched
+            "<Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
             f"<Internal><MaxSampleSize>{LARGEST} KiB</MaxSampleSize></Internal></Domain></CycloneDDS>"
         )
         try:
