@@ -3,7 +3,7 @@
     make engines                                         # once: environments of their own in ~/.cache/gaponet
     python benchmarks/engines.py ROBOT WORK [--data DATASET] [--test]
 
-Exports the robot for MuJoCo, MJX, mjlab, Isaac Lab and Newton, once fitted without its law, and runs the check.py
+Exports the robot for each engine, once fitted without its law, and runs the check.py
 beside each export in that engine's environment, without gaponet. Prints a row per engine: mean |error| on the
 validation motions that travel (five of 30 s at most), there and in gaponet, and what the export says that it leaves
 out; --test adds what the MJCF leaves on the test motions, all of their length. What is found in WORK is kept.
@@ -32,7 +32,7 @@ CACHE = Path.home() / ".cache" / "gaponet"
 CHECKS = {  # environment → export, check, what runs in it
     "mujoco": ("mjcf", "check.py", "mujoco"), "mjx": ("mjcf", "check_mjx.py", "mujoco-mjx"),
     "mjlab-1.6": ("mjlab", "check.py", "mjlab"), "isaaclab-3": ("isaaclab", "check.py", "isaaclab"),
-    "newton": ("newton", "check.py", "newton"),
+    "newton": ("newton", "check.py", "newton"), "drake": ("drake", "check.py", "drake"),
 }  # fmt: skip
 VERSION = "import sys, importlib.metadata as m; print(m.version(sys.argv[1]))"
 

@@ -21,7 +21,9 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 
 def export(
     robot: Holder,
-    to: Literal["onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "json", "randomization"] = "onnx",
+    to: Literal[
+        "onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json", "randomization"
+    ] = "onnx",
     out: Path | None = None,
     data: str | None = None,
     into: Path | None = None,
@@ -35,10 +37,10 @@ def export(
     """Write an identified robot or a network for another program.
 
     Args:
-        to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab and newton, each with a check.py that needs
-            no gaponet; isaaclab; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a run: onnx
-            (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for mjlab and
-            Isaac Lab). Of a robot, randomization: what to randomise in training.
+        to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
+            check.py that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a
+            run: onnx (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for
+            mjlab and Isaac Lab). Of a robot, randomization: what to randomise in training.
         out: Folder; default one with that name in the robot or run, for onnx the run's model folder.
         data: Dataset on which a servo law's nearest plain servos are fitted, and every form is judged; default the one
             that the robot was identified from, and without any what the robot itself answers.
@@ -107,7 +109,7 @@ def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: fl
     from gaponet.model.artifact import CARD, GapModel
 
     if (run / "robot.toml").is_file():
-        raise UsageError(f"{run}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton or json")
+        raise UsageError(f"{run}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton, drake or json")
     if to == "torch":
         from gaponet_interop.engine.folder import export_model
 

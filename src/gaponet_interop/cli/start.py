@@ -68,7 +68,7 @@ def start(
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     effort_limit: tuple[str, ...] = (),
-    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "json"] = "mjcf",
+    to: Literal["mjcf", "mjlab", "isaaclab", "newton", "drake", "json"] = "mjcf",
     budget: str | None = None,
     dry_run: Flag = False,
     anyway: Flag = False,

@@ -59,6 +59,42 @@ def newton_config(robot: str, facts: dict[str, Any]) -> str:
     )
 
 
+DRAKE = '''def add_servos(plant):
+    """Actuators, before plant.Finalize(). Drake's gains act implicitly in a discrete plant, which adds kp * step of
+    damping: that much is taken off."""
+    for name, s in SERVOS.items():
+        joint, d = plant.GetJointByName(name), s["kd"] - s["kp"] * plant.time_step()
+        actuator = plant.AddJointActuator(name, joint, s["effort_limit"])
+        actuator.set_default_gear_ratio(1.0)
+        actuator.set_default_rotor_inertia(s["armature"])
+        actuator.set_controller_gains(PdControllerGains(p=s["kp"], d=max(d, 0.0)))
+        joint.set_default_damping(max(s["damping"] + min(d, 0.0), 0.0))
+
+
+def friction(plant, context):
+    """Drake's joints have none: what its input for applied generalized forces takes in each step, N m."""
+    speed, inertia = plant.GetVelocities(context), plant.CalcMassMatrix(context).diagonal()
+    told = np.zeros(plant.num_velocities())
+    for name, s in SERVOS.items():
+        i, loss = plant.GetJointByName(name).velocity_start(), s["frictionloss"]
+        told[i] = -loss * np.tanh(speed[i] / max(0.005, loss * plant.time_step() / inertia[i]))
+    return told
+'''
+
+
+def drake_config(robot: str, facts: dict[str, Any]) -> str:
+    """For Drake's MultibodyPlant."""
+    fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss")
+    servos = "".join(f"    {name!r}: { ({f: s[f] for f in fields})!r},\n" for name, s in facts["plain"].items())
+    return (
+        f"{_head(robot, 'Drake', facts)}import numpy as np\nfrom pydrake.multibody.tree import PdControllerGains\n\n"
+        f"SERVOS = {{\n{servos}}}\n"
+        f"# A servo aims at its target plus this, rad.\nOFFSETS = {_column(facts, 'offset')}\n"
+        "# Drake's actuators are not late: targets go through mujoco_servos.delay_weights, as in check.py.\n"
+        f"DELAYS = {_column(facts, 'delay')}\n\n\n{DRAKE}"
+    )
+
+
 def _head(robot: str, engine: str, facts: dict[str, Any]) -> str:
     law = ", ".join(facts["law"])
     lost = f" Its law ({law}) is not here; these numbers were fitted without it." if law else ""
@@ -75,4 +111,4 @@ def _column(facts: dict[str, Any], field: str, names: list[str] | None = None) -
     return repr({name: s[field] for name, s in facts["plain"].items() if names is None or name in names})
 
 
-CONFIGS = {"mjlab": mjlab_config, "isaaclab": isaaclab_config, "newton": newton_config}
+CONFIGS = {"mjlab": mjlab_config, "isaaclab": isaaclab_config, "newton": newton_config, "drake": drake_config}

@@ -30,12 +30,13 @@ from gaponet_interop.engine.forms import check_motions, comparable, left, mean_e
 
 KIND = "engine"
 FACTS, ROBOT, TERM, CHECK = "facts.json", "robot.xml", "gaponet_action.py", "check.npz"
-ENGINES = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "json")
+ENGINES = ("mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json")
 CHECKS = {
     "mjcf": {"check.py": "mjcf.py", "check_mjx.py": "mjx.py"},
     "mjlab": {"check.py": "mjlab.py"},
     "isaaclab": {"check.py": "isaaclab.py"},
     "newton": {"check.py": "newton.py"},
+    "drake": {"check.py": "drake.py"},
 }
 OURS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
 LAW = """\"\"\"The law of an identified servo: what MuJoCo's actuators and friction loss do not; numpy or torch.\"\"\"
@@ -169,6 +170,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:
             )
     if any(s["delay"] for s in facts["plain"].values()):
         told += {"newton": ["Newton has no delays: check.py has a buffer of five lines"],
+                 "drake": ["Drake has no delays: check.py has a buffer of five lines"],
                  "mjcf": ["delays need MuJoCo 3.5; MJX and Newton drop them without a word: check_mjx.py has a buffer"],
                  "isaaclab": ["robot_cfg.py rounds delays to physics steps; the action term does not"],
                  "mjlab": ["robot_cfg.py rounds delays to physics steps; robot.xml does not"]}.get(to, [])  # fmt: skip
@@ -178,7 +180,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:
             f"{facts['file']} has no place for {', '.join(lost)}: they stand in facts.json (plain), kp and kd for your "
             "controller; files that it names stay where they were"
         )
-    if facts["law"] and to in ("isaaclab", "newton", "urdf"):
+    if facts["law"] and to in ("isaaclab", "newton", "drake", "urdf"):
         told.append(f"the servos' law ({', '.join(facts['law'])}) is not in {to}: the numbers were fitted without it")
     return tuple(told)
 
