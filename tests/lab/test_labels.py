@@ -42,6 +42,7 @@ def test_payload_and_unit_are_told_where_the_payload_loads_the_joint():
         unit, mass, _ = r.name.split()
         assert (r.payload, r.unit) == (float(mass), int(unit))  # the one that holds more is the later one
     assert (found.agreement["within_half_a_kg"], found.agreement["taken_for_one_of_these"]) == (1.0, 0.0)
+    assert "torque alone, whichever the unit, says 36 of 36 payloads within 0.5 kg of their label" in found.remarks
 
 
 def test_a_joint_that_the_payload_does_not_load_tells_nothing_and_says_so():
@@ -76,7 +77,10 @@ def test_a_recording_whose_commands_were_written_down_late_is_named_by_its_torqu
     found = estimate(logs, MASSES, UNITS, {})
     assert {i for i, r in enumerate(found.recordings) if abs(r.late) > 0.01} == odd
     assert [r.late for r in found.recordings if abs(r.late) > 0.01] == pytest.approx([0.04, 0.04], abs=0.006)
-    assert [line.partition(":")[0] for line in found.remarks] == ["take 3", "take 11"]
+    assert [line.partition(":")[0] for line in found.remarks] == ["elbow", "take 3", "take 11"]
+    gains, held = found.gains["elbow"]
+    assert (gains.kp, gains.kd) == (pytest.approx(40.0, rel=0.02), pytest.approx(1.5, rel=0.1))
+    assert held.kp == pytest.approx(40.0, abs=3 * held.error)
     for _, log in logs:  # where torque is something else, nothing is said
         log.channels["tau"] = Channel(log.channels["tau"].time, rng.standard_normal((len(log.channels["tau"].time), 1)))
     assert not estimate(logs, MASSES, UNITS, {}).remarks

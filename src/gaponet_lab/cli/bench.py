@@ -84,8 +84,8 @@ def _real(
         methods |= networks(steps)
     found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets)
     screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
-    for name, agreement in found["labels"].items():
-        screen.say(f"{name}: {agreement}", "labels")
+    for name, remarks in found["labels"].items():
+        screen.say(f"{name}: {'; '.join(remarks)}", "labels")
     for path in write_page(found, out):
         screen.say(f"written: {path!s}")
     screen.result(found)

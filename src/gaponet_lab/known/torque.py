@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -84,6 +85,58 @@ def rival(
     )  # fmt: skip
 
 
+class Gains(NamedTuple):
+    """kp, N·m/rad, and its standard error over recordings; kd, N·m·s/rad; which share of the torque's variance they
+    explain."""
+
+    kp: float
+    error: float
+    kd: float
+    explained: float
+
+    @property
+    def trusted(self) -> bool:
+        """Whether torque is the servo's own."""
+        return self.explained > EXPLAINED and self.kp > 0 <= self.kd
+
+
+def servo_gains(recordings: ListOf[Array], last: int = 0) -> Gains:
+    """A servo's gains from its own law, torque = kp (command of the period before − position) − kd velocity.
+
+    Rows are means of five. Noise of measured position and speed would soften a gain, so by two-stage least squares,
+    with the commands of PAST periods as instruments (Janot, Vandanjon & Gautier 2014).
+
+    Args:
+        recordings: Command, position, velocity and torque of the joint, (4, T) each.
+        last: Only so many rows at each end count, as their mean, by plain least squares; 0 for all.
+    """
+    sums, rows = [], []
+    for ctrl, qpos, qvel, tau in recordings:
+        t = np.arange(len(tau) - 1)
+        past = [ctrl[np.maximum(t - k, 0)] for k in range(PAST)]
+        channels = [ctrl[:-1] - qpos[1:], -qvel[1:], tau[1:], *past]
+        error, speed, torque, *told = (np.convolve(x, np.ones(5) / 5, "valid") for x in np.array(channels, float))
+        one = np.ones_like(torque)
+        x, z = np.stack([error, speed, one], axis=1), np.stack([*told, one], axis=1)
+        if last:
+            x, torque = x[-last:].mean(axis=0, keepdims=True), torque[-last:].mean(keepdims=True)
+            z = x
+        sums.append(np.concatenate([z.T @ z, z.T @ x, z.T @ torque[:, None]], axis=1))
+        rows.append(np.concatenate([x, torque[:, None]], axis=1))
+
+    def solved(s: Array) -> Array:
+        first = np.linalg.lstsq(s[:, :-4], s[:, -4:-1])[0]
+        return np.asarray(np.linalg.lstsq(first.T @ s[:, -4:-1], first.T @ s[:, -1])[0])
+
+    every, n = np.concatenate(rows), len(sums)
+    kp, kd, constant = solved(np.sum(sums, axis=0))
+    without = np.array([solved(np.sum(sums, axis=0) - one)[0] for one in sums])
+    left = every[:, 3] - every[:, :3] @ [kp, kd, constant]
+    explained = 1 - float(left.var() / max(every[:, 3].var(), 1e-12))
+    error = np.sqrt((n - 1) / n * np.square(without - without.mean()).sum())
+    return Gains(float(kp), float(error), float(kd), explained)
+
+
 class TorqueFit:
     """What recordings with torque say of a robot."""
 
@@ -95,41 +148,21 @@ class TorqueFit:
         """
         self.robot, self.nominal = robot, robot
         self.sequences = [s for s in sequences if s.tau is not None and s.meta.known_gains[0] is None]
-        trusted = {
-            joint: {"kp": kp, "kd": kd}
-            for joint, (kp, kd, explained) in self.gains().items()
-            if explained > EXPLAINED and kp > 0 <= kd
-        }
+        trusted = {joint: {"kp": g.kp, "kd": g.kd} for joint, g in self.gains().items() if g.trusted}
         self.trusted = len(self.sequences) == len(sequences) and bool(trusted)
         if self.trusted:
             self.robot = robot.with_servos(trusted)
         masses = {s.meta.payload_mass for s in self.sequences}
         self.hangs = bool(robot.payload_mounts) and len(masses) > 1
 
-    def gains(self) -> dict[str, tuple[float, float, float]]:
-        """Joint → kp N·m/rad, kd N·m·s/rad, and the share of the torque's variance that they explain.
-
-        The command is that of the period before, rows are means of five. Noise of measured position and speed would
-        soften a gain, so by two-stage least squares, with the commands of PAST periods as instruments (Janot,
-        Vandanjon & Gautier 2014). Joints whose command never moves are left out.
-        """
+    def gains(self) -> dict[str, Gains]:
+        """Joint → gains; joints whose command never moves are left out."""
         parts: dict[int, list[Array]] = {}
         for s in self.sequences:
             assert s.tau is not None
             for j in _moved(s, self.nominal):
-                ctrl, t = s.ctrl[:-1, j], np.arange(len(s) - 1)
-                past = [ctrl[np.maximum(t - k, 0)] for k in range(PAST)]
-                rows = [ctrl - s.qpos[1:, j], -s.qvel[1:, j], s.tau[1:, j], *past]
-                parts.setdefault(j, []).append(np.stack([np.convolve(x, np.ones(5) / 5, "valid") for x in rows]))
-        found = {}
-        for j, each in parts.items():
-            error, speed, tau, *past = np.concatenate(each, axis=1).astype(float)
-            one = np.ones_like(tau)
-            columns, told = np.stack([error, speed, one], axis=1), np.stack([*past, one], axis=1)
-            x = np.linalg.lstsq(told @ np.linalg.lstsq(told, columns)[0], tau)[0]
-            explained = 1 - float((tau - columns @ x).var() / max(tau.var(), 1e-12))
-            found[self.nominal.joint_names[j]] = float(x[0]), float(x[1]), explained
-        return found
+                parts.setdefault(j, []).append(np.stack([x[:, j] for x in (s.ctrl, s.qpos, s.qvel, s.tau)]))
+        return {self.nominal.joint_names[j]: servo_gains(each) for j, each in parts.items()}
 
     def hanging(self, friction: bool = False) -> RobotSpec:
         """Where the payload hangs, and what hangs there always, by least squares on recorded torque.

@@ -83,7 +83,7 @@ class Bench:
         """Import, split, fit and measure some sets, by default all.
 
         Returns:
-            rows (Row.as_dict), cards, labels (set → agreement), left_out (folder → why), seconds (set →).
+            rows (Row.as_dict), cards, labels (set → sentences), left_out (folder → why), seconds (set →).
         """
         unknown = set(only) - {c.name for c in self.cards.set}
         if unknown:
@@ -92,7 +92,7 @@ class Bench:
         left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
         left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_there(c)}
         rows: list[Row] = []
-        labels: dict[str, Any] = {}
+        labels: dict[str, list[str]] = {}
         seconds: dict[str, float] = {}
         for card in here:
             began = time.monotonic()
@@ -103,7 +103,7 @@ class Bench:
                 f"{seconds[card.name]:.0f} s"
             )
             if told:
-                labels[card.name] = told.agreement
+                labels[card.name] = told.remarks
             for name in card.questions:
                 rows += self.ask(card, name, list(questions(name, dataset, robot, self.before(card))))
             seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)

@@ -27,6 +27,8 @@ from gaponet.arrays import Array
 from gaponet.data.log import Log
 from gaponet.errors import LogError
 from gaponet.files import write_text
+from gaponet.text import measured
+from gaponet_lab.known.torque import Gains, servo_gains
 
 MOVED = 0.05  # rad that a command moves a joint
 SAME_END = 0.05  # of the widest command of a joint: ends that are nearer are one command
@@ -34,6 +36,7 @@ SETTLE = 0.1  # s
 ALIKE = 3.0  # standard deviations of a repetition within which neighbours are repetitions
 LEVER, APART = 0.3, 2.5  # N·m per kg, and bands apart in their widths, from which a joint tells its payload
 FEW, ROUNDS, EXPLAINED = 4, 4, 0.9  # recordings; of the search; of the torque's variance, by the servo's law
+NEAR = 0.5  # kg that a payload may be off its label
 LATE, STEP, WIDEST = 0.015, 0.005, 0.08  # s: beside the others; steps and range of the search
 KILOGRAMS = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
 
@@ -48,6 +51,7 @@ class Labelled:
         torque: Each row's torque, with its command, (k,) N·m and rad; gain times error where none was recorded.
         known: kg, where a file's name says it.
         payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
+        held: What its torque says of the payload where nobody knows the unit, kg.
         copy: The name of a recording with the same samples that came before.
         follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
         late: How much later its torque follows the command than in the other recordings of the joint, s.
@@ -61,6 +65,7 @@ class Labelled:
     payload: float = 0.0
     unit: int = 0
     told: bool = False
+    held: float = 0.0
     copy: str = ""
     follows: Array | None = field(default=None, repr=False)
     late: float = 0.0
@@ -81,12 +86,14 @@ class Cell:
 
 @dataclass(frozen=True)
 class Labels:
-    """What was estimated; `agreement` is of the recordings whose payload a file's name says, where joints tell it."""
+    """What was estimated; `agreement` is of the recordings whose payload a file's name says, where joints tell it;
+    `gains` are what the torque of a joint's recordings says of its servo, in all and at their ends."""
 
     recordings: list[Labelled]
     cells: list[Cell]
     payloads: tuple[float, ...]
     agreement: dict[str, float] = field(default_factory=dict)
+    gains: dict[str, tuple[Gains, Gains]] = field(default_factory=dict)
 
     @property
     def remarks(self) -> list[str]:
@@ -96,6 +103,17 @@ class Labels:
             f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
             f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
         ] if a else []  # fmt: skip
+        loaded = [r for r in self.recordings if r.told and not r.copy and abs(r.late) <= LATE]
+        near = f"{sum(abs(r.held - r.payload) < NEAR for r in loaded)} of {len(loaded)}"
+        if loaded:
+            told += [f"torque alone, whichever the unit, says {near} payloads within {NEAR:g} kg of their label"]
+        told += [
+            f"{joint}: torque is kp (command − position) − kd velocity, kp {measured(g.kp, g.error)} N·m/rad ("
+            f"{measured(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: {g.explained:.1%} of "
+            "its variance"
+            for joint, (g, end) in self.gains.items()
+            if g.trusted
+        ]
         return told + [
             f"{r.name}: its torque follows the command {abs(r.late) * 1e3:.0f} ms {'later' if r.late > 0 else 'sooner'}"
             f" than in the other recordings of {r.joint}: clocks of command and state are apart; it is left out"
@@ -128,7 +146,11 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     own = [r for r in found if not r.copy]
     for joint in dict.fromkeys(r.joint for r in own):
         _clocks([r for r in own if r.joint == joint and r.follows is not None])
-    cells = [_fit(part, payloads, units) for part in _by_command([r for r in own if abs(r.late) <= LATE])]
+    timely = [r for r in own if abs(r.late) <= LATE]
+    cells = [_fit(part, payloads, units) for part in _by_command(timely)]
+    follows: dict[str, list[Array]] = {}
+    for r in timely:
+        follows.setdefault(r.joint, []).extend([] if r.follows is None else [r.follows[1:]])
     first_of = {r.name: r for r in own}
     for r in found:
         if r.copy:
@@ -136,7 +158,7 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
     said = [r for r in own if r.known is not None and r.told]
     agreement = {}
     if said:
-        near = lambda r, m: abs(r.payload - m) < 0.5  # noqa: E731
+        near = lambda r, m: abs(r.payload - m) < NEAR  # noqa: E731
         masses = {r.known for r in said}
         others = [r for r in own if r.known is None and r.told]
         agreement = {
@@ -145,7 +167,8 @@ def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: 
             "not_said": len(others),
             "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
         }  # fmt: skip
-    return Labels(found, cells, tuple(payloads), agreement)
+    gains = {j: (servo_gains(each), servo_gains(each, 1)) for j, each in follows.items() if len(each) >= FEW}
+    return Labels(found, cells, tuple(payloads), agreement, gains)
 
 
 def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
@@ -246,8 +269,9 @@ def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
     first = np.unique(group, return_index=True)[1]
     unit, own = _ranked(mean - slope * load[first], load[first], units)
     told = bool(slope >= LEVER and slope / width >= APART)
-    for r, g, m in zip(part, group, load, strict=True):
-        r.payload = float(m)
+    held = (x - own.mean()) / slope
+    for r, g, m, kg in zip(part, group, load, held, strict=True):
+        r.payload, r.held = float(m), float(kg)
         r.unit, r.told = int(unit[g]), told
     return Cell(part[0].joint, part[0].command, len(part), sign * slope, float(slope / width), sign * own, told)
 

@@ -70,8 +70,9 @@ def write_page(found: dict[str, Any], out: Path) -> list[Path]:
     lines += ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
     lines += ["| " + " | ".join(cells) + " |" for cells in table(rows)]
     spent = ", ".join(f"{what} {seconds:,} s" for what, seconds in found["seconds"].items())
-    agreed = [f"Labels of {what}: {json.dumps(agreement)}." for what, agreement in found["labels"].items()]
-    lines += ["", f"From file to table, on this machine: {spent}.", *agreed]
+    lines += ["", f"From file to table, on this machine: {spent}."]
+    for what, remarks in found["labels"].items():
+        lines += ["", f"Labels of {what} (`gaponet data labels`):", "", *(f"- {remark}" for remark in remarks)]
     write_text(out / f"{name}.md", "\n".join(lines) + "\n")
     figures = save(draw(rows, found["cards"]), out / name) if rows else []
     return [out / f"{name}.md", out / f"{name}.json", *figures]

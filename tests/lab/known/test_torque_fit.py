@@ -50,7 +50,7 @@ def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(
         tau = np.stack([7.0 * error[:, 0] - 0.3 * s.qvel[:, 0], rng.standard_normal(200)], axis=1)
         made.append(replace(s, tau=tau + 0.01 * rng.standard_normal(tau.shape)))
     said = TorqueFit(made, arm)
-    (kp, kd, explained), (_, _, noise) = said.gains().values()
+    (kp, _, kd, explained), (_, _, _, noise) = said.gains().values()
     assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
     assert explained > 0.95 > 0.5 > noise
     assert said.trusted
@@ -67,7 +67,7 @@ def test_noise_of_position_and_speed_softens_no_gain(arm):
         error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
         noisy = [x + spread * rng.standard_normal(x.shape) for x, spread in ((s.qpos, 0.01), (s.qvel, 0.3))]
         made.append(replace(s, tau=48.0 * error - 1.0 * s.qvel, qpos=noisy[0], qvel=noisy[1]))
-    for kp, kd, _ in TorqueFit(made, arm).gains().values():
+    for kp, _, kd, _ in TorqueFit(made, arm).gains().values():
         assert (kp, kd) == (pytest.approx(48.0, rel=0.03), pytest.approx(1.0, rel=0.1))
 
 
