@@ -71,13 +71,26 @@ DRAKE = '''def add_servos(plant):
         joint.set_default_damping(max(s["damping"] + min(d, 0.0), 0.0))
 
 
-def friction(plant, context):
-    """Drake's joints have none: what its input for applied generalized forces takes in each step, N m."""
-    speed, inertia = plant.GetVelocities(context), plant.CalcMassMatrix(context).diagonal()
-    told = np.zeros(plant.num_velocities())
-    for name, s in SERVOS.items():
-        i, loss = plant.GetJointByName(name).velocity_start(), s["frictionloss"]
-        told[i] = -loss * np.tanh(speed[i] / max(0.005, loss * plant.time_step() / inertia[i]))
+def friction(plant, context, target, sweeps=10):
+    """What Drake's joints lack, for the input of applied generalized forces, N m: as much of each joint's friction as
+    brings it to rest in this step, by Gauss and Seidel; target: rad, of SERVOS in their order."""
+    servos, step = SERVOS.values(), plant.time_step()
+    column = {field: np.array([s[field] for s in servos]) for field in next(iter(servos))}
+    joints = [plant.GetJointByName(name) for name in SERVOS]
+    at, dof = [j.position_start() for j in joints], [j.velocity_start() for j in joints]
+    inertia, speed = plant.CalcMassMatrix(context), plant.GetVelocities(context)
+    force = plant.CalcGravityGeneralizedForces(context) - plant.CalcBiasTerm(context)
+    asked = column["kp"] * (target - plant.GetPositions(context)[at])
+    force[dof] += np.clip(asked, -column["effort_limit"], column["effort_limit"])
+    held = inertia.copy()
+    held[dof, dof] += step * (column["damping"] + column["kd"])
+    moved = np.linalg.inv(held)
+    after, told = moved @ (inertia @ speed + step * force), np.zeros(len(speed))
+    for _ in range(sweeps):
+        for i, loss in zip(dof, column["frictionloss"]):
+            now = np.clip(told[i] - after[i] / (step * moved[i, i]), -loss, loss)
+            after += step * moved[:, i] * (now - told[i])
+            told[i] = now
     return told
 '''
 
@@ -85,7 +98,8 @@ def friction(plant, context):
 def drake_config(robot: str, facts: dict[str, Any]) -> str:
     """For Drake's MultibodyPlant."""
     fields = ("kp", "kd", "effort_limit", "armature", "damping", "frictionloss")
-    servos = "".join(f"    {name!r}: { ({f: s[f] for f in fields})!r},\n" for name, s in facts["plain"].items())
+    numbers = {name: {f: s[f] for f in fields} for name, s in facts["plain"].items()}
+    servos = "".join(f"    {name!r}: {told!r},\n" for name, told in numbers.items())
     return (
         f"{_head(robot, 'Drake', facts)}import numpy as np\nfrom pydrake.multibody.tree import PdControllerGains\n\n"
         f"SERVOS = {{\n{servos}}}\n"

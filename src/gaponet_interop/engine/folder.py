@@ -170,7 +170,7 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:
             )
     if any(s["delay"] for s in facts["plain"].values()):
         told += {"newton": ["Newton has no delays: check.py has a buffer of five lines"],
-                 "drake": ["Drake has no delays: check.py has a buffer of five lines"],
+                 "drake": ["Drake has no delays: check.py has a buffer of five lines; friction is robot_cfg.py's"],
                  "mjcf": ["delays need MuJoCo 3.5; MJX and Newton drop them without a word: check_mjx.py has a buffer"],
                  "isaaclab": ["robot_cfg.py rounds delays to physics steps; the action term does not"],
                  "mjlab": ["robot_cfg.py rounds delays to physics steps; robot.xml does not"]}.get(to, [])  # fmt: skip

@@ -40,8 +40,9 @@ for motion in played:
     for k in range(len(motion["ctrl"]) - 1):
         for i in range(facts["decimation"]):
             past = np.concatenate([motion["ctrl"][k][None], past[:-1]])
-            desired.FixValue(context, np.concatenate([(weights * past).sum(0) + offset, np.zeros(len(names))]))
-            forces.FixValue(context, robot_cfg.friction(plant, context))
+            target = (weights * past).sum(0) + offset
+            desired.FixValue(context, np.concatenate([target, np.zeros(len(names))]))
+            forces.FixValue(context, robot_cfg.friction(plant, context, target))
             simulator.AdvanceTo((k * facts["decimation"] + i + 0.5) * step)  # one discrete step, whatever is rounded
         found.append(plant.GetPositions(context)[at])
     errors.append(np.abs(np.array(found) - motion["qpos"][1:])[:, columns].mean())
