@@ -22,6 +22,7 @@ PUBLIC = {  # model → joints that are welded where it stands: slides, wheels, 
     "boston_dynamics_spot/spot.xml": (), "wonik_allegro/right_hand.xml": (), "aloha/aloha.xml": ("finger",),
     "shadow_hand/right_hand.xml": ("FFJ1", "FFJ2", "MFJ1", "MFJ2", "RFJ1", "RFJ2", "LFJ1", "LFJ2"),
 }  # fmt: skip
+PACKAGED = Path(__file__).parents[1] / "src" / "gaponet" / "robots"  # more names
 RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
 LAWS = (
     "stribeck",
@@ -285,14 +286,18 @@ def spoiled(robot: Stranger, how: str) -> Stranger:
 
 def draw(seed: int, public: bool | None = None, small: bool = False, named: str = "") -> Stranger:
     """The robot of a seed. public: of the public models, or (False) of those that are made here; default: by chance.
-    small: the first made here of at most SMALL joints, at no more than SLOW Hz. named: one of PUBLIC, in part."""
+    small: the first made here of at most SMALL joints, at no more than SLOW Hz. named: one of PUBLIC, in part, or of
+    gaponet's own robots."""
     if small:
         next(i for i in range(100) if len((found := draw(seed + 10**6 * i, False)).joints) <= SMALL)
         return replace(found, rate=min(found.rate, SLOW))
     rng = np.random.default_rng([seed, 0])
     chance, place = rng.random() < 0.4, rng.integers(len(PUBLIC))
     spec, body = None, next((m for m in PUBLIC if named and named in m), list(PUBLIC)[place])
-    if (bool(named) or (chance if public is None else public)) and (folder := _folder()) is not None:
+    if named and (PACKAGED / named / "robot.xml").is_file():
+        body = f"{named}/robot.xml"
+        spec = _public(PACKAGED / body, ())
+    elif (bool(named) or (chance if public is None else public)) and (folder := _folder()) is not None:
         spec = _public(folder / body, PUBLIC[body])
     if spec is None:
         body = ("arm", "legs", "hand")[rng.integers(3)]

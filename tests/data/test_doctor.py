@@ -2,15 +2,17 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from logs import arm_sequence, late, wave
 
 from gaponet.data.checks.finding import Finding
+from gaponet.data.checks.timing import EARLY, _drift
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.sequence import Sequence
-from gaponet.data.signals import lowpass
+from gaponet.data.signals import Response, lowpass
 from gaponet.data.store import Dataset
 from gaponet.errors import DatasetError
 from gaponet.sim.dynamics import static_torque
@@ -141,6 +143,24 @@ def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(a
         arm, tmp_path / "bad", *(arm_sequence(arm, u, odd(i, q), motion=m) for i, (m, u, q) in enumerate(logs))
     )
     assert any(f.check == check and words in f.message for f in bad.findings if f.level in ("warning", "error"))
+
+
+@pytest.mark.parametrize(("middle", "told"), [(0.5, True), (2.5, False)], ids=["drift", "jumps"])
+def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_differ_are_no_drift(middle, told):
+    """A trajectory generator follows quick parts of a motion later than slow ones, from one part to the next."""
+    surveys = [SimpleNamespace(response=SimpleNamespace(duration=6.0))] * 6
+    end = 0.01 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
+    way = middle * np.array([1, -1, 1, -1, 1, -1]) if middle > 1 else middle
+    found = list(_drift(surveys, np.stack([0 * end, way * end, end], axis=1)))
+    assert [f.check for f in found] == ["clock"] * told
+
+
+@pytest.mark.parametrize(("ahead", "said"), [(0, False), (6, True)])
+def test_commands_to_come_explain_states_only_where_states_come_first(ahead, said):
+    logs = [lively(seed) for seed in range(4)]
+    told = Response.following([Response.of(u[: len(u) - ahead], q[ahead:], 0.02) for u, q in logs])
+    assert (told.early > EARLY).tolist() == [said] * 2
+    assert (told.onset < 0).tolist() == [said] * 2
 
 
 def test_one_sample_one_radian_off_is_a_warning(arm, tmp_path):

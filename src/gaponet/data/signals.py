@@ -211,8 +211,8 @@ class Response:
             early[j] = (power[j] - cross[j, first:] @ np.linalg.solve(later, cross[j, first:])) / left
             way = np.cumsum(weights) / weights.sum()
             first = int(np.argmax(way > 0.05))
-            if quick[j]:
-                before = way[first - 1] if first else 0.0
+            if quick[j] and first:  # the earliest lag of all stands for what is earlier still, or for chance
+                before = way[first - 1]
                 onset[j] = at[first] + step - step * (way[first] - 0.05) / max(way[first] - before, 1e-9)
             moved = np.stack([np.interp(at - s, at, weights, left=0.0, right=0.0) for s in SHIFTS])
             spread = np.fft.rfft(moved, 2 * lags, axis=1)

@@ -24,7 +24,7 @@ LOGARITHM = ("kp", "stribeck_speed")
 OVER_KP = ("damping", "frictionloss", "armature", "stribeck", "min_torque", "effort_limit")
 FIRST_DELAY, MAX_DELAY = 0.02, 0.15  # s: a delay of zero hides what it does
 RESOLVED = 5.0  # physics steps in a radian of the stiffest oscillation that a search starts from
-WIDE_KP, SLOW, HEAVY, ZERO = 4.0, 1.0, 0.3, 0.2  # logarithm of kp, s of damping/kp, s of √(armature/kp), rad of offset
+WIDE_KP, SLOW, HEAVY, ZERO = 5.0, 1.0, 0.3, 0.2  # logarithm of kp, s of damping/kp, s of √(armature/kp), rad of offset
 STILL = 0.01  # rad: commands that differ by less ask nothing of a joint
 STANDING = ("kp", "offset")  # what a joint shows that is never moved: how far it gives way, and where it stands
 
