@@ -28,7 +28,7 @@ def played(arm, tmp_path):
             for k in range(3):
                 ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
                 qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
-                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit)
+                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
                 data.append(replace(one, meta=replace(one.meta, repetition=k)))
     return data
 
@@ -81,7 +81,11 @@ def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, play
     assert (later.qpos == was.qpos[:-rows]).all()
     assert sum(len(s) < len(was) for s in changed["late"].known) == -(-len(question.known) // 10)
     assert (changed["joints"].train[0].qpos == question.train[0].qpos[:, ::-1]).all()
-    assert all(q.test is question.test for name, q in changed.items() if name != "all_late")
+    asked = changed["asked_labels"]
+    assert asked.train is question.train
+    assert [s.meta.payload_mass for s in asked.test] != [s.meta.payload_mass for s in question.test]
+    assert sorted(s.meta.payload_mass for s in asked.test) == sorted(s.meta.payload_mass for s in question.test)
+    assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "asked_labels"))
 
 
 def test_the_method_on_the_page_is_one(arm, played, tmp_path):

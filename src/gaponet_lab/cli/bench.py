@@ -28,7 +28,7 @@ def bench(
     sets: tuple[str, ...] = (),
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     networks: int = 0,
-    adversary: Literal["", "labels", "late", "all_late", "joints"] = "",
+    adversary: Literal["", "labels", "asked_labels", "late", "all_late", "joints"] = "",
     json: Json = False,
 ) -> None:
     """Measure speed, or methods on public recordings of real robots.
@@ -46,8 +46,9 @@ def bench(
         sets: Only these data sets, with real.
         method: A method of your own, FILE.py:FUNCTION, with real; may be repeated.
         networks: Train networks too, with real, for so many control steps each; 0 for none.
-        adversary: What is done, with real, to the recordings that are learned from: labels dealt out anew; late, 40 ms
-            of delay added to one in ten, or to all of them and to those asked (all_late); joints in another order.
+        adversary: What is done, with real, to the recordings that are learned from: labels dealt out anew, or those of
+            the recordings asked (asked_labels); late, 40 ms of delay added to one in ten, or to all of them and to
+            those asked (all_late); joints in another order.
         rounds: Interleaved turns of each; default 15, 3 with train. The fastest counts, with train the median.
     """
     screen = Out(json)

@@ -27,6 +27,16 @@ def labels(question: Question) -> Question:
     return _learned(question, [replace(s, meta=m) for s, m in zip(known, metas, strict=True)])
 
 
+def asked_labels(question: Question) -> Question:
+    """Payload dealt out anew among what is asked of a joint: what a payload's label is worth must be lost."""
+    rng, metas = np.random.default_rng(0), [s.meta for s in question.test]
+    for joints in {m.unrecorded for m in metas}:
+        mine = [i for i, m in enumerate(metas) if m.unrecorded == joints]
+        for i, j in zip(mine, rng.permutation(mine), strict=True):
+            metas[i] = replace(metas[i], payload_mass=question.test[j].meta.payload_mass)
+    return replace(question, test=[replace(s, meta=m) for s, m in zip(question.test, metas, strict=True)])
+
+
 def late(question: Question) -> Question:
     """40 ms of delay added to one recording in ten of those that are learned from: nothing may follow them."""
     return _learned(question, [_later(s) if i % ONE_IN == 0 else s for i, s in enumerate(question.known)])
@@ -46,7 +56,9 @@ def joints(question: Question) -> Question:
     return _learned(question, [_ordered(s, order) for s in question.known])
 
 
-ADVERSARIES: dict[str, Adversary] = {"labels": labels, "late": late, "all_late": all_late, "joints": joints}
+ADVERSARIES: dict[str, Adversary] = {
+    f.__name__: f for f in (labels, asked_labels, late, all_late, joints)
+}  # fmt: skip
 
 
 def _learned(question: Question, known: list[Sequence]) -> Question:

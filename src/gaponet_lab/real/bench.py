@@ -139,7 +139,8 @@ class Bench:
         noise = float(np.mean([f for q in folds if (f := floor(q)) == f] or [np.nan]))
         splits = tuple(q.split for q in folds)
         change: Adversary = ADVERSARIES.get(self.adversary, lambda q: q)
-        folds = [self._at_work(card, change(q), self.adversary) for q in folds]
+        pairs = [(q, change(q)) for q in folds]  # where what is learned from stays, so does what was learned
+        folds = [self._at_work(card, new, self.adversary * (new.train is not q.train)) for q, new in pairs]
         for method, (title, answer) in self.methods.items():
             if _nothing_to_go_on(method, folds):
                 continue

@@ -18,13 +18,14 @@ from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
 from gaponet_lab.real.questions import Question, rehearsal
-from gaponet_lab.real.rivals import Answer, Method, identified, nominal
+from gaponet_lab.real.rivals import Answer, Method, fitted, identified, nominal
 
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 TRAINED = (("", "shared_mlp"), ("", "gaponet"), ("identification + ", "gaponet"))
-ROUNDS, ENVIRONMENTS = 2, 256  # of the supervised start
-WHOLE = 600_000  # control steps from which training is that of gaponet train; fewer are a supervised start alone
+WHOLE = 600_000  # control steps from which training is that of gaponet train
+# Fewer are one round of its supervised start.
+BRIEF = WarmStartConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
 
 
 def networks(steps: int) -> dict[str, tuple[str, Method]]:
@@ -37,11 +38,10 @@ def networks(steps: int) -> dict[str, tuple[str, Method]]:
 
 
 def _recipe(steps: int) -> TrainConfig:
-    """How a network is trained for so many control steps; a short training also labels no more rows than that."""
+    """How a network is trained for so many control steps; a brief training labels no more rows than that."""
     warm = WarmStartConfig()
     if steps < WHOLE:
-        each = max(steps // (ROUNDS * ENVIRONMENTS), 1)
-        warm = replace(warm, rounds=ROUNDS, num_envs=ENVIRONMENTS, steps=each, rows=steps, gradient_steps=500)
+        warm = replace(BRIEF, steps=max(steps // BRIEF.num_envs, 1), rows=steps)
     return TrainConfig(warm_start=warm, mixed_gains=True)
 
 
@@ -62,7 +62,9 @@ def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
         write_text(split, json.dumps({"parts": parts}))
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
         half_way = (training / "checkpoint.pt").is_file()
-        Trainer(dataset, start.robot, training, config, Budget(steps=steps), half_way).run()
+        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), half_way)
+        trainer.baseline = fitted(question)
+        trainer.run()
     model = GapModel.load(training)
     val = model.card["val_mpjae"]
     worth = Added(base, val["added"], val.get("error", np.nan), val["start"])

@@ -59,7 +59,12 @@ def nominal(question: Question) -> Answer:
 
 def delay_offset(question: Question) -> Answer:
     """A delay and an offset of each joint."""
-    return Answer(question.robot, DelayOffset.fit(question.known, question.robot).corrector(question.robot))
+    return Answer(question.robot, fitted(question).corrector(question.robot))
+
+
+def fitted(question: Question) -> DelayOffset:
+    """Delay and offset, which networks keep beside them."""
+    return question.once("delay + offset", lambda: DelayOffset.fit(question.known, question.robot))
 
 
 def constant(question: Question) -> Answer:
