@@ -1,35 +1,40 @@
 """What a network, and its rivals, add to identification where causes have no name: docs/results/unnamed.md.
 
-    python benchmarks/unnamed.py WORK [--seeds 3] [--budget 600000] [--fleet unnamed] [--shuffled]
+    python benchmarks/unnamed.py WORK [--seeds 3] [--budget 600000] [--fleet unnamed|FILE] [--data DATASET]
 
-The fleet `unnamed`, recipe of virtual_h1_2.py: identified and trained on virtual-1 to virtual-3, measured on virtual-4
-playing other motions, whole-motion free run. Rivals on the same labels: a shared MLP with the operator's inputs, and
-gradient-boosted trees, one per joint, on position, speed and a − q of all joints and the payload (needs scikit-learn).
-With --shuffled every recording has another one's labels. What is found in WORK is kept. Every number is from VIRTUAL
-robots.
+Collects the fleet (recipe of virtual_h1_2.py), runs `gaponet identify` and `gaponet train` on virtual-1 to virtual-3 as
+a user would, and measures virtual-4 playing other motions, whole-motion free run. Rivals: a shared MLP trained as the
+operator is, and gradient-boosted trees on the same labels, one per joint, on position, speed and a − q of all joints
+and the payload (needs scikit-learn), with every recording's own labels and with another one's. With --data all learn
+from these recordings, and are asked the motions of the fleet that are not among them, if there are such (postures left
+out); else (other units) the same motions as always. What is found in WORK is kept. Every number is from VIRTUAL robots.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run, table
+from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
+from gaponet.data.split import split_entries
+from gaponet.data.store import Dataset
 from gaponet.metrics import standard_error
 from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec
-from gaponet.sim.identify import DEFAULT_TERMS
-from gaponet.sim.replay import replay
+from gaponet.robot import RobotSpec, load_robot
+from gaponet.sim.replay import Corrector, replay
+from gaponet.spread import Spread, Table
 from gaponet.training.labels import trajectory_labels
 
 LIMIT, ROUNDS, TREES, LEAF, MOST = 0.3, 1, 120, 60, 60_000  # rad, rounds of DAgger, of each joint, rows, rows fitted
-KINDS = ("gaponet", "shared_mlp")
+SHUFFLED = "trees-shuffled"
 
 
 class Trees:
@@ -84,50 +89,119 @@ def trees(bench: Bench, robot: RobotSpec, labels: Array, seed: int) -> Trees:
     return model
 
 
-def trained(bench: Bench, robot: RobotSpec, folder: Path, kind: str, seed: int, budget: str) -> Array:
-    """Errors of a run on the test motions, rad."""
-    if not (folder / "model" / "card.json").is_file():
-        run("train", bench.data.path, "--robot", robot.folder, "--out", folder, "--model", kind,
-            "--budget", budget, "--seed", seed, "--holdout-units", UNIT,
-            *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
-    return bench.errors(robot, GapModel.load(folder).corrector(robot))
+def of_others(bench: Bench, labels: Array) -> Array:
+    """Every recording with another one's labels, repeated or cut to its length."""
+    parts = np.split(labels, np.cumsum([len(s) for s in bench.train])[:-1])
+    other = np.roll(np.random.default_rng(0).permutation(len(parts)), 1)
+    return np.concatenate([np.resize(parts[o], p.shape) for o, p in zip(other, parts, strict=True)])
 
 
-def steps(bench: Bench, seeds: int, budget: str, shuffled: bool) -> dict[str, Errors]:
-    """Row by row."""
-    robot = bench.identified(DEFAULT_TERMS)
-    found: dict[str, Errors] = {"nominal": [bench.errors(bench.nominal)], "identified": [bench.errors(robot)]}
-    labels = trajectory_labels(bench.train, robot, LIMIT)
-    if shuffled:
-        parts = np.split(labels, np.cumsum([len(s) for s in bench.train])[:-1])
-        other = np.roll(np.random.default_rng(0).permutation(len(parts)), 1)
-        labels = np.concatenate([np.resize(parts[o], p.shape) for o, p in zip(other, parts, strict=True)])
-    found["… + trees"] = [bench.errors(robot, trees(bench, robot, labels, s)) for s in range(seeds)]
-    for kind in () if shuffled else KINDS:
-        found[f"… + {kind}"] = [
-            trained(bench, robot, bench.work / f"{kind}-{s}", kind, s, budget) for s in range(seeds)
-        ]
-    return found
+class Rows:
+    """The rows of the table: what is fitted, and its errors on validation and test, each found once."""
+
+    def __init__(self, bench: Bench, budget: str) -> None:
+        self.bench, self.budget = bench, budget
+
+    def errors(self, name: str, simulator: RobotSpec, corrector: Callable[[], Corrector] | None = None) -> Array:
+        """Of validation and then of test recordings, rad."""
+        file = self.bench.work / "errors" / f"{name}.npy"
+        if not file.is_file():
+            both = replace(self.bench, test=[*self.bench.val, *self.bench.test])
+            found = both.errors(simulator, corrector() if corrector else None)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            np.save(file, found)
+        return np.load(file)
+
+    def identified(self) -> RobotSpec:
+        """gaponet identify, as it comes."""
+        out = self.bench.work / "identified"
+        if not (out / "robot.toml").is_file():
+            run("identify", self.bench.data.path, "--out", out, *self.held_out())
+        return load_robot(out)
+
+    def held_out(self) -> list[str]:
+        """The unit that is measured, where it is among those to learn from."""
+        return ["--holdout-units", UNIT] if UNIT in {e.meta.unit_id for e in self.bench.data.entries} else []
+
+    def labels(self, robot: RobotSpec) -> Array:
+        """Of the training recordings."""
+        file = self.bench.work / "labels.npy"
+        if not file.is_file():
+            np.save(file, trajectory_labels(self.bench.train, robot, LIMIT))
+        return np.load(file)
+
+    def corrector(self, kind: str, robot: RobotSpec, seed: int) -> Corrector:
+        """Trees, or gaponet train as it comes."""
+        if kind == "trees":
+            return trees(self.bench, robot, self.labels(robot), seed)
+        if kind == SHUFFLED:
+            return trees(self.bench, robot, of_others(self.bench, self.labels(robot)), seed)
+        folder = self.bench.work / f"{kind}-{seed}"
+        if not (folder / "model" / "card.json").is_file():
+            run("train", self.bench.data.path, "--robot", robot.folder, "--out", folder, "--model", kind,
+                "--budget", self.budget, "--seed", seed, *self.held_out(),
+                *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
+        return GapModel.load(folder).corrector(robot)
+
+    def all(self, kinds: ListOf[str], seeds: int) -> dict[str, Errors]:
+        """Row by row, seed by seed."""
+        robot = self.identified()
+        found = {
+            "nominal": [self.errors("nominal", self.bench.nominal)],
+            "identified": [self.errors("identified", robot)],
+        }
+        for kind in kinds:
+            found[kind] = [
+                self.errors(f"{kind}-{seed}", robot, partial(self.corrector, kind, robot, seed))
+                for seed in range(1 if kind == SHUFFLED else seeds)
+            ]
+        return found
+
+
+def table(found: dict[str, Errors], sequences: list[Sequence], name: str) -> Table:
+    """What each row leaves, by payload in parts of what identification leaves, and paired differences over motions."""
+    payloads = sorted({s.meta.payload_mass for s in sequences})
+    base = {p: by_motion(found["identified"], sequences, p).mean() for p in (*payloads, None)}
+    best, rows = by_motion(found["gaponet"], sequences) if "gaponet" in found else None, []
+    for row, errors in found.items():
+        mean = by_motion(errors, sequences)
+        less, apart = by_motion(found["identified"], sequences) - mean, None if best is None else mean - best
+        seeds = Spread.of([float(by_motion([e], sequences).mean()) for e in errors]).std if len(errors) > 1 else None
+        by_payload = (by_motion(errors, sequences, p).mean() / base[p] for p in payloads)
+        over = "" if apart is None else f"{apart.mean():+.2f} ± {standard_error(apart):.2f}"
+        told = f"{less.mean():+.2f} ± {standard_error(less):.2f}"
+        rows.append((row, mean.mean(), seeds, mean.mean() / base[None], *by_payload, told, over))
+    heads = ("row", "mrad", "± seeds", "of identified", *(f"{p:g} kg" for p in payloads), "less", "above gaponet")
+    return Table(name, heads, tuple(rows), f"{name}: {len(sequences)} free runs of VIRTUAL robots")
+
+
+def learning_from(bench: Bench, data: Dataset) -> Bench:
+    """The bench with other recordings to learn from."""
+    parts = split_entries(data, (UNIT,) if UNIT in {e.meta.unit_id for e in data.entries} else ())
+    held = {e.meta.motion for e in data.entries}
+    strange = [e for e in bench.data.entries if e.meta.unit_id == UNIT and e.meta.motion not in held]
+    train, val = (data.sequences(parts[part]) for part in ("train", "val"))
+    test = bench.data.sequences(strange) if strange else bench.test
+    return replace(bench, data=data, train=train, val=val, test=test, work=bench.work / data.path.name)
 
 
 def main() -> None:
-    """Measure, and print the table and paired differences."""
+    """Measure, and print a table of validation and one of test motions."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--budget", default="600000", help="of each run, as in gaponet train")
-    parser.add_argument("--fleet", default="unnamed")
+    parser.add_argument("--fleet", default="unnamed", help="name, or a file")
     parser.add_argument("--recipe", type=Path, default=RECIPE)
-    parser.add_argument("--shuffled", action="store_true", help="every recording has another one's labels")
+    parser.add_argument("--data", type=Path, help="learn from these recordings, not from the fleet's")
+    parser.add_argument("--rows", nargs="*", default=["gaponet", "shared_mlp", "trees", SHUFFLED])
     args = parser.parse_args()
     bench = Bench.of(args.fleet, args.recipe, args.work)
-    found = steps(bench, args.seeds, args.budget, args.shuffled)
-    print(table(args.fleet, found, bench.test, f"MPJAE in mrad on VIRTUAL {UNIT}, ± over motions").markdown())
-    base = by_motion(found["identified"], bench.test)
-    for name, errors in list(found.items())[2:]:
-        less = base - by_motion(errors, bench.test)
-        ratio = 1 - less.mean() / base.mean()
-        print(f"{name}: {less.mean():+.2f} ± {standard_error(less):.2f} mrad less, {ratio:.3f} of identified")
+    bench = learning_from(bench, Dataset(args.data)) if args.data else bench
+    found = Rows(bench, args.budget).all(args.rows, args.seeds)
+    ends = len(bench.val)
+    for name, part, own in (("validation", bench.val, slice(0, ends)), ("test", bench.test, slice(ends, None))):
+        print(table({k: [e[own] for e in v] for k, v in found.items()}, part, name).markdown(), "\n")
 
 
 if __name__ == "__main__":

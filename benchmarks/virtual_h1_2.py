@@ -81,12 +81,13 @@ class Bench:
     @classmethod
     def of(cls, fleet: str, recipe: Path, work: Path) -> Bench:
         """Collect what is not there."""
-        run("collect", "--fleet", fleet, "--recipe", recipe, "--out", work / fleet)
-        data = Dataset(work / fleet)
+        name = Path(fleet).stem  # of a file
+        run("collect", "--fleet", fleet, "--recipe", recipe, "--out", work / name)
+        data = Dataset(work / name)
         parts = split_entries(data, (UNIT,))
         test = [e for e in parts["test"] if e.meta.unit_id == UNIT]
         found = (data.sequences(part) for part in (parts["train"], parts["val"], test))
-        return cls(fleet, data, load_robot("h1_2"), work / f"{fleet}-fits", *found)
+        return cls(name, data, load_robot("h1_2"), work / f"{name}-fits", *found)
 
     def kept(self, name: str, fit: Callable[[], RobotSpec]) -> RobotSpec:
         """A fitted simulator, fitted once."""

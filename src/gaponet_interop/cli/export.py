@@ -22,7 +22,7 @@ Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of ga
 def export(
     robot: Holder,
     to: Literal[
-        "onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json", "randomization"
+        "onnx", "torch", "mjcf", "urdf", "mjlab", "isaaclab", "newton", "drake", "json", "randomization", "actuator-net"
     ] = "onnx",
     out: Path | None = None,
     data: str | None = None,
@@ -40,7 +40,8 @@ def export(
         to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
             check.py that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a
             run: onnx (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for
-            mjlab and Isaac Lab). Of a robot, randomization: what to randomise in training.
+            mjlab and Isaac Lab), actuator-net (of each joint a network, past of target − position and speed in, torque
+            out: the form of mjlab, Newton and Isaac Lab). Of a robot, randomization: what to randomise in training.
         out: Folder; default one with that name in the robot or run, for onnx the run's model folder.
         data: Dataset on which a servo law's nearest plain servos are fitted, and every form is judged; default the one
             that the robot was identified from, and without any what the robot itself answers.
@@ -56,6 +57,9 @@ def export(
     screen = Out(json)
     if to == "randomization":
         _randomization(screen, robot, out, engine, scope, units)
+        return
+    if to == "actuator-net":
+        _actuator_net(screen, robot, out or robot / to, data, payload_mass)
         return
     if to in ("onnx", "torch"):
         if data or into or prefix:
@@ -98,6 +102,21 @@ def _randomization(
         screen.say(f"  no log determines these, drawn as wide as believed before: {told}", "warning", "yellow")
     screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
     screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
+
+
+def _actuator_net(screen: Out, run: Path, folder: Path, data: str | None, payload_mass: float) -> None:
+    from gaponet.eval.tables import mrad
+    from gaponet.model.artifact import GapModel
+    from gaponet_interop.engine.actuator_net import export_actuator_net
+
+    made = export_actuator_net(GapModel.load(run), run, folder, data, payload_mass)
+    rows = [[what, mrad(error)] for what, error in made.left.items()]
+    screen.table(f"What is left of {made.motions} validation motions", ["form", "mrad"], rows)
+    if not made.gain:
+        screen.say("  what the run adds goes by posture or payload, which engines do not tell a joint's network: these "
+                   "are the servos alone; --to torch has all of the run", "warning", "yellow")  # fmt: skip
+    screen.say(f"{folder}: JOINT.onnx, .pt2 and .pt of every joint; next, in mjlab: python {folder / 'check.py'}")
+    screen.result({"path": str(folder), "to": "actuator-net", "left": made.left, "gain": made.gain})
 
 
 def _simulator(holder: Path) -> Path:

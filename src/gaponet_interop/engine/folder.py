@@ -37,6 +37,11 @@ CHECKS = {
     "isaaclab": {"check.py": "isaaclab.py"},
     "newton": {"check.py": "newton.py"},
     "drake": {"check.py": "drake.py"},
+    "actuator-net": {
+        "check.py": "actuator_mjlab.py",
+        "check_newton.py": "actuator_newton.py",
+        "actuators.py": "actuators.py",
+    },
 }
 OURS = re.compile(r"from gaponet\S*\.(servo|mujoco_servos|scene_facts) import")
 LAW = """\"\"\"The law of an identified servo: what MuJoCo's actuators and friction loss do not; numpy or torch.\"\"\"
@@ -112,8 +117,8 @@ def export_robot(
         prices["in gaponet, fitted without the law"] = left(judging, plain)
     with writing(out, KIND):
         file, told, more = _write_form(robot, plain, to, out, facts, judging, source, prefix, payload_mass)
-        _write_motions(out / CHECK, motions)
-        _ship(out, to)
+        write_motions(out / CHECK, motions)
+        ship(out, to)
         write_text(out / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
     notes = (*_notes(robot, facts, to), *told)
     return Exported(file, prices | more, len(judging), judging[0].meta.virtual, notes)
@@ -153,7 +158,7 @@ def _write_form(
         return file, (), left_there
     if to == "json":
         return None, (), left_there
-    _write_scene(robot if to == "mjlab" else plain, out / ROBOT, payload_mass, servos=to == "mjlab")
+    write_scene(robot if to == "mjlab" else plain, out / ROBOT, payload_mass, servos=to == "mjlab")
     write_text(out / "robot_cfg.py", CONFIGS[to](robot.name, facts))
     return out / ROBOT, (), left_there
 
@@ -206,14 +211,14 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
         past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}
         facts = simulator_facts(robot, dt, payload_mass)
         facts |= {"model": past, "payload_seen": model.card.get("payload_seen")}
-        _write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
-        _write_scene(robot, folder / "robot_without_servos.xml", payload_mass, servos=False, dt=dt)
-        _ship(folder, "torch")
+        write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
+        write_scene(robot, folder / "robot_without_servos.xml", payload_mass, servos=False, dt=dt)
+        ship(folder, "torch")
         write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
     return difference
 
 
-def _write_scene(
+def write_scene(
     robot: RobotSpec, file: Path, payload_mass: float, servos: bool = True, dt: float | None = None
 ) -> None:
     """The simulator as one MJCF; without its servos for engines that bring their own, or they act twice."""
@@ -221,7 +226,8 @@ def _write_scene(
     write_text(file, text if servos else SERVOS.sub("", text))
 
 
-def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
+def write_motions(file: Path, motions: ListOf[Sequence]) -> None:
+    """The recordings that travel, for a check."""
     held: dict[str, Any] = {"count": np.array(len(motions)), "names": np.array([s.meta.motion for s in motions])}
     for i, s in enumerate(motions):
         held |= {f"ctrl_{i}": s.ctrl, f"qpos_{i}": s.qpos, f"qvel_{i}": s.qvel, f"dt_{i}": np.array(s.dt)}
@@ -229,7 +235,7 @@ def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
         np.savez_compressed(opened, **held)
 
 
-def _ship(folder: Path, to: str) -> None:
+def ship(folder: Path, to: str) -> None:
     """Files that need no gaponet: the law, the action term, the check."""
     here = Path(__file__).parent
     told = (servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit, servo.servo_torque)
@@ -237,7 +243,7 @@ def _ship(folder: Path, to: str) -> None:
     limits = f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
     write_text(folder / "servo_law.py", "\n\n".join([LAW + limits, *law]))
     shipped = {"mujoco_servos.py": here / "mujoco_servos.py"}
-    if to in ("mjlab", "isaaclab", "torch"):
+    if to in ("mjlab", "isaaclab", "torch", "actuator-net"):
         shipped |= {"scene_facts.py": here / "scene_facts.py", TERM: here / "action_term.py"}
     shipped |= {name: here / "checks" / file for name, file in CHECKS.get(to, {}).items()}
     for name, file in shipped.items():
