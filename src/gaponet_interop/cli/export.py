@@ -14,8 +14,11 @@ from gaponet.robot import load_robot
 from gaponet.robot_folder import KEPT, keeps_robot
 
 if TYPE_CHECKING:
+    from gaponet_interop.engine.folder import Exported
     from gaponet_interop.engine.ranges import Engine, Scope
 
+NETWORKS = ("onnx", "torch", "actuator-net")
+CHECKED_IN = {"mjcf": "MuJoCo", "actuator-net": "mjlab"}
 Holder = Annotated[Folder, tyro.conf.arg(help="Robot folder, or run folder of gaponet train.", metavar="ROBOT|RUN")]
 
 
@@ -58,32 +61,42 @@ def export(
     if to == "randomization":
         _randomization(screen, robot, out, engine, scope, units)
         return
-    if to == "actuator-net":
-        _actuator_net(screen, robot, out or robot / to, data, payload_mass)
-        return
+    if to in NETWORKS and (robot / "robot.toml").is_file():
+        raise UsageError(f"{robot}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton or json")
     if to in ("onnx", "torch"):
         if data or into or prefix:
             raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
         _network(screen, robot, to, out, payload_mass)
         return
     from gaponet.eval.tables import mrad
-    from gaponet.progress import bar
-    from gaponet_interop.engine.folder import export_robot
-    from gaponet_interop.engine.forms import recordings_of
 
-    spec, folder = load_robot(_simulator(robot)), out or robot / to
-    recordings = recordings_of(_simulator(robot), data, spec)
-    with bar("fitting without the law") as update:
-        made = export_robot(spec, to, folder, recordings, into, prefix, payload_mass, update)
-    of = "of the robot's own answers, VIRTUAL" if made.virtual else "validation motions"
+    folder = out or robot / to
+    made = _made(robot, to, folder, data, into, prefix, payload_mass)
+    of = "VIRTUAL motions" if made.virtual else "validation motions"
     rows = [[what, mrad(error)] for what, error in made.left.items()]
     screen.table(f"What is left of {made.motions} {of}", ["form", "mrad"], rows)
     for line in made.notes:
         screen.say(f"  {line}", "warning", "yellow")
-    check = folder / "check.py"
-    told = f"; next, in {'MuJoCo' if to == 'mjcf' else to}: python {check}" if check.is_file() else ""
-    screen.say(f"{made.file or folder}: {spec.name} for {to}{told}")
-    screen.result({"path": str(folder), "to": to, "robot": spec.name, "left": made.left, "notes": made.notes})
+    check, name = folder / "check.py", load_robot(_simulator(robot)).name
+    told = f"; next, in {CHECKED_IN.get(to, to)}: python {check}" if check.is_file() else ""
+    screen.say(f"{made.file or folder}: {name} for {to}{told}")
+    screen.result({"path": str(folder), "to": to, "robot": name, "left": made.left, "notes": made.notes})
+
+
+def _made(
+    robot: Path, to: str, folder: Path, data: str | None, into: Path | None, prefix: str, payload_mass: float
+) -> Exported:
+    from gaponet.model.artifact import GapModel
+    from gaponet.progress import bar
+    from gaponet_interop.engine.folder import export_networks, export_robot
+    from gaponet_interop.engine.forms import recordings_of
+
+    if to == "actuator-net":
+        return export_networks(GapModel.load(robot), robot, folder, data, payload_mass)
+    spec = load_robot(_simulator(robot))
+    recordings = recordings_of(_simulator(robot), data, spec)
+    with bar("fitting without the law") as update:
+        return export_robot(spec, to, folder, recordings, into, prefix, payload_mass, update)
 
 
 def _randomization(
@@ -102,21 +115,6 @@ def _randomization(
         screen.say(f"  no log determines these, drawn as wide as believed before: {told}", "warning", "yellow")
     screen.say(f"{file}: {len(next(iter(made.units.values())))} units in {file.parent / 'randomization.json'}")
     screen.result({"path": str(file), "scope": scope, "ranges": made.ranges, "unknown": made.unknown})
-
-
-def _actuator_net(screen: Out, run: Path, folder: Path, data: str | None, payload_mass: float) -> None:
-    from gaponet.eval.tables import mrad
-    from gaponet.model.artifact import GapModel
-    from gaponet_interop.engine.actuator_net import export_actuator_net
-
-    made = export_actuator_net(GapModel.load(run), run, folder, data, payload_mass)
-    rows = [[what, mrad(error)] for what, error in made.left.items()]
-    screen.table(f"What is left of {made.motions} validation motions", ["form", "mrad"], rows)
-    if not made.gain:
-        screen.say("  what the run adds goes by posture or payload, which engines do not tell a joint's network: these "
-                   "are the servos alone; --to torch has all of the run", "warning", "yellow")  # fmt: skip
-    screen.say(f"{folder}: JOINT.onnx, .pt2 and .pt of every joint; next, in mjlab: python {folder / 'check.py'}")
-    screen.result({"path": str(folder), "to": "actuator-net", "left": made.left, "gain": made.gain})
 
 
 def _simulator(holder: Path) -> Path:

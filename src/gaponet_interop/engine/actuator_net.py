@@ -3,8 +3,7 @@
 The form is Hwangbo et al. 2019 (Science Robotics 4, eaau5872), which mjlab, Newton and Isaac Lab load. The servo as
 identified is in it exactly, since a late target less today's position is the error of then less the way since. What the
 run's network adds, kp · Δa, is fitted to such a past by a small network, on free runs that the run's network corrects.
-An engine asks joint by joint and tells neither posture nor payload, so what goes by these is lost: `left` says how much
-(docs/results/unnamed.md).
+Engines tell a joint's network neither posture nor payload: what goes by these is lost (docs/results/unnamed.md).
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 import warnings
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,21 +27,10 @@ from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.eval.candidate import split_of_run
 from gaponet.eval.run_files import read_config
-from gaponet.files import whole, write_text, writing
-from gaponet.model.artifact import GapModel
+from gaponet.files import whole
 from gaponet.robot import RobotSpec
-from gaponet.sim.replay import replay
-from gaponet_interop.engine.facts import simulator_facts
-from gaponet_interop.engine.folder import (
-    CHECK,
-    FACTS,
-    KIND,
-    ROBOT,
-    ship,
-    write_motions,
-    write_scene,
-)
-from gaponet_interop.engine.forms import check_motions, comparable, mean_error
+from gaponet.sim.replay import Corrector, replay
+from gaponet_interop.engine.forms import comparable, mean_error
 from gaponet_interop.engine.mujoco_servos import delay_weights
 
 PAST, HIDDEN, CLAMP = 0.1, (32, 32), 5.0  # s beyond the longest delay, widths, standard deviations
@@ -86,73 +73,46 @@ class ActuatorNet(nn.Module):
         return torque.clamp(-self.limit, self.limit)
 
 
-@dataclass(frozen=True)
-class Made:
-    """What was written.
-
-    Attributes:
-        left: Form → mean |error| over the validation motions, rad.
-        motions: How many.
-        length: Physics steps of the past that a network is shown.
-        gain: How much of what the run's network adds was taken.
-    """
-
-    left: dict[str, float]
-    motions: int
-    length: int
-    gain: float
-
-
-def export_actuator_net(
-    model: GapModel, run: Path, folder: Path, data: str | None = None, payload_mass: float = 0.0
-) -> Made:
-    """Write JOINT.onnx (Newton), JOINT.pt2 (torch.export) and JOINT.pt (TorchScript: mjlab, Isaac Lab) of every joint.
-
-    Args:
-        run: Whose motions the networks are fitted to and judged on.
-        data: Where its recordings are now; default where they were.
-        payload_mass: kg in each hand, of the recordings that count.
+def recordings(run: Path, data: str | None, robot: RobotSpec, payload_mass: float) -> list[list[Sequence]]:
+    """Training and validation motions of a run that were made with this payload and the robot's own gains.
 
     Raises:
-        UsageError: No recording was made with this payload and the robot's gains.
+        UsageError: There is none.
     """
-    robot = model.simulator()
-    model.require_payload(payload_mass)
-    config = read_config(run)
-    dataset = Dataset.opened(data or (config["dataset"] if "://" in config["dataset"] else run / config["dataset"]))
-    entries = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
-    held = {part: set(hashes.values()) for part, hashes in split_of_run(run).items()}
-    train, val = (
-        comparable(dataset.sequences(spread([e for e in entries if e.hash in held[part]], MOST)), robot, payload_mass)
-        for part in ("train", "val")
-    )
-    if not train or not val:
+    there = data or read_config(run)["dataset"]
+    dataset = Dataset.opened(there if data or "://" in there else run / there)
+    made = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
+    held = split_of_run(run)
+    parts = [spread([e for e in made if e.hash in held[part].values()], MOST) for part in ("train", "val")]
+    found = [comparable(dataset.sequences(part), robot, payload_mass) for part in parts]
+    if not all(found):
         raise UsageError(f"no recording of {run} was made with {payload_mass:g} kg and the robot's own gains")
-    facts = simulator_facts(robot, train[0].dt, payload_mass) | {"file": ROBOT, "virtual": train[0].meta.virtual}
-    corrector, op = model.corrector(robot), robot.operated_index
-    twins = replay(train, robot, corrector, lock_idle=True)
-    nets = _fitted(train, twins, robot, facts)
-    motions = check_motions(val, robot)
-    aligned = list(zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True))
-    with writing(folder, KIND):
-        write_scene(robot, folder / ROBOT, payload_mass, servos=False)
-        tried = {gain: _played(folder / ROBOT, motions, robot, nets, facts, gain) for gain in GAINS}
-        gain = min(tried, key=lambda g: tried[g])
-        for net in nets.values():
-            net.gain = gain
-        left = {
-            "the run, in gaponet": float(np.mean([mean_error(s.qpos[:, op], t.qpos[:, op]) for s, t in aligned])),
-            "actuator networks": tried[gain], "of these the servo alone": tried[0.0],
-        }  # fmt: skip
-        length = len(next(iter(nets.values())).mean) // 2
-        told = {"length": length, "step": facts["options"]["timestep"], "gain": gain, "input_order": "pos_vel"}
-        facts |= {"actuator_net": told, "left_mrad": {k: 1e3 * x for k, x in left.items()}}
-        for name, net in nets.items():
-            _write(net, folder, name, told | {"joint": name, "robot": robot.name})
-        write_motions(folder / CHECK, motions)
-        ship(folder, "actuator-net")
-        write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
-    return Made(left, len(motions), length, gain)
+    return found
+
+
+def write_networks(
+    sequences: ListOf[Sequence], motions: ListOf[Sequence], corrector: Corrector, robot: RobotSpec, folder: Path,
+    facts: dict[str, Any],
+) -> dict[str, float]:  # fmt: skip
+    """Fit the networks to free runs of sequences, judge them on motions, write them, and say so in facts.
+
+    Returns:
+        What is left of the motions, rad, by form.
+    """
+    nets, op = (
+        _fitted(sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts),
+        robot.operated_index,
+    )
+    aligned = zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True)
+    tried = {gain: _played(folder / facts["file"], motions, robot, nets, facts, gain) for gain in GAINS}
+    gain = min(tried, key=lambda g: tried[g])
+    told = {"length": _length(facts), "step": facts["options"]["timestep"], "gain": gain, "input_order": "pos_vel"}
+    for name, net in nets.items():
+        net.gain = gain
+        _write(net, folder, name, told | {"joint": name, "robot": robot.name})
+    facts["actuator_net"] = told
+    run = float(np.mean([mean_error(s.qpos[:, op], t.qpos[:, op]) for s, t in aligned]))
+    return {"the run, in gaponet": run, "actuator networks": tried[gain], "of these the servo alone": tried[0.0]}
 
 
 def _length(facts: dict[str, Any]) -> int:

@@ -64,7 +64,7 @@ class Exported:
         file: The MJCF; None for json.
         left: Form → mean |error| over the motions that judged it, rad.
         motions: How many those are.
-        virtual: Whether they are the robot's own answers, not recordings.
+        virtual: Whether no real robot played them, but this one or another simulated one.
         notes: What the form leaves out, and what the user is to decide.
     """
 
@@ -117,8 +117,8 @@ def export_robot(
         prices["in gaponet, fitted without the law"] = left(judging, plain)
     with writing(out, KIND):
         file, told, more = _write_form(robot, plain, to, out, facts, judging, source, prefix, payload_mass)
-        write_motions(out / CHECK, motions)
-        ship(out, to)
+        _write_motions(out / CHECK, motions)
+        _ship(out, to)
         write_text(out / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
     notes = (*_notes(robot, facts, to), *told)
     return Exported(file, prices | more, len(judging), judging[0].meta.virtual, notes)
@@ -158,7 +158,7 @@ def _write_form(
         return file, (), left_there
     if to == "json":
         return None, (), left_there
-    write_scene(robot if to == "mjlab" else plain, out / ROBOT, payload_mass, servos=to == "mjlab")
+    _write_scene(robot if to == "mjlab" else plain, out / ROBOT, payload_mass, servos=to == "mjlab")
     write_text(out / "robot_cfg.py", CONFIGS[to](robot.name, facts))
     return out / ROBOT, (), left_there
 
@@ -211,14 +211,47 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
         past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}
         facts = simulator_facts(robot, dt, payload_mass)
         facts |= {"model": past, "payload_seen": model.card.get("payload_seen")}
-        write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
-        write_scene(robot, folder / "robot_without_servos.xml", payload_mass, servos=False, dt=dt)
-        ship(folder, "torch")
+        _write_scene(robot, folder / ROBOT, payload_mass, dt=dt)
+        _write_scene(robot, folder / "robot_without_servos.xml", payload_mass, servos=False, dt=dt)
+        _ship(folder, "torch")
         write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
     return difference
 
 
-def write_scene(
+def export_networks(
+    model: GapModel, run: Path, folder: Path, data: str | None = None, payload_mass: float = 0.0
+) -> Exported:
+    """Write a run as actuator networks, of every joint .onnx (Newton), .pt (mjlab, Isaac Lab) and .pt2 (torch.export).
+
+    Args:
+        run: Whose motions the networks are fitted to, and judged on.
+        data: Where its recordings are now; default where they were.
+        payload_mass: In each hand, kg, of the recordings that count.
+
+    Raises:
+        UsageError: No recording was made with this payload and the robot's gains.
+    """
+    from gaponet_interop.engine.actuator_net import recordings, write_networks
+
+    model.require_payload(payload_mass)
+    robot = model.simulator()
+    train, val = recordings(run, data, robot, payload_mass)
+    motions, dt = check_motions(val, robot), train[0].dt
+    facts = simulator_facts(robot, dt, payload_mass) | {"file": ROBOT, "virtual": train[0].meta.virtual}
+    with writing(folder, KIND):
+        _write_scene(robot, folder / ROBOT, payload_mass, servos=False, dt=dt)
+        left = write_networks(train, motions, model.corrector(robot), robot, folder, facts)
+        facts["left_mrad"] = {form: 1e3 * error for form, error in left.items()}
+        _write_motions(folder / CHECK, motions)
+        _ship(folder, "actuator-net")
+        write_text(folder / FACTS, json.dumps(facts, indent=1, ensure_ascii=False) + "\n")
+    lost = "what the run adds goes by posture, which no joint's network is told: these are the servos alone; try torch"
+    law = f"the servos' law ({', '.join(facts['law'])}) is not in actuator networks"
+    notes = (lost,) * (not facts["actuator_net"]["gain"]) + (law,) * bool(facts["law"])
+    return Exported(folder / ROBOT, left, len(motions), train[0].meta.virtual, notes)
+
+
+def _write_scene(
     robot: RobotSpec, file: Path, payload_mass: float, servos: bool = True, dt: float | None = None
 ) -> None:
     """The simulator as one MJCF; without its servos for engines that bring their own, or they act twice."""
@@ -226,8 +259,7 @@ def write_scene(
     write_text(file, text if servos else SERVOS.sub("", text))
 
 
-def write_motions(file: Path, motions: ListOf[Sequence]) -> None:
-    """The recordings that travel, for a check."""
+def _write_motions(file: Path, motions: ListOf[Sequence]) -> None:
     held: dict[str, Any] = {"count": np.array(len(motions)), "names": np.array([s.meta.motion for s in motions])}
     for i, s in enumerate(motions):
         held |= {f"ctrl_{i}": s.ctrl, f"qpos_{i}": s.qpos, f"qvel_{i}": s.qvel, f"dt_{i}": np.array(s.dt)}
@@ -235,7 +267,7 @@ def write_motions(file: Path, motions: ListOf[Sequence]) -> None:
         np.savez_compressed(opened, **held)
 
 
-def ship(folder: Path, to: str) -> None:
+def _ship(folder: Path, to: str) -> None:
     """Files that need no gaponet: the law, the action term, the check."""
     here = Path(__file__).parent
     told = (servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit, servo.servo_torque)

@@ -1,21 +1,26 @@
 """Actuator networks: the servo as identified, exactly, and what a run's network adds, as torque."""
 
 import json
+import re
+import subprocess
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 from arm import write_arm
+from environments import environment
 from runs import corrects_by
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
+from gaponet.model.artifact import GapModel
 from gaponet.sim.replay import replay
 from gaponet.training.config import TrainConfig
 from gaponet_interop.engine import actuator_net
-from gaponet_interop.engine.actuator_net import ActuatorNet, export_actuator_net
+from gaponet_interop.engine.actuator_net import ActuatorNet
+from gaponet_interop.engine.folder import export_networks
 from gaponet_interop.engine.forms import own_motions
 from gaponet_interop.engine.mujoco_servos import read
 
@@ -76,7 +81,19 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_
 
 
 def test_a_payload_that_nobody_recorded_is_refused(run, tmp_path):
-    from gaponet.model.artifact import GapModel
-
     with pytest.raises(UsageError, match=r"made with 0.2 kg"):
-        export_actuator_net(GapModel.load(run), run, tmp_path, payload_mass=0.2)
+        export_networks(GapModel.load(run), run, tmp_path, payload_mass=0.2)
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize(
+    ("name", "package", "check"),
+    [("mjlab-1.6", "mjlab==1.6.*", "check.py"), ("newton", "newton[sim,onnx]", "check_newton.py")],
+)
+def test_engines_play_the_networks_as_plain_mujoco_does_here(run, tmp_path, name, package, check):
+    made = export_networks(GapModel.load(run), run, tmp_path)
+    python = environment(name, "3.11", (package,))
+    said = subprocess.run([python, check], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    there, here = re.findall(r": ([\d.]+) mrad; in gaponet ([\d.]+)", said)[0]
+    assert float(here) == pytest.approx(1e3 * made.left["actuator networks"], abs=0.01)
+    assert float(there) == pytest.approx(float(here), rel=0.05, abs=0.05)

@@ -23,7 +23,7 @@ ENGINES = {  # name → what is exported, what is run, Python, what is installed
     "mjx": ("mjcf", "check_mjx.py", "3.11", ("mujoco-mjx",)),
     "isaaclab-3": ("isaaclab", "check.py", "3.12", ("isaaclab==3.*", "mujoco-usd-converter")),
     "drake": ("drake", "check.py", "3.12", ("drake",)),
-    "newton": ("newton", "check.py", "3.11", ("newton[sim]",)),
+    "newton": ("newton", "check.py", "3.11", ("newton[sim,onnx]",)),
 }
 
 
