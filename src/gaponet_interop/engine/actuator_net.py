@@ -124,7 +124,7 @@ def _length(facts: dict[str, Any]) -> int:
 def _fitted(
     sequences: ListOf[Sequence], twins: ListOf[Any], robot: RobotSpec, facts: dict[str, Any]
 ) -> dict[str, ActuatorNet]:
-    """By joint; those that are not operated have the servo alone."""
+    """A network of each joint; those that are not operated have the servo alone."""
     step, length = facts["options"]["timestep"], _length(facts)
     nets = {name: ActuatorNet(joint, step, length) for name, joint in facts["joints"].items()}
     rng = np.random.default_rng(0)
