@@ -314,20 +314,20 @@ class _Judge:
         return np.asarray((total / np.maximum(count, 1)).sum(axis=0) / np.maximum((count > 0).sum(axis=0), 1))
 
     def best(self, candidates: dict[str, Values]) -> tuple[str, Values]:
-        """Name and values of what does best: an earlier one where it is not beaten by more than a hundredth; what was
-        chosen joint by joint where that is surely better."""
-        names = list(candidates)
+        """Name and values of what does best: the first fit; another one where it is surely better, or by a tenth; what
+        was chosen joint by joint where it is surely better; the given robot where no fit is better by a hundredth."""
+        given, first, *others = candidates
         joints = np.array([self.by_joint(v) for v in candidates.values()])
         which = joints.argmin(axis=0)
         if len(set(which.tolist())) > 1:  # what did best for each joint: may do best for all
             fields = set.intersection(*(set(v) for v in candidates.values()))
             rows = {f: np.stack([v[f] for v in candidates.values()]) for f in fields}
             candidates = candidates | {"mixed": {f: x[which, np.arange(len(which))] for f, x in rows.items()}}
-        costs, name = {name: self.errors(v) for name, v in candidates.items()}, names[0]
-        for other in names:
-            name = other if costs[other].mean() < (1 - BETTER) * costs[name].mean() else name
-        if "mixed" in candidates and Tried("mixed", costs[name], costs["mixed"]).kept:
-            name = "mixed"
+        costs, name = {name: self.errors(v) for name, v in candidates.items()}, first
+        for other in (*others, *(candidates.keys() & {"mixed"})):
+            far = other != "mixed" and costs[other].mean() < (1 - ALONE_BETTER) * costs[name].mean()
+            name = other if far or Tried(other, costs[name], costs[other]).kept else name
+        name = name if costs[name].mean() < (1 - BETTER) * costs[given].mean() else given
         return name, candidates[name]
 
 

@@ -243,12 +243,12 @@ class TorqueFit:
         low, high = (np.stack([ends[f] for f in scale], axis=1) for ends in (least, most))
 
         def values(x: Array) -> dict[str, Array]:
-            moved = {f: first[f] + x[..., i] * scale[f] for i, f in enumerate(scale)}
-            return {f: np.broadcast_to(v, x.shape[:2]) for f, v in first.items()} | moved
+            moved = {f: first[f] + x[..., i] * scale[f] for i, f in enumerate(scale)}  # at the least 0, or −1e-20
+            known = {f: np.broadcast_to(v, x.shape[:2]) for f, v in first.items()}
+            return known | {f: v if f == "offset" else np.maximum(v, 0) for f, v in moved.items()}
 
         def errors(x: Array) -> Array:
-            own = alone.errors(values(x)).reshape(*x.shape[:2], -1)
-            return np.concatenate([own, how[2] * x], axis=2) / SOFT
+            return np.concatenate([alone.errors(values(x)).reshape(*x.shape[:2], -1), how[2] * x], axis=2) / SOFT
 
         x, _ = descend(
             np.zeros((1, *low.shape)) + LATE * (np.array([*scale]) == "delay"), low, high, errors, ITERATIONS
