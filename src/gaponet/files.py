@@ -32,8 +32,10 @@ _held: set[tuple[str, int]] = set()  # folders of this process's threads
 
 
 @contextmanager
-def whole(path: Path) -> Iterator[Path]:
+def whole(path: Path, named: bool = True) -> Iterator[Path]:
     """Give a name beside path to write to; what is there when the block ends well takes path's place, on the disk.
+
+    Where it is not `named`, its name is not on the disk before `sync(path.parent)`, once for many files.
 
     Raises:
         OSError: It could not be written; path is as it was.
@@ -43,7 +45,8 @@ def whole(path: Path) -> Iterator[Path]:
         yield temporary
         sync(temporary)
         os.replace(temporary, path)
-        sync(path.parent)
+        if named:
+            sync(path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -60,6 +61,25 @@ def test_what_is_removed_leaves_no_file_and_the_rest_stays_as_it_is(dataset, seq
 def test_another_payload_of_the_same_motion_is_another_sequence(dataset, sequence):
     dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
     assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, 1.0]
+
+
+def test_of_many_none_is_listed_twice_or_lost_where_the_block_ends_badly(dataset, sequence):
+    masses = [float(mass) for mass in range(1, 6)]
+    some = [replace(sequence, meta=replace(sequence.meta, payload_mass=mass)) for mass in masses]
+    with suppress(KeyboardInterrupt), dataset.appending():
+        for s in some[:3]:
+            dataset.append(s)
+        with pytest.raises(DatasetError, match="already in"):
+            dataset.append(some[2])
+        raise KeyboardInterrupt
+    again = Dataset(dataset.path)
+    assert len(again) < 4
+    with again.appending():
+        for s in some:
+            if again.find(s.content_hash()) is None:
+                again.append(s)
+    assert [e.meta.payload_mass for e in Dataset(dataset.path).entries] == [0.0, *masses]
+    assert len(Dataset(dataset.path).sequences()) == 6
 
 
 def test_a_line_cut_short_by_a_crash_is_not_there_and_reading_leaves_it_alone(dataset, sequence):

@@ -167,16 +167,17 @@ def _import(
     present = [entry for digest, _ in digests if (entry := dataset.find(digest))]
     taken = Counter(e.meta.slot for e in dataset.entries)
     added = []
-    for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
-        if rests is not None:
-            rests[digest] = Holds.of(sequence, robot.operated_index)
-        if dataset.find(digest):
-            continue
-        slot = sequence.meta.slot
-        if sequence.meta.repetition < 0:  # the format does not state it
-            sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
-        added.append(dataset.append(sequence, findings(sequence), digest))
-        taken[slot] += 1
+    with dataset.appending():
+        for (digest, _), sequence in zip(digests, held if size <= HOLD else again, strict=True):
+            if rests is not None:
+                rests[digest] = Holds.of(sequence, robot.operated_index)
+            if dataset.find(digest):
+                continue
+            slot = sequence.meta.slot
+            if sequence.meta.repetition < 0:  # the format does not state it
+                sequence = replace(sequence, meta=replace(sequence.meta, repetition=taken[slot]))
+            added.append(dataset.append(sequence, findings(sequence), digest))
+            taken[slot] += 1
     return dataset, added, present
 
 

@@ -157,7 +157,7 @@ class Survey:
             torque=_torque(sequence, robot),
             holds=Holds.of(sequence, robot.operated_index),
             response=Response.of(ctrl, qpos, dt),
-            spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]),
+            spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
             **_kind(sequence),
             halted_s=_halted(ctrl, qpos, dt),
             loads=_loads(sequence),

@@ -42,8 +42,8 @@ class Standing:
         op, meta = robot.operated_index, sequence.meta
         sequence = sequence.rows(slice(None, None, max(1, round(1 / (RATE * sequence.dt)))))
         still = np.flatnonzero(np.abs(sequence.qvel[:, op]).max(axis=1) < STANDS)
-        qpos = sequence.qpos[still].astype(float)
-        load = gravity(qpos, meta.payload_mass, meta.payload_side)[:, op]
+        qpos = sequence.qpos[still]  # of a hundred hours, all of these are kept
+        load = gravity(qpos.astype(float), meta.payload_mass, meta.payload_side)[:, op].astype(np.float32)
         torque = np.zeros(len(still)) if sequence.tau is None else np.abs(sequence.tau)[still][:, op].max(axis=1)
         return Standing(meta.motion, heights(sequence)[still], (sequence.ctrl[still] - qpos)[:, op], load, torque)
 
