@@ -10,8 +10,8 @@ from gaponet.spread import Table
 
 
 def mrad(value: float | None) -> str:
-    """rad → milliradian text."""
-    return "–" if value is None else f"{value * 1e3:.2f}"
+    """rad → milliradian text; a dash where there is none, as of the standard error over one motion."""
+    return "–" if value is None or value != value else f"{value * 1e3:.2f}"
 
 
 def totals(

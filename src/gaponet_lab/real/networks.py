@@ -18,7 +18,7 @@ from gaponet.training.budget import Budget
 from gaponet.training.config import TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
 from gaponet_lab.real.questions import Question, rehearsal
-from gaponet_lab.real.rivals import Answer, Method, fitted, identified, nominal
+from gaponet_lab.real.rivals import LEFT_OUT, Answer, Method, fitted, identified, nominal
 
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
@@ -70,5 +70,5 @@ def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
     worth = Added(base, val["added"], val.get("error", np.nan), val["start"])
     told = f"{100 * worth.less / worth.left:.0f} % less on validation"
     if not worth.helps:
-        return replace(start, note=f"left out: {told}")
+        return replace(start, note=f"{LEFT_OUT}: {told}")
     return replace(start, corrector=model.corrector(start.robot), note=told)

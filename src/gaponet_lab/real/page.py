@@ -11,6 +11,7 @@ import numpy as np
 from gaponet.files import write_text
 from gaponet_lab.plot.colours import colour, shade
 from gaponet_lab.plot.style import figure, legend, save, styled
+from gaponet_lab.real.rivals import LEFT_OUT
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,11 +49,18 @@ recorded start. ± is the standard error over independent motions, of difference
 def table(rows: list[dict[str, Any]]) -> list[list[str]]:
     """Cells; ± is the standard error over independent motions, of differences paired."""
     return [
-        [r["set"], r["question"], r["method"], _pm(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
+        [r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
+         _pm(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
          "" if i == 0 or not r["less_than_nominal"] else _pm(r["less_than_nominal"], r["less_standard_error"]),
          "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", str(r["motions"]), str(r["recordings"])]
         for i, r in enumerate(rows)
     ]  # fmt: skip
+
+
+def _left_out(notes: tuple[str, ...]) -> str:
+    """That validation left a network out, of so many that were trained."""
+    count = sum(note.startswith(LEFT_OUT) for note in notes)
+    return f" ({LEFT_OUT} in {count} of {len(notes)})" if count else ""
 
 
 def _pm(value: float, error: float | None) -> str:

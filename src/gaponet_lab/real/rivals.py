@@ -19,6 +19,7 @@ from gaponet.sim.refit import refit
 from gaponet.sim.replay import Corrector, replay
 from gaponet_lab.real.questions import Question, recorded, rehearsal
 
+LEFT_OUT = "left out"  # by validation: begins a note
 SECONDS = 30.0  # of the test's own session that calibration may use
 
 
