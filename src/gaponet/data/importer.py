@@ -220,9 +220,10 @@ def _meta(log: Log, motion: str, src: Path, robot: RobotSpec, given: _Given, sha
         flag = "--" + name.replace("_", "-")
         if value is not None and name in stated and stated[name] != value:
             raise UsageError(f"{log.source}: {flag} {value} contradicts the file's {stated[name]}; leave it out")
-        if value is None and name in ("unit_id", "payload_mass") and name not in stated:
-            example = "0 (kg in each hand, 0 when empty)" if name == "payload_mass" else "NAME"
-            raise UsageError(f"{log.source}: this format does not say it: give {flag} {example}")
+    needed = {"unit_id": "--unit-id NAME", "payload_mass": "--payload-mass 0 (kg in each hand, 0 when empty)"}
+    missing = [flag for name, flag in needed.items() if said[name] is None and name not in stated]
+    if missing:
+        raise UsageError(f"{log.source}: this format does not say it: give {' and '.join(missing)}")
     fields: dict[str, Any] = {"source": _relative(log.source, src), "source_sha256": sha256, "repetition": UNSTATED}
     fields |= {name: value for name, value in said.items() if value is not None}
     return SequenceMeta(**(fields | {"robot": robot.name, "motion": motion} | stated))
