@@ -192,7 +192,7 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
 def halves(folder: Path, day: Path, other: Path, work: Path) -> None:
     """Identified from each half of a day's motions and asked of the other, and of both days' logs under one name."""
     data, there = Dataset(day), Dataset(other)
-    robot, logs = load_robot(folder), data.sequences(data.entries)
+    robot, logs = load_robot(str(folder)), data.sequences(data.entries)  # a name or a folder
     later, file = there.sequences(there.entries), work / "halves.json"
     lines = json.loads(file.read_text()) if file.is_file() else []
     for k in range(len(lines), 2):

@@ -126,5 +126,6 @@ def _tell(screen: Out, spec: RobotSpec, now: dict[str, dict[str, float]], then: 
         part = fields[start : start + WIDE]
         title = f"{spec.name}: standard errors, now → expected" if start == 0 else "The same"
         screen.table(title, ["joint", *(COLUMNS[f][0] for f in part)], [
-            [j, *(f"{now[j][f] * COLUMNS[f][1]:.2g} → {then[j][f] * COLUMNS[f][1]:.2g}" for f in part)] for j in now
+            [j, *(" → ".join(f"{float(f'{by[j][f] * COLUMNS[f][1]:.2g}'):g}" for by in (now, then)) for f in part)]
+            for j in now
         ])  # fmt: skip
