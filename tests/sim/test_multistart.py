@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaponet.sim.multistart import better_half, descend, step
+from gaponet.sim.multistart import agreed_slopes, better_half, descend, step
 
 POINTS = np.linspace(-1, 1, 60)
 
@@ -41,3 +41,14 @@ def test_a_step_ends_at_the_edge_and_the_rest_is_solved_anew():
     normal = np.array([[2.0, 1.0], [1.0, 2.0]])
     found = step(normal, np.array([-4.0, 0.0]), np.array([-9.0, -9.0]), np.array([1.0, 9.0]), np.array(0.0))
     assert found == pytest.approx([1.0, -0.5], abs=1e-6)
+
+
+def test_a_slope_counts_where_both_sides_agree():
+    """A joint at the edge of breaking loose goes far to one side: it does not tell the parameter."""
+    errors = lambda x: np.concatenate([3 * x, 50 * np.maximum(x, 0), -np.abs(x)], axis=-1)  # noqa: E731
+    at, low, high = np.zeros((1, 1, 1)), np.full((1, 1), -9.0), np.full((1, 1), 9.0)
+    _, slopes = agreed_slopes(at, low, high, errors)
+    np.testing.assert_allclose(slopes[0, 0, :, 0], [3, 0, 0], atol=1e-6)
+    for edge in ((np.zeros((1, 1)), high), (low, np.zeros((1, 1)))):  # at a bound there is one side
+        _, slopes = agreed_slopes(at, *edge, errors)
+        assert abs(slopes[0, 0, 2, 0]) == pytest.approx(1)

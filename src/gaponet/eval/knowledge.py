@@ -46,7 +46,7 @@ class JointKnown:
         step, step_covariance: How far the recordings move fields and play, joints one by one; (P + 1), (P + 1, P + 1).
         scatter: How much farther windows pull apart than independent rows would, (P + 1).
         predicted: Standard deviation of a predicted position by the covariance alone, rad.
-        left, band: RMS error of whole motions that were not fitted, and what 9 of 10 samples are within, rad.
+        left, band: RMS error of motions that were not fitted, and what 9 of 10 samples of others should be within, rad.
     """
 
     values: tuple[float, ...]

@@ -26,7 +26,7 @@ from gaponet.sim.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
 from gaponet.sim.free_runs import FreeRuns, cut
 from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.model import build_model
-from gaponet.sim.multistart import better_half, descend, slopes
+from gaponet.sim.multistart import agreed_slopes, better_half, descend
 from gaponet.sim.shared import far_from_published, same_servos, share
 from gaponet.sim.touching import Touch, fit_table, low_windows, tip_heights, touching_below
 from gaponet.text import measured
@@ -479,7 +479,8 @@ class Fit:
         names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
         axes, runs = Axes(self.bounds, names, values), self.runs if self.company is None else self.company
         x = axes.of(values)
-        here, jac = (y[0] for y in slopes(x[None], axes.high, lambda xs: self.errors(axes.values(xs), runs)))
+        asked = agreed_slopes(x[None], axes.low, axes.high, lambda xs: self.errors(axes.values(xs), runs))
+        here, jac = (y[0] for y in asked)
         weight = 1 / np.sqrt(1 + here**2)
         pull = jac * (weight * here)[..., None]  # (n, rows + 2, P)
         window = runs.window

@@ -83,6 +83,13 @@ def slopes(x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
     return found[0], np.moveaxis(jac, 0, -1)
 
 
+def agreed_slopes(x: Array, low: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
+    """Errors and slopes of `slopes`, those that both sides agree on: of two the smaller, none where they have other
+    signs. A joint that rests at the edge of breaking loose goes far for a step to one side, and that is no slope."""
+    (here, ahead), (_, behind) = (slopes(x, h, errors) for h in (high, np.where(x - STEP < low, high, x)))
+    return here, np.where(ahead * behind > 0, np.sign(ahead) * np.minimum(abs(ahead), abs(behind)), 0)
+
+
 def step(normal: Array, slope: Array, low: Array, high: Array, damping: Array) -> Array:
     """Minima of damped quadratics inside boxes, (…, P): what leaves a box is held at its edge, the rest solved anew."""
     size = slope.shape[-1]

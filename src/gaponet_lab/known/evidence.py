@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.eval.knowledge import JointKnown, Knowledge, Source, believed, seen
+from gaponet.metrics import standard_error
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sim.free_runs import cut
+from gaponet.sim.identify import SURE
 from gaponet.sim.joint_runs import SOFT, JointRuns
 from gaponet.sim.multistart import slopes
 from gaponet.sim.replay import replay
@@ -176,12 +179,12 @@ def known(
             own = inverted(inverted(own) + np.diag(believed(fields, values[joint]) ** -2))
         normal = says.normals[i].sum(axis=0)[:-1, :-1]
         predicted = SOFT * float(np.sqrt(max(np.trace(own @ normal), 0.0) / max(says.rows[i], 1)))
-        error = left[joint]
+        error = np.concatenate(left[joint])
         rest = before and not judges and before.joints[joint]
         joints[joint] = JointKnown(
             _plain(values[joint]), _plain(own), _plain(step[i]), _plain(step_covariance[i]), _plain(scatter[i]),
             predicted, max(float(np.sqrt(np.mean(error**2))), rest.left if rest else 0.0),
-            max(float(np.quantile(error, BAND)), rest.band if rest else 0.0),
+            max(_band(left[joint]), rest.band if rest else 0.0),
         )  # fmt: skip
     source: Source = {
         "made_by": "identify" if judges or covariances else "calibrate",
@@ -194,16 +197,24 @@ def known(
     return Knowledge(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
 
 
-def _left(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, Array]:
-    """Joint → |error| of every row that holds it, motions in free run, rad; where none does, the worst joint's."""
+def _left(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:
+    """Joint → |error| of every motion that holds it, in free run, rad; where none does, the worst joint's."""
     twins = replay(sequences, robot, nthread=nthread, lock_idle=True)
     pairs = [(s.meta.unrecorded, np.abs(t.qpos - s.qpos)[1:]) for s, t in zip(sequences, twins, strict=True)]
     found = {}
     for j, i in zip(robot.operated, robot.operated_index, strict=True):
         if mine := [error[:, i] for silent, error in pairs if j not in silent]:
-            found[j] = np.concatenate(mine)
-    worst = max(found.values(), key=lambda error: float(np.square(error).mean()), default=np.zeros(1))
+            found[j] = mine
+    worst = max(found.values(), key=lambda each: float(np.square(np.concatenate(each)).mean()), default=[np.zeros(1)])
     return {j: found.get(j, worst) for j in robot.operated}
+
+
+def _band(motions: ListOf[Array]) -> float:
+    """What 9 of 10 samples of other motions should be within, from |error| of some: wider than of these by one standard
+    error (Student's) of the mean of their RMS."""
+    rms, few = np.array([np.sqrt(np.square(error).mean()) for error in motions]), len(motions) - 1
+    wider = float(stdtrit(few, SURE)) * standard_error(rms) / max(float(rms.mean()), 1e-12) if few else 0.0
+    return float(np.quantile(np.concatenate(motions), BAND)) * (1 + wider)
 
 
 def _plain(x: Array) -> Any:

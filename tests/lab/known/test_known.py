@@ -14,6 +14,7 @@ from gaponet.errors import RobotError
 from gaponet.eval.knowledge import Knowledge, values_of
 from gaponet.robot import load_robot
 from gaponet.robot_folder import save_robot
+from gaponet.sim.replay import replay
 from gaponet_lab.known.drift import drift
 from gaponet_lab.known.evidence import known
 
@@ -95,6 +96,18 @@ def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_
     judged = known(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
     assert judged.left > 10 * both["elbow"].left
     assert judged.values == both["elbow"].values
+
+
+def test_a_band_is_wider_where_few_motions_differ_much(arm, folder):
+    robot, judges = load_robot(folder), played(arm, 20, 4)
+    alike = known(robot, judges, judges, nthread=1).joints["elbow"]
+    apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
+    twins = replay(apart, robot, nthread=1, lock_idle=True)
+    pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, twins, strict=True)])
+    wide = known(robot, judges, apart, nthread=1).joints["elbow"].band
+    assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.band
+    one = known(robot, judges, judges[:1], nthread=1).joints["elbow"].band
+    assert np.isfinite(one)
 
 
 def test_more_seconds_make_it_surer_and_are_told(arm, folder):
