@@ -10,11 +10,13 @@ from logs import arm_sequence, late, wave
 from gaponet.data.store import Dataset
 from gaponet.errors import UsageError
 from gaponet.robot import available, load_robot
+from gaponet.robot_folder import save_robot
+from gaponet_lab.real import networks as brief
 from gaponet_lab.real.adversaries import ADVERSARIES
 from gaponet_lab.real.bench import Bench, load_method
 from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
 from gaponet_lab.real.questions import floor, questions
-from gaponet_lab.real.rivals import METHODS
+from gaponet_lab.real.rivals import LEFT_OUT, METHODS
 
 PAGE = Path(__file__).parents[2] / "docs" / "benchmark.md"
 
@@ -86,6 +88,27 @@ def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, play
     assert [s.meta.payload_mass for s in asked.test] != [s.meta.payload_mass for s in question.test]
     assert sorted(s.meta.payload_mass for s in asked.test) == sorted(s.meta.payload_mass for s in question.test)
     assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "asked_labels"))
+
+
+def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_identified_robot(
+    arm, played, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(brief, "BRIEF", replace(brief.BRIEF, num_envs=12, gradient_steps=2, sensor_states=16))
+    (question,) = questions("new motions", played, arm, None)
+    methods = {title: method for title, method in brief.networks(240).values() if title != "shared MLP"}
+    with pytest.raises(UsageError, match="networks need a folder"):
+        methods["GAPONet"](question)
+    question = replace(question, work=tmp_path)
+    save_robot(arm, tmp_path / "identified")
+    beside, above = (method(question) for method in methods.values())
+    assert beside.corrector is not None
+    assert not beside.note.startswith(LEFT_OUT)
+    assert (above.corrector, above.note.partition(":")[0]) == (None, LEFT_OUT)
+    cards = [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
+    assert len(cards) == 2
+    again = methods["GAPONet"](question)
+    assert again.note == beside.note
+    assert cards == [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
 
 
 def test_the_method_on_the_page_is_one(arm, played, tmp_path):

@@ -46,7 +46,7 @@ def _recipe(steps: int) -> TrainConfig:
 
 
 def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
-    """The simulator with its network, or without where `gaponet train` says that it adds nothing."""
+    """The simulator with its network; the identified one without where `gaponet train` says that it adds nothing."""
     if question.work is None:
         raise UsageError(f"{question.name}: networks need a folder to be trained in")
     start = BASES[base](question)
@@ -69,6 +69,6 @@ def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
     val = model.card["val_mpjae"]
     worth = Added(base, val["added"], val.get("error", np.nan), val["start"])
     told = f"{100 * worth.less / worth.left:.0f} % less on validation"
-    if not worth.helps:
+    if base and not worth.helps:
         return replace(start, note=f"{LEFT_OUT}: {told}")
     return replace(start, corrector=model.corrector(start.robot), note=told)
