@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from arm import recordings, write_arm
+from arm import TOML, recordings, write_arm
 
+from gaponet.robot import Table
 from gaponet.sim.replay import replay
 from gaponet.training.labels import trajectory_labels
 
@@ -37,3 +38,14 @@ def test_a_joint_that_nobody_recorded_has_no_label(tmp_path):
     labels = trajectory_labels([replace(sequence, meta=meta)], robot, 0.5)
     assert np.isnan(labels[:, 1]).all()
     assert np.isfinite(labels[:, 0]).all()
+
+
+def test_where_a_tip_is_at_the_table_there_is_no_label(tmp_path):
+    robot = write_arm(tmp_path, toml=TOML + '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n')
+    sequences = recordings(robot, 2, rows=100)
+    q = np.concatenate([s.qpos for s in sequences])
+    tip = -0.2 * (np.sin(q[:, 0]) + np.sin(q.sum(1)))
+    table = replace(robot, table=Table(float(np.median(tip)) - 0.01))
+    labels = trajectory_labels(sequences, table, 0.5)
+    assert (np.isnan(labels).all(1) == (tip < np.median(tip))).mean() > 0.98
+    assert np.isfinite(trajectory_labels(sequences, robot, 0.5)).all()

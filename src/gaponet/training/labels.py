@@ -19,17 +19,20 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 from gaponet.sim.replay import replay
+from gaponet.sim.touching import tip_heights
 
 ITERATIONS, GAIN = 6, 0.6
 LEAD, SMOOTH = 0.1, 0.06  # s: how much later a correction shows, σ of the filter
+TOUCHING = 0.01  # m above the table
 
 
 def trajectory_labels(
     sequences: ListOf[Sequence], robot: RobotSpec, limit: float, nthread: int = 0, tick: Callable[[], object] = bool
 ) -> Array:
-    """Δa* of the operated joints within ±limit rad, (rows of all recordings, n); NaN where a joint was not recorded.
+    """Δa* of the operated joints within ±limit rad, (rows of all recordings, n).
 
-    Of every recording the iteration that followed it best; tick is called in each.
+    Of every recording the iteration that followed it best; tick is called in each. NaN where a joint was not recorded,
+    and where a tip is at the robot's table: what a contact takes no correction explains.
     """
     op = robot.operated_index
     deltas = [np.zeros((len(s), len(op))) for s in sequences]
@@ -45,6 +48,9 @@ def trajectory_labels(
             deltas = [_bettered(*x, limit) for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)]
     labels = np.concatenate([d for _, d in best]).astype(np.float32)
     silent = [np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences]
+    if robot.table is not None:
+        low = robot.table.height + TOUCHING
+        silent = [m | (h < low)[:, None] for m, h in zip(silent, tip_heights(sequences, robot), strict=True)]
     return np.where(np.concatenate(silent), np.nan, labels).astype(np.float32)
 
 
