@@ -27,6 +27,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.metrics import standard_error
+from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay
@@ -136,12 +137,34 @@ class Rows:
             return trees(self.bench, robot, self.labels(robot), seed)
         if kind == SHUFFLED:
             return trees(self.bench, robot, of_others(self.bench, self.labels(robot)), seed)
-        folder = self.bench.work / f"{kind}-{seed}"
+        return GapModel.load(self.trained(kind, robot, seed)).corrector(robot)
+
+    def trained(self, kind: str, robot: RobotSpec, seed: int) -> Path:
+        """The folder of gaponet train as it comes, or with an option: gaponet:model.sensors=off."""
+        folder, (model, *more) = self.bench.work / f"{kind}-{seed}", kind.split(":")
         if not (folder / "model" / "card.json").is_file():
-            run("train", self.bench.data.path, "--robot", robot.folder, "--out", folder, "--model", kind,
+            run("train", self.bench.data.path, "--robot", robot.folder, "--out", folder, "--model", model,
                 "--budget", self.budget, "--seed", seed, *self.held_out(),
+                *[word for option in more for word in f"--{option}".split("=")],
                 *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
-        return GapModel.load(folder).corrector(robot)
+        return folder
+
+    def calibrated(self, robot: RobotSpec, kinds: ListOf[str]) -> dict[str, Errors]:
+        """With 30 s of the unit, motions trained on: the robot folder, and under the first network."""
+        out = self.bench.work / "calibrated"
+        if not (out / "robot.toml").is_file():
+            run("calibrate", robot.folder, self.bench.data.path, "--unit", UNIT, "--out", out, "--motions",
+                *sorted({s.meta.motion for s in self.bench.train}))  # fmt: skip
+        found = {"calibrated": [self.errors("calibrated", load_robot(out))]}
+        for kind in kinds:
+            folder = self.trained(kind, robot, 0)
+            model = GapModel.load(folder)
+            if UNIT not in calibration.Calibration.load(folder, model.weights_hash()):
+                run("calibrate", folder, self.bench.data.path, "--unit", UNIT)
+            own = calibration.Calibration.load(folder, model.weights_hash())[UNIT].robot(robot)
+            name = f"{kind}, calibrated"
+            found[name] = [self.errors(name, own, partial(model.corrector, robot))]
+        return found
 
     def all(self, kinds: ListOf[str], seeds: int) -> dict[str, Errors]:
         """Row by row, seed by seed."""
@@ -195,10 +218,13 @@ def main() -> None:
     parser.add_argument("--recipe", type=Path, default=RECIPE)
     parser.add_argument("--data", type=Path, help="learn from these recordings, not from the fleet's")
     parser.add_argument("--rows", nargs="*", default=["gaponet", "shared_mlp", "trees", SHUFFLED])
+    parser.add_argument("--calibrate", action="store_true", help="also with 30 s of the unit, seed 0")
     args = parser.parse_args()
     bench = Bench.of(args.fleet, args.recipe, args.work)
     bench = learning_from(bench, Dataset(args.data)) if args.data else bench
-    found = Rows(bench, args.budget).all(args.rows, args.seeds)
+    rows = Rows(bench, args.budget)
+    found = rows.all(args.rows, args.seeds)
+    found |= rows.calibrated(rows.identified(), [k for k in args.rows if k == "gaponet"]) if args.calibrate else {}
     ends = len(bench.val)
     for name, part, own in (("validation", bench.val, slice(0, ends)), ("test", bench.test, slice(ends, None))):
         print(table({k: [e[own] for e in v] for k, v in found.items()}, part, name).markdown(), "\n")

@@ -42,7 +42,7 @@ def isaaclab_actuators(folder: Path) -> dict[str, Any]:
             joint_names_expr=[name], network_file=str(folder / f"{name}.pt"), pos_scale=1.0, vel_scale=1.0,
             torque_scale=1.0, input_order="pos_vel", input_idx=list(range(facts["actuator_net"]["length"])),
             saturation_effort=MOST, velocity_limit=MOST, armature=joint["armature"], friction=joint["frictionloss"],
-            **{limit: joint["effort_limit"]},
+            viscous_friction=joint["damping"], **{limit: joint["effort_limit"]},
         )
         for name, joint in facts["joints"].items()
     }  # fmt: skip
