@@ -29,14 +29,3 @@ def test_the_oracle_is_one_control_period_of_the_simulator(tmp_path):
         mujoco.mj_step(model, data, robot.decimation)
         expected = np.concatenate([data.qpos - q[0], 0.02 * (data.qvel - v[0])])
         np.testing.assert_allclose(answer[0, k], expected, atol=1e-7)
-
-
-def test_absolute_answers_are_the_next_state(tmp_path):
-    robot = write_arm(tmp_path)
-    q, v = np.array([[0.2, -0.1], [0.1, 0.0]]), np.array([[0.5, -0.3], [0.0, 0.2]])
-    conditions = [(0.3, "both", 0.02)] * 2
-    delta, absolute = (
-        ProbeOracle(robot, ModelConfig(num_probes=4, sensor_target=target), conditions)(q, v)
-        for target in ("delta", "absolute")
-    )
-    np.testing.assert_allclose(absolute, delta + np.concatenate([q, 0.02 * v], axis=1)[:, None], atol=1e-6)

@@ -48,8 +48,6 @@ class ModelConfig:
     """Probe that reads inertia, payload and saturation, rad."""
     sensors: Literal["predicted", "off"] = "predicted"
     """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only."""
-    sensor_target: Literal["delta", "absolute"] = "delta"
-    """delta: a probe's answer is [q' − q, Δt·(q̇' − q̇)]. absolute: [q', Δt·q̇']."""
     branch_history: bool = True
     """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
     can be corrected (docs/log.md)."""

@@ -33,7 +33,6 @@ class ProbeOracle:
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
         self.sim = sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
-        self.absolute = config.sensor_target == "absolute"
         self.operated = np.array([sim.joint_names.index(name) for name in robot.operated])
         self.target = np.zeros(sim.qpos.shape)
 
@@ -55,7 +54,7 @@ class ProbeOracle:
             qpos, qvel: States of the joints, (k, n_free), one per slot.
 
         Returns:
-            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] where sensor_target is absolute.
+            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints.
         """
         k, m, op, sim = len(qpos), len(self.offsets), self.operated, self.sim
         rows, each = np.arange(k * m), np.repeat(np.arange(k), m)
@@ -65,8 +64,6 @@ class ProbeOracle:
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)
-        moved, sped = sim.qpos[rows][:, op], sim.qvel[rows][:, op]
-        if not self.absolute:
-            moved, sped = moved - q[:, op], sped - v[:, op]
-        sped = sped * self.dt[each][:, None]
+        moved = sim.qpos[rows][:, op] - q[:, op]
+        sped = (sim.qvel[rows][:, op] - v[:, op]) * self.dt[each][:, None]
         return np.concatenate([moved, sped], axis=1).astype(np.float32).reshape(k, m, 2 * len(op))

@@ -23,7 +23,6 @@ from gaponet.sim.touching import tip_heights
 
 ITERATIONS, GAIN = 6, 0.6
 LEAD, SMOOTH = 0.1, 0.06  # s: how much later a correction shows, σ of the filter
-TOUCHING = 0.01  # m above the table
 
 
 def trajectory_labels(
@@ -47,11 +46,10 @@ def trajectory_labels(
         if iteration < ITERATIONS:
             deltas = [_bettered(*x, limit) for x in zip(deltas, errors, (s.dt for s in sequences), strict=True)]
     labels = np.concatenate([d for _, d in best]).astype(np.float32)
-    silent = [np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences]
+    silent = np.concatenate([np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences])
     if robot.table is not None:
-        low = robot.table.height + TOUCHING
-        silent = [m | (h < low)[:, None] for m, h in zip(silent, tip_heights(sequences, robot), strict=True)]
-    return np.where(np.concatenate(silent), np.nan, labels).astype(np.float32)
+        silent[np.concatenate(tip_heights(sequences, robot)) < robot.table.height + 0.01] = True  # m
+    return np.where(silent, np.nan, labels).astype(np.float32)
 
 
 def _bettered(delta: Array, error: Array, dt: float, limit: float) -> Array:
