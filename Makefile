@@ -48,7 +48,7 @@ live: setup
 peers: setup
 	$(BIN)/python -m pytest -m peers -s tests/robots
 
-# MuJoCo, MJX, mjlab, Isaac Lab and Newton (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
+# MuJoCo, MJX, mjlab, Isaac Lab, Newton and Drake (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
 # and mjlab and Isaac Lab train in one: half an hour.
 engines: setup
 	$(BIN)/python -m pytest -m peers -s tests/interop/engine
