@@ -1,10 +1,13 @@
 """A user's URDF or SDF takes along what its tags hold, and is told what they do not."""
 
+import json
+import subprocess
 import xml.etree.ElementTree as ET
 
 import mujoco
 import pytest
 from arm import write_arm
+from environments import environment
 
 from gaponet.cli.main import main
 from gaponet.errors import RobotError, UsageError
@@ -25,7 +28,8 @@ URDF = f"""<robot name="arm"><!-- by hand -->
     <dynamics friction="0.5"/></joint>
   <joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><axis xyz="0 1 0"/>
     <limit effort="9" velocity="3" lower="-1.5" upper="1.5"/></joint>
-  <transmission name="t"><joint name="elbow"><hardwareInterface>e</hardwareInterface></joint></transmission>
+  <transmission name="t"><type>t</type><joint name="elbow"><hardwareInterface>e</hardwareInterface></joint>
+  </transmission>
 </robot>
 """
 SDF = """<sdf version="1.9"><model name="arm"><link name="a"/><link name="b"/><link name="c"/>
@@ -82,3 +86,23 @@ def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, cap
         export_robot(robot, "urdf", tmp_path / "c", source=file)
     assert main(["export", str(robot.folder), "--to", "urdf", "--into", str(file)]) == 2
     assert "no joint 'shoulder'" in capsys.readouterr().err
+
+
+DRAKE = """
+import json, sys
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+plant = MultibodyPlant(0.001)
+Parser(plant).AddModels(sys.argv[1])
+print(json.dumps({name: plant.GetJointByName(name).default_damping() for name in ("shoulder", "elbow")}))
+"""
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize(("name", "text"), [("mine.urdf", URDF), ("mine.sdf", SDF)])
+def test_drakes_parser_reads_the_damping(robot, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / name)
+    python = environment("drake", "3.12", ("drake",))
+    done = subprocess.run([python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"shoulder": 0.8, "elbow": 0.6}
