@@ -148,11 +148,13 @@ def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(a
 @pytest.mark.parametrize(("middle", "told"), [(0.5, True), (2.5, False)], ids=["drift", "jumps"])
 def test_a_clock_that_drifts_is_late_by_half_in_the_middle_and_motions_that_differ_are_no_drift(middle, told):
     """A trajectory generator follows quick parts of a motion later than slow ones, from one part to the next."""
-    surveys = [SimpleNamespace(response=SimpleNamespace(duration=6.0))] * 6
-    end = 0.01 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
+    surveys = [SimpleNamespace(response=SimpleNamespace(duration=12.0))] * 6
+    end = 0.02 * np.array([0.7, 0.9, 1.0, 1.0, 1.1, 1.3])
     way = middle * np.array([1, -1, 1, -1, 1, -1]) if middle > 1 else middle
-    found = list(_drift(surveys, np.stack([0 * end, way * end, end], axis=1)))
-    assert [f.check for f in found] == ["clock"] * told
+    shifts = np.stack([0 * end, way * end, end], axis=1)
+    assert [f.check for f in _drift(surveys, shifts)] == ["clock"] * told
+    short = [SimpleNamespace(response=SimpleNamespace(duration=5.0))] * 6
+    assert not list(_drift(short, shifts))
 
 
 @pytest.mark.parametrize(("ahead", "said"), [(0, False), (6, True)])

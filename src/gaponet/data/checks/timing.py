@@ -25,6 +25,7 @@ DEAD_TIMES = (
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
 DRIFT, SURE, OWN = 3e-4, 4.5, 0.7  # s a second, standard errors, and how much of one motions' own differences are
+LASTS = 10.0  # s of a recording: in less friction shifts slow parts by more than clocks do
 NOTCH = 1.5  # depth, natural logarithm of power
 WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 GAP = 2.5  # periods without a sample
@@ -115,7 +116,8 @@ def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
     between = np.array([s.response.duration for s in surveys]) * (1 - 1 / shifts.shape[1])
     slope = (shifts[:, -1] - shifts[:, 0]) / between
     bent = (shifts[:, -1] + shifts[:, 0] - 2 * shifts[:, 1]) / between / np.sqrt(3)  # of one that drifts: chance
-    slope, bent = slope[np.isfinite(slope)], bent[np.isfinite(bent)]
+    long = between >= LASTS * (1 - 1 / shifts.shape[1])
+    slope, bent = slope[np.isfinite(slope) & long], bent[np.isfinite(bent) & long]
     if len(slope) < FEW:
         return
     drift = float(np.median(slope))
