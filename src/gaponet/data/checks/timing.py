@@ -24,8 +24,7 @@ DEAD_TIMES = (
     (0.035, "as good as no dead time"), (LONG, "usual for a bus, a servo's firmware and its inertia"),
     (np.inf, "long; hobby servos have it: look for a buffer, a filter, or clocks of command and state that are apart"),
 )  # fmt: skip
-DRIFT, SURE, OWN = 3e-4, 4.5, 0.7  # s a second, standard errors, and how much of one motions' own differences are
-LASTS = 10.0  # s of a recording: in less friction shifts slow parts by more than clocks do
+DRIFT, SURE, OWN, LASTS = 3e-4, 4.5, 0.7, 10.0  # s a second; errors; what of one motions differ by; s of a recording
 NOTCH = 1.5  # depth, natural logarithm of power
 WIDTHS = np.geomspace(0.04, 0.4, 150)  # of an average, s
 GAP = 2.5  # periods without a sample
@@ -42,8 +41,7 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     told = Response.following(own, [s.motion not in odd for s in same])
     known = np.isfinite(told.onset)
     onset = float(np.median(told.onset[known])) if known.any() else np.nan
-    if known.any() and np.median(told.early[known]) < EARLY:
-        onset = max(onset, 0.0)
+    onset = max(onset, 0.0) if known.any() and np.median(told.early[known]) < EARLY else onset
     apart = SURE * _scatter(told.onset - onset)
     if onset < FIRST - step or onset < -max(-FIRST / 3, step, apart):
         text = (
@@ -113,11 +111,11 @@ def _late(surveys: list[Survey], own: list[Response]) -> Iterator[Finding]:
 
 
 def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
-    between = np.array([s.response.duration for s in surveys]) * (1 - 1 / shifts.shape[1])
-    slope = (shifts[:, -1] - shifts[:, 0]) / between
-    bent = (shifts[:, -1] + shifts[:, 0] - 2 * shifts[:, 1]) / between / np.sqrt(3)  # of one that drifts: chance
-    long = between >= LASTS * (1 - 1 / shifts.shape[1])
-    slope, bent = slope[np.isfinite(slope) & long], bent[np.isfinite(bent) & long]
+    long = (between := np.array([s.response.duration for s in surveys])) >= LASTS  # in less friction shifts more
+    between = between[long] * (1 - 1 / shifts.shape[1])
+    first, middle, last = shifts[long, 0], shifts[long, 1:-1].mean(axis=1), shifts[long, -1]
+    slope, bent = (last - first) / between, (last + first - 2 * middle) / between / np.sqrt(3)
+    slope, bent = slope[np.isfinite(slope)], bent[np.isfinite(bent)]  # of one that drifts, what bends is chance
     if len(slope) < FEW:
         return
     drift = float(np.median(slope))
