@@ -10,6 +10,7 @@ import shlex
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -91,8 +92,16 @@ class GaponetSO101(Robot):
 
     @cached_property
     def observation_features(self) -> dict[str, type | tuple]:
-        cameras = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
-        return self.action_features | cameras
+        return self.action_features | {name: shape for name, shape, _ in self._pictures()}
+
+    def _pictures(self) -> Iterator[tuple[str, tuple[int, int, int], Callable[[], Any]]]:
+        """Key, shape and reading of each camera's colours and depth, named as LeRobot's followers name them."""
+        for name, camera in self.cameras.items():
+            size = camera.height, camera.width
+            if getattr(camera, "use_rgb", True):
+                yield name, (*size, 3), camera.read_latest
+            if getattr(camera, "use_depth", False):
+                yield f"{name}_depth", (*size, 1), camera.read_latest_depth
 
     @cached_property
     def action_features(self) -> dict[str, type]:
@@ -168,7 +177,7 @@ class GaponetSO101(Robot):
             said = self._log.read_text(errors="replace").strip().splitlines() if self._process else []
             raise DeviceNotConnectedError(f"{self} is not connected, or was stopped: {' '.join(said[-2:])}")
         saw(self.units.named(state.qpos))
-        return self.units.named(state.qpos) | {name: camera.read_latest() for name, camera in self.cameras.items()}
+        return self.units.named(state.qpos) | {name: read() for name, _, read in self._pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         if self._process is None:

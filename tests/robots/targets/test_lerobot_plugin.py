@@ -58,6 +58,16 @@ def seen(gripper: float) -> dict[str, float]:
     return {f"{joint}.pos": value for joint, value in FOUND.items()} | {"gripper.pos": gripper, "camera": None}
 
 
+def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
+    wrist = SimpleNamespace(height=4, width=6, read_latest=lambda: "colours")
+    front = SimpleNamespace(**vars(wrist), use_rgb=True, use_depth=True, read_latest_depth=lambda: "depth")
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.units, robot.cameras = plugin.Units(so101), {"wrist": wrist, "front": front}
+    shapes = {"wrist": (4, 6, 3), "front": (4, 6, 3), "front_depth": (4, 6, 1)}
+    assert robot.observation_features == robot.action_features | shapes
+    assert [read() for *_, read in robot._pictures()] == ["colours", "colours", "depth"]
+
+
 def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(plugin, so101, tmp_path):
     (tmp_path / "roll.csv").write_text("time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5)))
     config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
