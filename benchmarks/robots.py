@@ -339,6 +339,8 @@ def main() -> None:
     print(text)
     if args.page:
         publish(args.page, rows, text)
+    if (ratios(rows) > WORSE).any() or (ratios(rows, "plain") > WORSE_THAN_PLAIN).any():
+        parser.exit(1, "a robot is worse than its file by more than 1 %, or than the plain script by more than 10 %\n")
 
 
 if __name__ == "__main__":
