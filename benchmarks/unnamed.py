@@ -23,6 +23,7 @@ import numpy as np
 from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run
 
 from gaponet.arrays import Array
+from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
@@ -151,11 +152,22 @@ class Rows:
 
     def calibrated(self, robot: RobotSpec, kinds: ListOf[str]) -> dict[str, Errors]:
         """With 30 s of the unit, motions trained on: the robot folder, and under the first network."""
-        out = self.bench.work / "calibrated"
+        out, motions = self.bench.work / "calibrated", sorted({s.meta.motion for s in self.bench.train})
         if not (out / "robot.toml").is_file():
-            run("calibrate", robot.folder, self.bench.data.path, "--unit", UNIT, "--out", out, "--motions",
-                *sorted({s.meta.motion for s in self.bench.train}))  # fmt: skip
-        found = {"calibrated": [self.errors("calibrated", load_robot(out))]}
+            words = (
+                "calibrate",
+                robot.folder,
+                self.bench.data.path,
+                "--unit",
+                UNIT,
+                "--out",
+                out,
+                "--motions",
+                *motions,
+            )
+            gaponet([*map(str, words)])  # may refuse: then the robot stays as it was identified
+        own = load_robot(out) if (out / "robot.toml").is_file() else robot
+        found = {"calibrated": [self.errors("calibrated", own)]}
         for kind in kinds:
             folder = self.trained(kind, robot, 0)
             model = GapModel.load(folder)
