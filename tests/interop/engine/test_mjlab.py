@@ -102,7 +102,16 @@ def test_a_trained_model_moves_mjlab_as_it_moves_alignedsim(python, tmp_path):
     data, run = str(tmp_path / "data"), str(tmp_path / "run")
     recipe = ["--robot", "h1_2", "--fleet", "easy", "--recipe", "demo", "--units", "virtual-1", "--nproc", "1"]
     assert main(["collect", "--out", data, *recipe]) == 0
-    start = ["--warm-start.num-envs", "64", "--warm-start.steps", "100", "--warm-start.rounds", "4"]
+    start = [
+        "--warm-start.num-envs",
+        "64",
+        "--warm-start.steps",
+        "100",
+        "--warm-start.rounds",
+        "4",
+        "--warm-start.rows",
+        "4000",
+    ]
     assert main(["train", data, "--out", run, "--budget", "25600", *start]) == 0
     model = GapModel.load(run)
     compare(python, model, 2.0, tmp_path, "H1-2, trained on virtual robots (25,600 steps), 2 kg per hand")
