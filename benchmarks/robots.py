@@ -312,12 +312,11 @@ def main() -> None:
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
     journal = args.work / "robots.jsonl"
-    found = known(journal)
-    if journal.exists():  # what was cut short goes
-        write_text(journal, journal.read_text().rpartition("\n")[0] + "\n" * bool(found))
+    if known(journal):  # what was cut short goes
+        write_text(journal, journal.read_text().rpartition("\n")[0] + "\n")
     seconds = args.seconds or (SMALL if args.small else None)
     for seed in args.seeds or range(args.first, args.first + args.robots):
-        if seed in found and not args.seeds:
+        if seed in known(journal) and not args.seeds:  # by another process on the same folder, perhaps
             continue
         folder = args.work / str(seed)
         shutil.rmtree(folder, ignore_errors=True)
