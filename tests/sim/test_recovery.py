@@ -10,7 +10,7 @@ from gaponet.progress import silent
 from gaponet.robot import LAW, Table
 from gaponet.sim import touching
 from gaponet.sim.axes import CLASSIC, Bounds
-from gaponet.sim.identify import Clock, Fit
+from gaponet.sim.identify import Clock, Fit, identify
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
 
@@ -45,6 +45,18 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
         for i, joint in enumerate(robot.joint_names):  # within 5 %, or two standard errors
             assert abs(found[field][i] - value) < max(0.05 * value, 2 * std[joint][field])
             assert std[joint][field] < value
+
+
+def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
+    """The file's damping of the shoulder, which no command moves, is ten times too much."""
+    robot = write_arm(tmp_path / "arm")
+    swung = [replace(s, ctrl=s.ctrl * [0, 1]) for s in played(robot, robot, 3, 200)]
+    true, told = (robot.with_servos({"shoulder": {"damping": d, "kp": 20.0}}) for d in (0.2, 2.0))
+    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(swung, replay(swung, true), strict=True)]
+    found = identify(parts[:2], told, parts[2:], windows=2, terms=(), table=False)
+    assert found.better
+    assert found.after < 0.1 * found.before
+    assert any("shoulder: not determined" in text for text in found.warnings)
 
 
 TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'

@@ -26,7 +26,7 @@ FIRST_DELAY, MAX_DELAY = 0.02, 0.15  # s: a delay of zero hides what it does
 RESOLVED = 5.0  # physics steps in a radian of the stiffest oscillation that a search starts from
 WIDE_KP, SLOW, HEAVY, ZERO = 5.0, 1.0, 0.3, 0.2  # logarithm of kp, s of damping/kp, s of √(armature/kp), rad of offset
 STILL = 0.01  # rad: commands that differ by less ask nothing of a joint
-STANDING = ("kp", "offset")  # what a joint shows that is never moved: how far it gives way, and where it stands
+STANDING = ("kp", "offset", "damping", "frictionloss")  # of a joint that is never moved: how it gives way to others
 
 
 def first_values(robot: RobotSpec) -> Values:

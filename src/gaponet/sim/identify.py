@@ -553,7 +553,7 @@ class Fit:
             if self.bounds.still[i]:
                 why = (
                     f"{joint}: not determined by these logs: no command moves it by {STILL:g} rad; it keeps the file's "
-                    "values but for its offset and, where others load it, kp; record a motion that moves it"
+                    "values but for what others that move it show (kp, damping, friction, offset); record its motion"
                 )
                 found[joint] = tuple(names), why
                 continue
