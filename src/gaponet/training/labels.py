@@ -22,7 +22,7 @@ from gaponet.sim.replay import replay
 from gaponet.sim.touching import tip_heights
 
 ITERATIONS, GAIN = 6, 0.6
-LEAD, SMOOTH = 0.1, 0.06  # s: how much later a correction shows, σ of the filter
+LEAD, SMOOTH, NEAR = 0.1, 0.06, 0.01  # s: how much later a correction shows, σ of the filter; m: a tip is at the table
 
 
 def trajectory_labels(
@@ -48,7 +48,7 @@ def trajectory_labels(
     labels = np.concatenate([d for _, d in best]).astype(np.float32)
     silent = np.concatenate([np.tile([j in s.meta.unrecorded for j in robot.operated], (len(s), 1)) for s in sequences])
     if robot.table is not None:
-        silent[np.concatenate(tip_heights(sequences, robot)) < robot.table.height + 0.01] = True  # m
+        silent[np.concatenate(tip_heights(sequences, robot)) < robot.table.height + NEAR] = True
     return np.where(silent, np.nan, labels).astype(np.float32)
 
 

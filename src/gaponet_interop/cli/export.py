@@ -62,10 +62,12 @@ def export(
         _randomization(screen, robot, out, engine, scope, units)
         return
     if to in NETWORKS and (robot / "robot.toml").is_file():
-        raise UsageError(f"{robot}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton or json")
+        raise UsageError(
+            f"{robot}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton, drake or json"
+        )
+    if to in NETWORKS and (into or prefix or (data and to != "actuator-net")):
+        raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
     if to in ("onnx", "torch"):
-        if data or into or prefix:
-            raise UsageError(f"--data, --into and --prefix are of robots; --to {to} writes a run's network")
         _network(screen, robot, to, out, payload_mass)
         return
     from gaponet.eval.tables import mrad
@@ -125,8 +127,6 @@ def _simulator(holder: Path) -> Path:
 def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: float) -> None:
     from gaponet.model.artifact import CARD, GapModel
 
-    if (run / "robot.toml").is_file():
-        raise UsageError(f"{run}: is a robot, which has no network; --to mjcf, mjlab, isaaclab, newton, drake or json")
     if to == "torch":
         from gaponet_interop.engine.folder import export_model
 

@@ -99,10 +99,8 @@ def write_networks(
     Returns:
         What is left of the motions, rad, by form.
     """
-    nets, op = (
-        _fitted(sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts),
-        robot.operated_index,
-    )
+    nets = _fitted(sequences, replay(sequences, robot, corrector, lock_idle=True), robot, facts)
+    op = robot.operated_index
     aligned = zip(motions, replay(motions, robot, corrector, lock_idle=True), strict=True)
     tried = {gain: _played(folder / facts["file"], motions, robot, nets, facts, gain) for gain in GAINS}
     gain = min(tried, key=lambda g: tried[g])

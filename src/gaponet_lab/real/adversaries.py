@@ -56,9 +56,7 @@ def joints(question: Question) -> Question:
     return _learned(question, [_ordered(s, order) for s in question.known])
 
 
-ADVERSARIES: dict[str, Adversary] = {
-    f.__name__: f for f in (labels, asked_labels, late, all_late, joints)
-}  # fmt: skip
+ADVERSARIES: dict[str, Adversary] = {f.__name__: f for f in (labels, asked_labels, late, all_late, joints)}
 
 
 def _learned(question: Question, known: list[Sequence]) -> Question:

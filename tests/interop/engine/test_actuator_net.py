@@ -80,6 +80,11 @@ def test_networks_play_the_run_in_plain_mujoco_and_say_what_they_leave(run, tmp_
     assert json.loads(props["metadata"])["input_order"] == "pos_vel"
 
 
+def test_what_is_of_robots_is_refused(run, tmp_path, capsys):
+    assert main(["export", str(run), "--to", "actuator-net", "--into", str(tmp_path / "scene.xml")]) == 2
+    assert "--into and --prefix are of robots" in capsys.readouterr().err
+
+
 def test_a_payload_that_nobody_recorded_is_refused(run, tmp_path):
     with pytest.raises(UsageError, match=r"made with 0.2 kg"):
         export_networks(GapModel.load(run), run, tmp_path, payload_mass=0.2)

@@ -32,7 +32,6 @@ def begin(env: Any, env_ids: Any) -> None:
 options, decimation = gaponet.mjlab_options(HERE)
 options = dataclasses.replace(options, timestep=facts["actuator_net"]["step"])
 networks = EntityArticulationInfoCfg(actuators=mjlab_actuators(HERE))
-target = JointPositionActionCfg(entity_name="robot", actuator_names=(".*",), use_default_offset=False)
 cfg = ManagerBasedRlEnvCfg(
     decimation=decimation,
     scene=SceneCfg(num_envs=turns.worlds, entities={"robot": gaponet.mjlab_entity(HERE, articulation=networks)}),
