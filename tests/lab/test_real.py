@@ -15,6 +15,7 @@ from gaponet_lab.real import networks as brief
 from gaponet_lab.real.adversaries import ADVERSARIES
 from gaponet_lab.real.bench import Bench, load_method
 from gaponet_lab.real.cards import CARDS, ROBOTS, read_cards
+from gaponet_lab.real.page import by_joint
 from gaponet_lab.real.questions import floor, questions
 from gaponet_lab.real.rivals import LEFT_OUT, METHODS
 
@@ -121,3 +122,22 @@ def test_the_method_on_the_page_is_one(arm, played, tmp_path):
     assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
     with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
         load_method("nothing.py:f")
+
+
+def test_a_method_that_fails_loses_its_own_row_and_joints_that_were_recorded_alone_are_told_by_payload(
+    arm, played, tmp_path
+):
+    alone = Dataset.create(tmp_path / "alone", arm)
+    for e in played.entries:
+        one = played.read(e)
+        alone.append(replace(one, meta=replace(one.meta, notes={"held_at_home": [arm.operated[1]]})))
+    (question,) = questions("0.5 kg left out", alone, arm, None)
+    said, methods = [], {"nominal": METHODS["nominal"], "mine": ("mine", lambda question: 1 / 0)}
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=said.append)
+    card = next(c for c in read_cards().set if c.name == "so101")
+    (row,) = (row.as_dict() for row in bench.ask(card, question.name, [question]))
+    assert any("mine: ZeroDivisionError" in text for text in said)
+    ((mrad, count),) = row["by_joint_mrad"][arm.operated[0]].values()
+    assert (mrad, count) == (pytest.approx(row["mrad"]), 12)
+    told = by_joint([row])
+    assert told[-1] == f"| 0.5 kg left out | {arm.operated[0]} | 0.5 | 12 | {mrad:.1f} |"

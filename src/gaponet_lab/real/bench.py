@@ -8,7 +8,7 @@ import json
 import re
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec
 from gaponet_lab.real.adversaries import ADVERSARIES, Adversary
 from gaponet_lab.real.cards import Card, Cards, prepare
-from gaponet_lab.real.questions import Question, floor, questions
+from gaponet_lab.real.questions import Question, floor, questions, recorded
 from gaponet_lab.real.rivals import Method, identified
 
 Said = Callable[[str], None]
@@ -32,7 +32,8 @@ class Row:
     """What a method leaves of a question: mean |error| of each independent motion, (motions,) rad.
 
     `nominal` is the same of the nominal simulator, in the same order; `seconds` is what fitting and asking took;
-    `notes` are the answers' own.
+    `notes` are the answers' own; `by_joint` says of joints that were recorded one at a time what is left with each
+    payload, mrad, the mean over motions, and of how many recordings.
     """
 
     set: str
@@ -43,9 +44,9 @@ class Row:
     recordings: int
     floor: float
     splits: tuple[str, ...]
-    by_payload: dict[str, float]
     seconds: float
     notes: tuple[str, ...] = ()
+    by_joint: dict[str, dict[str, tuple[float, int]]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: mrad, with the standard error over motions, of differences paired."""
@@ -55,7 +56,7 @@ class Row:
             "standard_error": 1e3 * standard_error(self.error), "of_nominal": self.error.mean() / self.nominal.mean(),
             "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(self.error),
             "recordings": self.recordings, "floor_mrad": 1e3 * self.floor, "splits": self.splits,
-            "by_payload_mrad": self.by_payload, "seconds": round(self.seconds, 1), "notes": self.notes,
+            "by_joint_mrad": self.by_joint, "seconds": round(self.seconds, 1), "notes": self.notes,
         })  # fmt: skip
 
 
@@ -96,7 +97,12 @@ class Bench:
         seconds: dict[str, float] = {}
         for card in here:
             began = time.monotonic()
-            dataset, robot, told = prepare(card, self.data, self.work)
+            try:
+                dataset, robot, told = prepare(card, self.data, self.work)
+            except GAPONetError as error:
+                self.say(f"{card.name}: {error}")
+                left_out[card.folder] = str(error)
+                continue
             seconds[card.name] = time.monotonic() - began
             self.say(
                 f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min, from file to dataset in "
@@ -148,21 +154,27 @@ class Bench:
             try:
                 for q in folds:
                     found.append(self._once(card, q, method, answer))
-            except GAPONetError as error:
-                self.say(f"{card.name}, {name}, {title}: {error}")
+            except Exception as error:  # a method may be anybody's: it loses its own row and no other
+                kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
+                self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
             by_motion: dict[str, list[float]] = {}
-            by_payload: dict[str, list[float]] = {}
+            cells: dict[tuple[str, str], dict[str, list[float]]] = {}
             for q, (errors, _, _) in zip(folds, found, strict=True):
                 for s, motion, e in zip(q.test, q.motion, errors, strict=True):
                     by_motion.setdefault(motion, []).append(e)
-                    by_payload.setdefault(f"{s.meta.payload_mass:g}", []).append(1e3 * e)
+                    if len(columns := recorded(s, q.robot)) == 1:
+                        cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
+                        cells.setdefault(cell, {}).setdefault(motion, []).append(1e3 * e)
             left = np.array([np.mean(v) for v in by_motion.values()])
             first = rows[0].error if rows else left
-            masses = {k: float(np.mean(v)) for k, v in sorted(by_payload.items())}
             count, took = sum(len(errors) for errors, _, _ in found), sum(s for _, s, _ in found)
             notes = tuple(note for _, _, note in found if note)
-            rows.append(Row(card.name, name, title, left, first, count, noise, splits, masses, took, notes))
+            by_joint: dict[str, dict[str, tuple[float, int]]] = {}
+            for (joint, kg), motions in sorted(cells.items()):
+                mean = float(np.mean([np.mean(v) for v in motions.values()]))
+                by_joint.setdefault(joint, {})[kg] = mean, sum(map(len, motions.values()))
+            rows.append(Row(card.name, name, title, left, first, count, noise, splits, took, notes, by_joint))
             self.say(f"{card.name}, {name}: {title} leaves {1e3 * left.mean():.2f} of {1e3 * first.mean():.2f} mrad")
         return rows
 

@@ -57,6 +57,25 @@ def table(rows: list[dict[str, Any]]) -> list[list[str]]:
     ]  # fmt: skip
 
 
+def by_joint(rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of Markdown: what each method leaves by joint and payload, of sets that were recorded joint by joint."""
+    lines = []
+    for name in dict.fromkeys(r["set"] for r in rows if r.get("by_joint_mrad")):
+        mine = [r for r in rows if r["set"] == name]
+        methods = list(dict.fromkeys(r["method"] for r in mine))
+        heads = [m.partition(" by ")[0].removesuffix(" simulator") for m in methods]
+        lines += ["", f"{name} by joint and payload, mrad (means over motions, few in a cell, so no ±):", ""]
+        lines += ["| question | joint | kg | recordings | " + " | ".join(heads) + " |"]
+        lines += ["| --- | --- | ---: | ---: |" + " ---: |" * len(heads)]
+        for question in dict.fromkeys(r["question"] for r in mine):
+            found = {r["method"]: r["by_joint_mrad"] for r in mine if r["question"] == question}
+            first = next(iter(found.values()))
+            for joint, kg, count in ((j, kg, n) for j, each in first.items() for kg, (_, n) in each.items()):
+                cells = [f"{found[m][joint][kg][0]:.1f}" if m in found else "–" for m in methods]
+                lines += ["| " + " | ".join([question, joint, kg, str(count), *cells]) + " |"]
+    return lines
+
+
 def _left_out(notes: tuple[str, ...]) -> str:
     """That validation left a network out, of so many that were trained."""
     count = sum(note.startswith(LEFT_OUT) for note in notes)
@@ -77,6 +96,7 @@ def write_page(found: dict[str, Any], out: Path) -> list[Path]:
         lines += [f"ADVERSARY: {found['adversary']}.", ""]
     lines += ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
     lines += ["| " + " | ".join(cells) + " |" for cells in table(rows)]
+    lines += by_joint(rows)
     spent = ", ".join(f"{what} {seconds:,} s" for what, seconds in found["seconds"].items())
     lines += ["", f"From file to table, on this machine: {spent}."]
     for what, remarks in found["labels"].items():
