@@ -47,7 +47,8 @@ CLUSTERS = 24  # parts of the recordings that are thought independent of each ot
 WIDE = 0.15  # a standard error so large, of the value and of its scale: not determined
 SURE = 0.84  # of Student's distribution, one side: one standard error where motions are many
 HALF = 0.29  # standard deviation of what lies anywhere within one step
-LASTS = 4.0  # s of recording that count as one independent measurement beside a belief
+LASTS = (1.0, 4.0)  # s of recording that count as one measurement beside a belief: at least, before it is known
+FAINT = 0.05  # a correlation that is none
 BELIEF = {"kp": 0.5, "armature": 1.5}  # standard deviation of the logarithm of a file's value
 TOLD = 0.1  # the same of a kp that recordings state
 BETTER, ALONE_BETTER = 0.01, 0.1  # of an error: a fall by more is an improvement, on several motions and on one
@@ -259,6 +260,7 @@ def _classic(fit: Fit, clock: Clock, nthread: int) -> tuple[Fit, dict[str, Value
     bounds = fit.bounds
     clock.share(PARTS["joints"], 0)
     alone = fit.search(CLASSIC, bounds.start, clock, "joints, each on its own", fit.balanced())
+    fit.learn_lasting(alone)
     whole = fit.whole(nthread)
     clock.share(PARTS["whole"] / (1 - PARTS["joints"]), 1)
     first = np.stack([Axes(whole.bounds, CLASSIC, bounds.start).of(v) for v in (alone, bounds.start)])
@@ -368,6 +370,7 @@ class Fit:
         self.runs, self.base, self.bounds, self.company = runs, robot, bounds, whole
         self.n = len(robot.operated)
         self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
+        self.lasts = np.full(self.n, LASTS[1])  # s: how long that lasts
         self.together = _Limbs(robot)
         self.covariance: Covariance = {}  # where `uncertainty` was asked last
 
@@ -377,7 +380,7 @@ class Fit:
         some = np.unique(np.arange(WHOLE) * len(parts) // WHOLE)
         runs = FreeRuns([parts[i] for i in some], self.base, nthread, touch=self.runs.touch[some])
         fit = Fit(self.runs, self.base, self.bounds, runs)
-        fit.noise = self.noise
+        fit.noise, fit.lasts = self.noise, self.lasts
         return fit
 
     def fields_of(self, values: Values) -> list[str]:
@@ -450,6 +453,15 @@ class Fit:
         """What the best fit leaves of each joint says how much a file's value weighs."""
         self.noise = np.maximum(SOFT * np.sqrt(2 * cost / np.maximum(rows, 1)), 1e-5)
 
+    def learn_lasting(self, values: Values) -> None:
+        """What an error of each joint says of itself later: so long it is one measurement beside a belief."""
+        found = self.runs.errors({f: v[None] for f, v in values.items()})[0]  # (n, windows, rows)
+        power = (np.abs(np.fft.rfft(found, 2 * found.shape[-1])) ** 2).sum(axis=1)
+        alike = np.fft.irfft(power)[:, : found.shape[-1]]
+        alike /= np.maximum(alike[:, :1], 1e-30)
+        alike *= np.cumprod(alike > FAINT, axis=1)
+        self.lasts = np.maximum(self.runs.dt * self.runs.thin * (2 * alike.sum(axis=1) - 1), LASTS[0])
+
     def errors(self, values: Values, runs: JointRuns | FreeRuns) -> Array:
         """Errors of (k, n) values, (k, n, rows), in SOFT; two more: how far kp and armature are from the file's."""
         if isinstance(runs, JointRuns):
@@ -464,7 +476,7 @@ class Fit:
 
     def _one(self) -> Array:
         """The standard deviation of an error that counts as one beside a belief, (n,) in SOFT."""
-        return np.asarray(self.noise / SOFT * np.sqrt(LASTS / max(self.runs.dt, 0.01)))
+        return np.asarray(self.noise / SOFT * np.sqrt(self.lasts / max(self.runs.dt, 0.01)))
 
     def robot(self, values: Values) -> RobotSpec:
         """The robot with these values."""
