@@ -110,26 +110,29 @@ def write_page(found: dict[str, Any], out: Path) -> list[Path]:
 def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
     """What each method leaves of the nominal error, a line for each question, what the robot itself leaves shaded."""
     asked = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
-    fig = figure(7.2, 0.34 * len(asked) + 1.5)
+    fig = figure(7.2, 0.5 * len(asked) + 1.5)
     ax = fig.subplots()
     names = [titles.get(name, name).partition(",")[0] + f": {question}" for name, question in asked]
-    for y, key in enumerate(asked):
-        mine = [r for r in rows if (r["set"], r["question"]) == key]
-        nominal = mine[0]["mrad"]
-        if mine[0]["floor_mrad"] is not None:
-            ax.barh(y, mine[0]["floor_mrad"] / nominal, 0.8, color="#111111", alpha=0.1, lw=0,
+    shown = {y: [r for r in rows if (r["set"], r["question"]) == key] for y, key in enumerate(asked)}
+    for y, (first, *_) in shown.items():
+        if first["floor_mrad"] is not None:
+            ax.barh(y, first["floor_mrad"] / first["mrad"], 0.86, color="#111111", alpha=0.1, lw=0,
                     label="repetitions differ by")  # fmt: skip
-        shown = [r for r in mine if r["method"] in LOOKS]  # the nominal simulator is the line
-        for i, r in enumerate(shown):
-            own, marker = LOOKS[r["method"]]
-            place = y + 0.5 * (i / max(len(shown) - 1, 1) - 0.5)
-            x, error = r["of_nominal"], (r["standard_error"] or 0.0) / nominal
-            ax.errorbar(min(x, WIDEST), place, xerr=error or None, fmt=marker if x <= WIDEST else ">", ms=4.5,
-                        color=own, elinewidth=0.8, label=r["method"].partition(" by ")[0])  # fmt: skip
+    for method, (own, marker) in LOOKS.items():  # the nominal simulator is the line
+        for y, (first, *others) in shown.items():
+            lanes = [r for r in others if r["method"] in LOOKS]
+            for i, r in enumerate(lanes):
+                if r["method"] == method:
+                    x, error = r["of_nominal"], (r["standard_error"] or 0.0) / first["mrad"]
+                    ax.errorbar(min(x, WIDEST), y + 0.76 * ((i + 0.5) / len(lanes) - 0.5), xerr=error or None,
+                                fmt=marker if x <= WIDEST else ">", ms=4, color=own, elinewidth=0.8,
+                                label=method.partition(" by ")[0])  # fmt: skip
+    for y in range(1, len(asked)):
+        ax.axhline(y - 0.5, color="#111111", alpha=0.08, lw=0.6, zorder=0)
     ax.axvline(1.0, color=colour("nominal"), lw=1.2, zorder=0, label="nominal simulator")
     ax.set_yticks(np.arange(len(asked)), names)
     ax.tick_params(axis="y", length=0)
-    ax.set_ylim(len(asked) - 0.4, -0.6)
+    ax.set_ylim(len(asked) - 0.5, -0.5)
     ax.set_xlim(0.0, max(1.05, min(1.05 * max(r["of_nominal"] for r in rows), WIDEST)))
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("mean |error|, of the nominal simulator's")
