@@ -112,6 +112,14 @@ def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_ide
     assert cards == [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
 
 
+def test_only_what_is_there_is_asked(tmp_path):
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", METHODS, say=lambda text: None)
+    for only, asked, told in ((("a robot",), (), "no set 'a robot'"), ((), ("why",), "no question 'why'")):
+        with pytest.raises(UsageError, match=told):
+            bench.run(only, asked)
+    assert bench.run()["rows"] == []
+
+
 def test_the_method_on_the_page_is_one(arm, played, tmp_path):
     code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
     (tmp_path / "mine.py").write_text(code)

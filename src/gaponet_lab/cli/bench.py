@@ -26,6 +26,7 @@ def bench(
     data: Path | None = None,
     out: Path = Path("bench_real"),
     sets: tuple[str, ...] = (),
+    questions: tuple[str, ...] = (),
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     networks: int = 0,
     adversary: Literal["", "labels", "asked_labels", "late", "all_late", "joints"] = "",
@@ -44,6 +45,7 @@ def bench(
         data: Folder of the public recordings, with real; default GAPONET_DATA, else ../shared/data.
         out: Folder for datasets, table and figure, with real.
         sets: Only these data sets, with real.
+        questions: Only these questions, such as "3 kg left out", with real.
         method: A method of your own, FILE.py:FUNCTION, with real; may be repeated.
         networks: Train networks too, with real, for so many control steps each; 0 for none.
         adversary: What is done, with real, to the recordings that are learned from: labels dealt out anew, or those of
@@ -59,7 +61,7 @@ def bench(
     elif what == "sim":
         _sim(robot, screen, num_envs or 512, rounds or 15)
     elif what == "real":
-        _real(data, out, sets, method, networks, adversary, screen)
+        _real(data, out, sets, questions, method, networks, adversary, screen)
     else:
         _train(robot, model, screen, num_envs or 1024, rounds or 3)
 
@@ -68,6 +70,7 @@ def _real(
     data: Path | None,
     out: Path,
     sets: tuple[str, ...],
+    questions: tuple[str, ...],
     method: tuple[str, ...],
     steps: int,
     adversary: str,
@@ -83,7 +86,7 @@ def _real(
         from gaponet_lab.real.networks import networks
 
         methods |= networks(steps)
-    found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets)
+    found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets, questions)
     screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
     for name, remarks in found["labels"].items():
         screen.say(f"{name}: {'; '.join(remarks)}", "labels")

@@ -80,8 +80,8 @@ class Bench:
     adversary: str = ""
     say: Said = print
 
-    def run(self, only: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Import, split, fit and measure some sets, by default all.
+    def run(self, only: tuple[str, ...] = (), asked: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Import, split, fit and measure some sets, by default all, of which some questions are asked, by default all.
 
         Returns:
             rows (Row.as_dict), cards, labels (set → sentences), left_out (folder → why), seconds (set →).
@@ -90,6 +90,9 @@ class Bench:
         if unknown:
             raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}")
         here = [c for c in self.cards.set if self._is_there(c) and (not only or c.name in only)]
+        every = {q for c in here for q in c.questions}
+        if set(asked) - every:
+            raise UsageError(f"no question '{min(set(asked) - every)}'; there are {', '.join(sorted(every))}")
         left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
         left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_there(c)}
         rows: list[Row] = []
@@ -110,7 +113,7 @@ class Bench:
             )
             if told:
                 labels[card.name] = told.remarks
-            for name in card.questions:
+            for name in (q for q in card.questions if not asked or q in asked):
                 rows += self.ask(card, name, list(questions(name, dataset, robot, self.before(card))))
             seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)
         return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in here}, "labels": labels,
