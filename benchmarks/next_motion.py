@@ -4,10 +4,10 @@
     python benchmarks/next_motion.py real ROBOT DATASET WORK --draws 16          windows of a real robot's recordings
     python benchmarks/next_motion.py table WORK
 
-A robot is known from 24 s. Then it is recorded further: chosen by gaponet excite --for's rule, or at random from the
-same candidates. All is fitted again from what was known. Errors to the truth (VIRTUAL), to the values of all recordings
-(real) and of test motions; standard errors as known.json says them. A line of WORK/*.jsonl for each arm or draw; what
-is there is not done again.
+A robot is known from 24 s. Then it is recorded further: chosen by gaponet excite --for's rule, at random from the same
+candidates, or by a plain rival, what is commanded farthest a second. All is fitted again from what was known. Errors to
+the truth (VIRTUAL), to the values of many more recordings (real) and of test motions; standard errors as known.json
+says them. A line of WORK/*.jsonl for each arm or draw; what is there is not done again.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ from gaponet.eval.knowledge import Knowledge, seen
 from gaponet.progress import silent
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
-from gaponet.sim.axes import CLASSIC, Axes, Bounds
-from gaponet.sim.free_runs import cut
+from gaponet.sim.axes import CLASSIC, Axes, Bounds, first_values
+from gaponet.sim.free_runs import FreeRuns, cut
 from gaponet.sim.identify import TOGETHER, Clock, Fit
 from gaponet.sim.joint_runs import JointRuns
-from gaponet.sim.replay import replay, whole_errors
+from gaponet.sim.replay import replay
+from gaponet.sim.touching import tip_heights, touching_below
 from gaponet_lab.known.evidence import known
 from gaponet_robots.motion.library import Library
 from gaponet_robots.motion.motion import Motion
@@ -50,15 +51,26 @@ from arm import TOML, XML, write_arm
 NORMAL_90 = 1.645
 HELD, NOISE = 0.3, 4e-4  # kg of the known payload, rad of the encoder
 FIRST_ARM = 2001  # of the fleet's units: of no other benchmark
-SETS = {"nothing more": 0.0, "chosen, 32 s": 32.0, "at random, 32 s": 32.0, "at random, 64 s": 64.0}
+Found = tuple[RobotSpec, Knowledge, Telling, list[int]]  # fitted, how sure, what the candidates were to tell, picked
+BASE = "at random, 32 s"
+MANY = 40  # windows of a real arm that give the values others are held against
+SETS = {
+    "nothing more": 0.0, "chosen, 32 s": 32.1, "farthest first, 32 s": 32.1, "at random, 32 s": 32.1,
+    "at random, 64 s": 64.1,
+}  # fmt: skip
 
 
-def fitted(robot: RobotSpec, start: RobotSpec, logs: list[Sequence]) -> tuple[RobotSpec, Knowledge]:
-    """As gaponet identify does without terms: every joint on its own, then together; and how sure that is."""
+def fitted(
+    robot: RobotSpec, start: RobotSpec, logs: list[Sequence], below: float = -np.inf
+) -> tuple[RobotSpec, Knowledge]:
+    """As gaponet identify does without terms: every joint on its own, then together, of all windows; and how sure that
+    is. Rows with a tip lower than `below` are passed over."""
     bounds, own, clock = Bounds(robot, logs), Bounds(start, logs), Clock(None, 0, silent)
-    fit = Fit(JointRuns(cut(logs, 10**6), robot, nthread=1), robot, bounds)
+    fit = Fit(JointRuns(cut(logs, 10**6), robot, below, nthread=1), robot, bounds)
     begin = bounds.start if start is robot else {f: own.first[f] for f in CLASSIC}
-    alone, whole = fit.search(CLASSIC, begin, clock, ""), fit.whole(1)
+    alone = fit.search(CLASSIC, begin, clock, "")
+    whole = Fit(fit.runs, robot, bounds, FreeRuns(fit.runs.parts, robot, 1, touch=fit.runs.touch))
+    whole.noise = fit.noise
     first = np.stack([Axes(whole.bounds, CLASSIC, bounds.start).of(v) for v in (alone, begin)])
     values = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "")
     whole.uncertainty(values)
@@ -71,10 +83,10 @@ def errors(mine: Knowledge) -> list[list[float]]:
     return [np.sqrt(np.diag(mine.array(j, "covariance"))).tolist() for j in mine.joints]
 
 
-def at_random(seconds: np.ndarray, limit: float, rng: np.random.Generator) -> list[int]:
-    """In any order, each that still fits."""
+def in_turn(order: np.ndarray, seconds: np.ndarray, limit: float) -> list[int]:
+    """In this order, each that still fits."""
     picks, left = list[int](), limit
-    for i in rng.permutation(len(seconds)).tolist():
+    for i in order.tolist():
         if seconds[i] <= left:
             picks, left = [*picks, i], left - seconds[i]
     return picks
@@ -87,22 +99,44 @@ def compared(
     record: Callable[..., list[Sequence]],
     rng: np.random.Generator,
     place: Path,
-    sets: dict[str, float] = SETS,
-) -> tuple[dict[str, tuple[RobotSpec, Knowledge, float]], Telling, Knowledge]:  # fmt: skip
+    below: float = -np.inf,
+) -> tuple[dict[str, Found], Telling, Knowledge]:  # fmt: skip
     """A robot fitted before and after each set of further recordings; record(picks) makes those."""
-    first, mine = fitted(robot, robot, before)
+    first, mine = fitted(robot, robot, before, below)
     save_robot(first, place)
     first = load_robot(place)
     own = expected(first, expect, 0.0, 1) if isinstance(expect[0], Motion) else [
         replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(expect, replay(expect, first, nthread=1), strict=True)
     ]  # fmt: skip
     told = Telling.of(first, mine, own, 1)
-    found = {"nothing more": (first, mine, 0.0)}
-    for name, limit in list(sets.items())[1:]:
-        picks = told.choose(limit) if name.startswith("chosen") else at_random(told.seconds, limit, rng)
-        logs = before + (record(picks))
-        found[name] = (*fitted(robot, first, logs), float(told.seconds[picks].sum()))
+    found: dict[str, Found] = {"nothing more": (first, mine, told, [])}
+    far = np.array([np.abs(np.diff(s.ctrl[:, robot.operated_index], axis=0)).sum() / s.duration for s in own])
+    for name, limit in list(SETS.items())[1:]:
+        order = np.argsort(-far) if name.startswith("farthest") else rng.permutation(len(far))
+        picks = told.choose(limit) if name.startswith("chosen") else in_turn(order, told.seconds, limit)
+        found[name] = (*fitted(robot, first, before + record(picks), below), told, picks)
     return found, told, mine
+
+
+def judge(logs: list[Sequence], robot: RobotSpec, below: float = -np.inf) -> Callable[[RobotSpec], np.ndarray]:
+    """The function that gives a robot's errors of recordings, windows of 8 s, (joints, rows) rad."""
+    runs = JointRuns(cut(logs, 10**6), robot, below, nthread=1)
+    whole = FreeRuns(runs.parts, robot, 1, touch=runs.touch)
+    return lambda of: whole.run({f: v[None] for f, v in first_values(of).items() if f in CLASSIC})[0]
+
+
+def judged(
+    true: RobotSpec, best: np.ndarray, wrong: Callable[[RobotSpec], np.ndarray],
+    after: RobotSpec, sure: Knowledge, told: Telling, picks: list[int],
+) -> dict[str, Any]:  # fmt: skip
+    """What a fit leaves beside the true robot, whose own errors are `best`."""
+    at, now, error = seen(true, CLASSIC), seen(after, CLASSIC), wrong(after)
+    return {
+        "errors": errors(sure), "off": [(now[j] - at[j]).tolist() for j in true.operated],
+        "seconds": float(told.seconds[picks].sum()),
+        "promised": np.sqrt(np.einsum("njj->nj", told.after(picks))).tolist(),
+        "test": float(np.abs(error).mean()), "path": float(np.sqrt(np.square(error - best).mean())),
+    }  # fmt: skip
 
 
 def played(
@@ -143,6 +177,7 @@ def virtual(work: Path, arms: int, form: str, joints: str) -> None:
     xml = XML.replace('axis="0 1 0"', 'axis="0 0 1"') if joints == "free" else XML  # free: gravity turns nothing
     robot = write_arm(work / f"arm-{joints}", TOML, xml)
     fleet, pool = load_fleet("hard", robot), candidates(Library(robot, 7, HELD))
+    tests = candidates(Library(robot, 8, HELD))[::4]  # of other seeds
     file = work / f"{form}-{joints}.jsonl"
     for k in range(len(file.read_text().splitlines()) if file.is_file() else 0, arms):
         began, rng = time.process_time(), np.random.default_rng([k, 99])
@@ -162,71 +197,77 @@ def virtual(work: Path, arms: int, form: str, joints: str) -> None:
             logs = [
                 s for i in picks for s in played(robot, unit, [rest[i % len(rest)]], HELD * (i >= len(rest)), 7 * i)
             ]
-            found[f"chosen, 32 s, at 0 and {HELD:g} kg"] = (
-                *fitted(robot, first, before + logs),
-                float(own.seconds[picks].sum()),
-            )
-        true = unit if form == "right" else fitted(robot, first, played(robot, unit, pool, 0.0, 3))[0]
-        at = seen(true, CLASSIC)
-        for name, (after, sure, seconds) in found.items():
-            now = seen(after, CLASSIC)
-            off = [(now[j] - at[j]).tolist() for j in robot.operated]
-            line[name] = {"errors": errors(sure), "off": off, "seconds": seconds}
+            found[f"chosen, 32 s, at 0 and {HELD:g} kg"] = (*fitted(robot, first, before + logs), own, picks)
+        true = unit if form == "right" else fitted(robot, first, played(robot, unit, pool[::2], 0.0, 3))[0]
+        wrong = judge(played(robot, unit, tests, 0.0, 10_000 * k + 500), robot)
+        line |= {name: judged(true, wrong(true), wrong, *of) for name, of in found.items()}
         with file.open("a") as out:
             out.write(json.dumps(line) + "\n")
         print(f"{k + 1} of {arms}, {time.process_time() - began:.0f} s of processor", flush=True)
 
 
 def real(folder: Path, day: Path, work: Path, draws: int) -> None:
-    """Lines of work/real.jsonl: windows of 8 s of the training motions; test motions judge."""
+    """Lines of work/real.jsonl: windows of 8 s of the training motions; those of the test motions judge."""
     data, robot = Dataset(day), load_robot(str(folder))  # a name or a folder
     parts = split_entries(data, ())
     train, test = (data.sequences(parts[part]) for part in ("train", "test"))
     windows = [replace(w, meta=replace(w.meta, motion=f"{w.meta.motion} {k}")) for k, w in enumerate(cut(train, 10**6))]
     windows = [w for w in windows if w.duration > 7.9]
-    file = work / "real.jsonl"
+    below = touching_below(robot, tip_heights(train, robot))
+    wrong = judge(test, robot, below)
+    file, kept = work / "real.jsonl", work / "all"
+    if not (kept / "robot.toml").is_file():
+        save_robot(fitted(robot, robot, windows[:: -(-len(windows) // MANY)], below)[0], kept)
+    whole = load_robot(kept)
+    best = wrong(whole)
+    print(
+        f"{len(windows)} windows; {MANY} of them: {1e3 * np.abs(best).mean():.2f} mrad of the test motions", flush=True
+    )
     done = file.read_text().splitlines() if file.is_file() else []
-    whole, _ = fitted(robot, robot, windows[:: max(1, len(windows) // 60)])
-    at = seen(whole, CLASSIC)
     for k in range(len(done), draws):
         began, rng = time.process_time(), np.random.default_rng([k, 7])
         order = rng.permutation(len(windows))
         before, rest = [windows[i] for i in order[:3]], [windows[i] for i in order[3:]]
-        found, _, _ = compared(robot, before, rest, lambda p: [rest[i] for i in p], rng, work / "robot")  # noqa: B023
-        line = {}
-        for name, (after, sure, seconds) in found.items():
-            now = seen(after, CLASSIC)
-            line[name] = {
-                "errors": errors(sure), "off": [(now[j] - at[j]).tolist() for j in robot.operated], "seconds": seconds,
-                "test": float(whole_errors(test, after, 1).mean()),
-            }  # fmt: skip
+        record = lambda p: [rest[i] for i in p]  # noqa: E731, B023
+        found, _, _ = compared(robot, before, rest, record, rng, work / "robot", below)
+        line = {name: judged(whole, best, wrong, *of) for name, of in found.items()}
         with file.open("a") as out:
             out.write(json.dumps(line) + "\n")
         print(f"{k + 1} of {draws}, {time.process_time() - began:.0f} s of processor", flush=True)
 
 
+def share(lines: ListOf[Any], name: str, what: str) -> str:
+    """What a set leaves over what BASE leaves: root mean squares over draws, geometric mean over numbers; ± by leaving
+    out one draw at a time."""
+    mine, base = (np.array([np.ravel(x[n][what]) for x in lines]) ** 2 for n in (name, BASE))
+
+    def of(rows: np.ndarray) -> float:
+        a, b = mine[rows].mean(axis=0), base[rows].mean(axis=0)
+        seen = (a > 0) & (b > 0)  # a delay at its bound is the same everywhere
+        return float(np.exp(0.5 * np.log(a[seen] / b[seen]).mean()))
+
+    left = np.array([of(np.arange(len(lines)) != i) for i in range(len(lines))])
+    return f"{of(np.arange(len(lines))):.2f} ± {np.sqrt((len(left) - 1) * left.var()):.2f}"
+
+
 def table(work: Path) -> None:
-    """Shares of what random 30 s leave: geometric means, ± standard error over arms or draws, paired."""
+    """Shares of what random 32 s leave, ± standard error over arms or draws, paired."""
     for file in sorted(work.glob("*.jsonl")):
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         names = [n for n in lines[0] if n != "said"]
-        print(f"\n{file.stem}: {len(lines)}\n\n| | s | standard errors | distance | kp alone | test, mrad |")
-        print("| --- | ---: | ---: | ---: | ---: | ---: |")
-
-        def logs(n: str, what: str, lines: list[Any] = lines) -> np.ndarray:
-            return np.array([np.log(np.abs(np.array(x[n][what])) + 1e-9) for x in lines])
-
+        print(f"\n{file.stem}: {len(lines)}\n")
+        print("| | s | standard errors | over promised | distance | kp off | paths | test, mrad |")
+        print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
         for n in names:
             cells = [f"{np.mean([x[n]['seconds'] for x in lines]):.0f}"]
-            for what in ("errors", "off"):
-                share = (logs(n, what) - logs("at random, 32 s", what)).mean(axis=(1, 2))
-                cells.append(
-                    f"{np.exp(share.mean()):.2f} ± {np.exp(share.mean()) * share.std(ddof=1) / len(share) ** 0.5:.2f}"
-                )
+            more = np.log([np.array(x[n]["errors"]) / x[n]["promised"] for x in lines]).mean()
+            cells += [share(lines, n, "errors"), f"{np.exp(more):.1f}", share(lines, n, "off")]
             cells.append(f"{100 * np.sqrt(np.mean([np.square(np.array(x[n]['off'])[:, 0]) for x in lines])):.1f} %")
-            test = [1e3 * (x[n]["test"] - x["at random, 32 s"]["test"]) for x in lines if "test" in x[n]]
-            cells.append(f"{np.mean(test):+.2f} ± {np.std(test, ddof=1) / len(test) ** 0.5:.2f}" if test else "")
+            cells.append(share(lines, n, "path"))
+            test = [1e3 * (x[n]["test"] - x[BASE]["test"]) for x in lines]
+            cells.append(f"{np.mean(test):+.2f} ± {np.std(test, ddof=1) / len(test) ** 0.5:.2f}")
             print(f"| {n} | {' | '.join(cells)} |")
+        print(f"test, {BASE}: {1e3 * np.mean([x[BASE]['test'] for x in lines]):.2f} mrad")
         if file.stem.startswith("right"):  # the truth is known, and of the form that is fitted
             z = np.array([np.array(x[n]["off"]) / np.array(x[n]["errors"]) for x in lines for n in names])
             held = (np.abs(z) < NORMAL_90).mean(axis=(0, 1))
