@@ -3,6 +3,7 @@
     python benchmarks/known.py virtual WORK --robots 100 --form right|wrong   VIRTUAL two-joint arms, a line each
     python benchmarks/known.py real ROBOT DAY OTHER_DAY WORK                  datasets of two days; ROBOT of the first
     python benchmarks/known.py halves ROBOT DAY OTHER_DAY WORK                a fit on half of a day asked on the other
+    python benchmarks/known.py drawn ROBOT DAY                                how far units of today move the path
     python benchmarks/known.py table WORK                                     the tables of docs/results/known.md
 
 A virtual arm is drawn from the hard fleet; with the right form only its gain, damping, dry friction, delay and encoder
@@ -29,13 +30,15 @@ from gaponet.eval.knowledge import Knowledge
 from gaponet.progress import silent
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
-from gaponet.sim.axes import CLASSIC, Bounds
+from gaponet.sim.axes import CLASSIC, Bounds, first_values
 from gaponet.sim.free_runs import cut
 from gaponet.sim.identify import Clock, Fit, identify
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
+from gaponet.sim.touching import tip_heights, touching_below
+from gaponet_interop.engine.ranges import ranges
 from gaponet_lab.known.drift import drift
-from gaponet_lab.known.evidence import known
+from gaponet_lab.known.evidence import WINDOWS, known
 from gaponet_robots.virtual.fleet import draw, load_fleet
 from gaponet_robots.virtual.physics import Physics
 from gaponet_robots.virtual.unit import VirtualRobot
@@ -250,14 +253,36 @@ def table(work: Path) -> None:
             print(f"| {what} | {count} | {named if what in right else ''} |")
 
 
+def drawn(folder: Path, day: Path) -> None:
+    """How far 100 units of today are from the robot's path in 40 windows of the training motions, RMS over each."""
+    data, robot = Dataset(day), load_robot(folder)
+    train, mine = data.sequences(split_entries(data, ())["train"]), Knowledge.load(robot)
+    assert mine is not None
+    below = touching_below(robot, tip_heights(train, robot))
+    runs, own = JointRuns(cut(train, WINDOWS), robot, below, 1), first_values(robot)
+    units = ranges(robot, samples=100).units
+    own = {f: np.repeat(own[f][None], 100, axis=0) for f in units}
+    path = runs.errors({f: v[:1] for f, v in own.items()})
+    print("| joint | the robot leaves, mrad | half of the units | 9 of 10 | all | 9 of 10, the limit stays |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    each = [1e3 * np.sqrt(np.square(runs.errors(v) - path).sum(axis=(2, 3)) / runs.rows)
+            for v in (units, units | {"effort_limit": own["effort_limit"]})]  # fmt: skip
+    for i, (joint, k) in enumerate(mine.joints.items()):
+        shares = [*np.quantile(each[0][:, i], (0.5, 0.9, 1.0)), np.quantile(each[1][:, i], 0.9)]
+        print(f"| {joint} | {1e3 * k.left:.1f} | {' | '.join(f'{x:.1f}' for x in shares)} |")
+
+
 def main() -> None:
     """As above."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("virtual", "real", "halves", "table"))
+    parser.add_argument("what", choices=("virtual", "real", "halves", "drawn", "table"))
     parser.add_argument("paths", nargs="+", type=Path)
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--form", choices=("right", "wrong"), default="wrong")
     args = parser.parse_args()
+    if args.what == "drawn":
+        drawn(*args.paths)
+        return
     args.paths[-1].mkdir(parents=True, exist_ok=True)
     if args.what == "virtual":
         virtual(args.paths[0], args.robots, args.form)

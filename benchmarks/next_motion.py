@@ -33,7 +33,7 @@ from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet.sim.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sim.free_runs import FreeRuns, cut
-from gaponet.sim.identify import TOGETHER, Clock, Fit
+from gaponet.sim.identify import Clock, Fit
 from gaponet.sim.joint_runs import JointRuns
 from gaponet.sim.replay import replay
 from gaponet.sim.touching import tip_heights, touching_below
@@ -53,7 +53,8 @@ HELD, NOISE = 0.3, 4e-4  # kg of the known payload, rad of the encoder
 FIRST_ARM = 2001  # of the fleet's units: of no other benchmark
 Found = tuple[RobotSpec, Knowledge, Telling, list[int]]  # fitted, how sure, what the candidates were to tell, picked
 BASE = "at random, 32 s"
-MANY = 40  # windows of a real arm that give the values others are held against
+TOGETHER = (4,)  # iterations of all joints
+MANY, JUDGES = 40, 40  # windows of a real arm that give the values others are held against, and that judge
 SETS = {
     "nothing more": 0.0, "chosen, 32 s": 32.1, "farthest first, 32 s": 32.1, "at random, 32 s": 32.1,
     "at random, 64 s": 64.1,
@@ -71,7 +72,7 @@ def fitted(
     alone = fit.search(CLASSIC, begin, clock, "")
     whole = Fit(fit.runs, robot, bounds, FreeRuns(fit.runs.parts, robot, 1, touch=fit.runs.touch))
     whole.noise = fit.noise
-    first = np.stack([Axes(whole.bounds, CLASSIC, bounds.start).of(v) for v in (alone, begin)])
+    first = Axes(whole.bounds, CLASSIC, bounds.start).of(alone)[None]
     values = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "")
     whole.uncertainty(values)
     found = fit.robot(values)
@@ -214,7 +215,7 @@ def real(folder: Path, day: Path, work: Path, draws: int) -> None:
     windows = [replace(w, meta=replace(w.meta, motion=f"{w.meta.motion} {k}")) for k, w in enumerate(cut(train, 10**6))]
     windows = [w for w in windows if w.duration > 7.9]
     below = touching_below(robot, tip_heights(train, robot))
-    wrong = judge(test, robot, below)
+    wrong = judge(cut(test, JUDGES), robot, below)
     file, kept = work / "real.jsonl", work / "all"
     if not (kept / "robot.toml").is_file():
         save_robot(fitted(robot, robot, windows[:: -(-len(windows) // MANY)], below)[0], kept)

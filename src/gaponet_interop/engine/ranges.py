@@ -2,7 +2,8 @@
 
 Today: the errors of this robot's values. Any day: what sessions on several days found besides. Any robot of its type:
 what several units differ by. Days and units are drawn whole, so what goes together in all joints (a cold day) stays
-together; drawing each number alone from its range trains on robots that do not exist.
+together; drawing each number alone from its range trains on robots that do not exist. What motions show are torques
+over kp: a unit whose kp errs has its torque limit err with it, or it could not move its own friction.
 """
 
 from __future__ import annotations
@@ -78,8 +79,11 @@ def ranges(
     rng, count, alone = np.random.default_rng(seed), max(DRAWN, samples), _alone(apart)
     x = middle + np.sqrt(1 - alone) * np.einsum("sd,dnp->snp", rng.standard_normal((count, len(apart))), apart)
     x = x + np.sqrt(alone * np.square(apart).sum(axis=0)) * rng.standard_normal(x.shape)
+    limit = np.repeat(spec.effort_limit[spec.operated_index][None], count, axis=0)
     for i in range(len(joints)):
-        x[:, i] += rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
+        error = rng.multivariate_normal(np.zeros(len(fields)), covariance[i], count, method="eigh")
+        x[:, i] += error
+        limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [f not in SIGNED and f not in ("kp", "stribeck_speed") for f in fields]
     x = np.where(bounded, np.maximum(x, 0.0), x)
     drawn, value = values_of(fields, x), values_of(fields, middle)
@@ -92,7 +96,8 @@ def ranges(
         for i, j in enumerate(joints)
     }
     unknown = tuple(f"{j}: {f}" for i, j in enumerate(joints) for k, f in enumerate(fields) if lost[i, k])
-    return Ranges(spec.name, scope, {f: v[:samples] for f, v in drawn.items()}, found, unknown, tuple(notes))
+    units = {f: v[:samples] for f, v in (drawn | {"effort_limit": limit}).items()}
+    return Ranges(spec.name, scope, units, found, unknown, tuple(notes))
 
 
 def _known(spec: RobotSpec) -> Knowledge:

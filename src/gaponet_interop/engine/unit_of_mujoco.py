@@ -19,7 +19,8 @@ def units(file: Path = HERE / "randomization.json") -> dict[str, Any]:
 
 
 def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, dict[str, float]]:
-    """Set kp, damping, friction and armature of every joint to those of a unit; kd of the servos stays.
+    """Set kp, damping, friction, armature and torque limit of every joint to a unit's; kd of the servos stays, and
+    servos without a limit have none.
 
     Returns:
         Joint → what MuJoCo's model does not hold: offset (rad, added to every target), delay (s), terms of the law.
@@ -31,9 +32,12 @@ def apply(model: mujoco.MjModel, drawn: dict[str, Any], row: int) -> dict[str, d
         dof = joint.dofadr[0]
         model.dof_damping[dof] = unit.pop("damping")
         model.dof_frictionloss[dof], model.dof_armature[dof] = unit.pop("frictionloss"), unit.pop("armature")
+        limit = unit.pop("effort_limit")
         for servo in np.flatnonzero(model.actuator_trnid[:, 0] == joint.id):
             if model.actuator_trntype[servo] == mujoco.mjtTrn.mjTRN_JOINT:
                 model.actuator_gainprm[servo, 0], model.actuator_biasprm[servo, 1] = unit["kp"], -unit["kp"]
+                if model.actuator_forcelimited[servo]:
+                    model.actuator_forcerange[servo] = -limit, limit
         del unit["kp"]
         left[name] = unit
     return left

@@ -66,6 +66,7 @@ def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
     low, high = (said["ranges"]["elbow"]["kp"][k] for k in (0, 2))
     np.testing.assert_allclose([np.log(low / 16), np.log(high / 16)], [-0.0822, 0.0822], atol=0.006)
     assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
+    np.testing.assert_allclose(np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5)
 
 
 def test_what_no_log_determines_is_said(arm, tmp_path, capsys):
@@ -96,12 +97,13 @@ def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
     folder = written(arm, tmp_path / "known")
     assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
     (tmp_path / "robot.xml").write_text(
-        XML.replace("</mujoco>", '<actuator><position joint="elbow" kp="20"/></actuator></mujoco>')
+        XML.replace("</mujoco>", '<actuator><position joint="elbow" kp="20" forcerange="-3 3"/></actuator></mujoco>')
     )
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\nimport mujoco, mujoco_randomization as r\n"
         "m = mujoco.MjModel.from_xml_path(sys.argv[2]); u = r.units(); left = r.apply(m, u, 7)\n"
         "assert abs(m.actuator_gainprm[0, 0] - u['units']['kp'][7][1]) < 1e-6\n"
+        "assert abs(m.actuator_forcerange[0, 1] - u['units']['effort_limit'][7][1]) < 1e-6\n"
         "assert abs(m.dof_frictionloss[1] - u['units']['frictionloss'][7][1]) < 1e-6\n"
         "assert set(left['elbow']) == {'offset', 'delay'} and 'gaponet' not in sys.modules\n"
     )
