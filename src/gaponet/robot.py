@@ -32,7 +32,7 @@ LOG_UNITS = ("rad", "deg", "fraction")
 STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
-FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", *LAW)
+FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *LAW)
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
@@ -61,6 +61,7 @@ class RobotSpec:
         delay: Time from command to servo, (n), s.
         offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
         zero: The encoder's: the MJCF's angle is reading + zero, (n), rad.
+        target_speed: Speed of the ramp that the servo's own generator makes of targets, (n), rad/s; 0 if it makes none.
         stop_low, stop_high: Joint stops that replace the MJCF's range, (n), rad; NaN where the MJCF's stands.
         stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
             is left, rad/s.
@@ -98,6 +99,7 @@ class RobotSpec:
     delay: Array = field(default_factory=lambda: np.array(0.0))
     offset: Array = field(default_factory=lambda: np.array(0.0))
     zero: Array = field(default_factory=lambda: np.array(0.0))
+    target_speed: Array = field(default_factory=lambda: np.array(0.0))
     stribeck: Array = field(default_factory=lambda: np.array(0.0))
     stribeck_speed: Array = field(default_factory=lambda: np.array(0.0))
     friction_motor: Array = field(default_factory=lambda: np.array(0.0))

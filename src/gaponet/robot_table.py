@@ -78,6 +78,7 @@ class _Servo:
     delay: Annotated[float, Interval(ge=0, le=1)] | None = None  # s
     offset: Angle | None = None  # rad
     zero: Angle | None = None
+    target_speed: Gain | None = None  # rad/s
     stop_low: Angle | None = None
     stop_high: Angle | None = None
     stribeck: Gain | None = None  # N·m

@@ -9,6 +9,7 @@ COMMANDS = {
 PROVIDES = {
     "what is known of a robot": "gaponet_lab.known.evidence:known",
     "what recordings say": "gaponet_lab.known.evidence:evidence",
+    "servos' own ramps": "gaponet_lab.known.ramps:with_ramps",
     "identification from torque": "gaponet_lab.known.torque:rival",
     "figure of a gap": "gaponet_lab.report.gap_figure:write_gap",
     "figure of a replay": "gaponet_lab.report.replay_figure:write",

@@ -8,7 +8,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.errors import UsageError
-from gaponet.sim.batch import BatchSim, OneByOne
+from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 
 
@@ -122,3 +122,30 @@ def test_a_mujoco_without_a_batch_moves_bit_for_bit_the_same(tmp_path, monkeypat
             np.testing.assert_array_equal(sim.torque, torque)
             assert len(np.unique(torque, axis=0)) == 3
     np.testing.assert_array_equal(np.array(moved[:20]), np.array(moved[20:]))
+
+
+@pytest.mark.parametrize("rates", [(0.02, 0.02), (0.01, 0.02)])
+def test_a_servo_with_a_ramp_does_what_another_one_does_with_ramped_commands(tmp_path, rates):
+    robot = write_arm(tmp_path)
+    slow = replace(robot, target_speed=[0.5, 0.0])
+    jumps = np.repeat(np.random.default_rng(2).uniform(-1, 1, (3, 2, 2)), 30, axis=0)
+    ramps = np.stack([ramped(jumps[:, i], np.zeros(2), np.array([0.5, np.inf]), dt) for i, dt in enumerate(rates)], 1)
+    sims = [BatchSim(r, [(0.0, "both", dt) for dt in rates]) for r in (slow, robot)]
+    for sim in sims:
+        sim.reset(slice(None), np.zeros(2), 0.0, past=jumps[0][:, None])
+    assert (np.abs(np.diff(ramps[:, 0, 0])) <= 0.5 * rates[0] + 1e-12).all()
+    for t, both in enumerate(zip(jumps, ramps, strict=True)):
+        for sim, target in zip(sims, both, strict=True):
+            sim.step(target)
+        if t == 40:  # a state holds how far the ramp has come
+            state = sims[0].state()
+            sims[0].step(np.ones((2, 2)))
+            sims[0].set_state(state)
+    np.testing.assert_array_equal(sims[0].qpos, sims[1].qpos)
+
+
+def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
+    sim = BatchSim(replace(write_arm(tmp_path), target_speed=[0.5, 0.5]), [(0.0, "both", 0.02)] * 2)
+    sim.reset(slice(None), np.zeros(2), 0.0)
+    sim.step(np.ones((2, 2)), np.array([1]))
+    np.testing.assert_allclose(sim.ctrl, [[0, 0], [0.01, 0.01]])

@@ -112,7 +112,7 @@ def _steps(one: Candidate, found: list[tuple[str, RobotSpec]]) -> list[tuple[str
 
 # What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
 CAUSES = {
-    "gain": ("kp", "kd", "damping", "armature", "delay", "offset", "effort_limit"),
+    "gain": ("kp", "kd", "damping", "armature", "delay", "target_speed", "offset", "effort_limit"),
     "friction": ("frictionloss",),
     "stribeck": ("stribeck", "stribeck_speed"),
     "load": ("friction_motor", "friction_external"),

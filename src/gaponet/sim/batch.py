@@ -87,6 +87,24 @@ else:
         MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
+UNDER_WAY = (0.05, 0.1)  # rad, s: a joint stays behind its ramp by no more
+
+
+def _under_way(target: Array, qpos: Array, speed: Array) -> Array:
+    """Where a ramp towards `target` (…, n), rad, has come when the joint is at qpos: as far on as may be."""
+    most = UNDER_WAY[0] + UNDER_WAY[1] * speed
+    return np.asarray(np.clip(target, qpos - most, qpos + most))
+
+
+def ramped(ctrl: Array, qpos: Array, speed: Array, dt: float) -> Array:
+    """Targets (T, …), rad, as a servo moves them that goes at `speed` (…), rad/s, at most, from where qpos (…) is."""
+    found = np.empty_like(ctrl)
+    aim = _under_way(ctrl[0], qpos, speed)
+    for t, target in enumerate(ctrl):
+        found[t] = aim = np.clip(target, aim - speed * dt, aim + speed * dt)
+    return found
+
+
 class Condition(NamedTuple):
     """What a recording was made under: kg, side, s, and gains (n) where they are not the robot's own."""
 
@@ -150,6 +168,9 @@ class BatchSim:
         self._one_rate = bool((self.nstep == self.nstep[0]).all())
         self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
+        speed = robot.target_speed[robot.index(self.joint_names)]
+        # Most that targets move in a period, (num_envs, n); None where servos take them as they come.
+        self.most = (self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf) if speed.any() else None
 
     def array(self, values: Any) -> Array:
         """Values as this simulator's arrays are: numpy's here, tensors in sim/warp.py."""
@@ -167,6 +188,9 @@ class BatchSim:
         self.qpos[ids] = qpos
         self.qvel[ids] = qvel
         self._warmstart[ids] = 0.0
+        if self.most is not None:
+            speed = self.most[ids] / (self.nstep * self.timestep)[ids, None]
+            self.ctrl[ids] = qpos if past is None else _under_way(past[:, 0], self.qpos[ids], speed)
         if self._late is not None:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
@@ -182,6 +206,9 @@ class BatchSim:
             ctrl: Targets, (num_envs, n), rad; clipped to the joint range, as a servo would.
             ids: Only these simulations move, (k,) sorted; default all.
         """
+        if self.most is not None:
+            on = np.clip(ctrl, self.ctrl - self.most, self.ctrl + self.most)
+            ctrl = on if ids is None else np.where(np.isin(np.arange(self.num_envs), ids)[:, None], on, self.ctrl)
         np.clip(ctrl, self.range[:, 0], self.range[:, 1], out=self.ctrl)
         if self._one_rate:
             self._advance(ids, int(self.nstep[0]))
@@ -240,7 +267,8 @@ class BatchSim:
     def _state(self) -> dict[str, Array]:
         late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
         servo = {} if self.law is None else {"servo_torque": self.law.torque, "servo_load": self.law.load}
-        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo
+        aim = {} if self.most is None else {"ctrl": self.ctrl}
+        return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo | aim
 
     def data(self, env: int) -> mujoco.MjData:
         """One simulation as MjData, for rendering or forward kinematics."""

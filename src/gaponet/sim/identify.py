@@ -216,6 +216,16 @@ def identify(
         budget: s that the searches may take, the table's apart; without one results are the same on every machine.
         stops: Give joints that stayed behind several commands a stop there.
     """
+    options = (validation, windows, terms, table, shared, nthread, progress, budget, stops)
+    ramps = offered("PROVIDES").get("servos' own ramps") if validation else None
+    return named(ramps)(_identify, sequences, robot, *options) if ramps else _identify(sequences, robot, *options)
+
+
+def _identify(
+    sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence], windows: int, terms: tuple[str, ...],
+    table: bool, shared: bool, nthread: int, progress: Progress, budget: float | None, stops: bool,
+) -> Identified:  # fmt: skip
+    """What `identify` does, with targets that move as the robot's servos are said to move them."""
     clock = Clock(budget, len(terms), progress)
     given, robot = robot, with_stops(robot, sequences)  # for the fit; what nobody confirmed is taken back in the end
     heights = tip_heights(sequences, robot)

@@ -22,6 +22,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
 from gaponet.robot import LAW, RobotSpec
 from gaponet.sim import servo
+from gaponet.sim.batch import ramped
 from gaponet.sim.model import build_model
 from gaponet.sim.servo import friction_limit, present, servo_torque
 
@@ -70,8 +71,12 @@ class JointRuns:
         low, high = robot.qpos_range[self.op].T
         # (n, windows, rows) each, so that a run reads what lies side by side.
         stack = lambda xs: np.stack([_held(x, rows) for x in xs]).transpose(2, 0, 1).astype(np.float32)  # noqa: E731
-        self.ctrl = stack([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
         self.qpos = stack([p.qpos[:, self.op] for p in parts])
+        self.ctrl = stack([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
+        if (speed := robot.target_speed[self.op]).any():
+            most = np.where(speed > 0, speed, np.inf)[:, None]
+            slow = ramped(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.dt)
+            self.ctrl = np.ascontiguousarray(np.moveaxis(slow, 0, -1))
         self.qvel = stack([p.qvel[:, self.op] for p in parts])
         # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' pull, its slope.
         middle = lambda x: 0.5 * (x + np.concatenate([x[..., 1:], x[..., -1:]], axis=-1))  # noqa: E731

@@ -147,6 +147,7 @@ def model_hash(robot: RobotSpec) -> str:
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
             *([] if robot.carries_payload else ["carries no payload"]),
+            *([f"target speed {robot.target_speed}"] * bool(robot.target_speed.any())),
             *lines(build_model(robot)),
         ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]

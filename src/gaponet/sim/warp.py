@@ -18,13 +18,14 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from gaponet.errors import UsageError
-from gaponet.sim.batch import BatchSim, CommandHistory
+from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
 from gaponet.sim.servo import ServoLaw
 
 CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
 LATE = {"history": "history", "time": "time"}
 LAW = {"servo_torque": "servo_torque", "servo_load": "servo_load"}
+AIM = {"ctrl": "ctrl"}
 
 
 class _Worlds:
@@ -135,7 +136,9 @@ class WarpSim:
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
-        self._kept = STATE | (LATE if self._late else {}) | ({} if sim.law is None else LAW)
+        self._kept = (
+            STATE | (LATE if self._late else {}) | ({} if sim.law is None else LAW) | ({} if sim.most is None else AIM)
+        )
         names = [*self._kept, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
@@ -147,6 +150,7 @@ class WarpSim:
         )
         self._ids = [self.array(rows) for rows in rates]
         self._low, self._high = self.array(self.range.T)
+        self._most = None if sim.most is None else self.array(sim.most)
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._late:
             model = next(iter(sim.models.values()))
@@ -163,6 +167,10 @@ class WarpSim:
         ids = ids if isinstance(ids, slice) else self.array(ids)
         self.qpos[ids], self.qvel[ids] = self.array(qpos), self.array(qvel)
         self._all["qacc_warmstart"][ids] = 0.0
+        if self._most is not None:
+            most = UNDER_WAY[0] + UNDER_WAY[1] * self._most[ids] / (self.nstep * self.timestep)[ids, None]
+            here = self.qpos[ids]
+            self.ctrl[ids] = here if past is None else torch.clamp(self.array(past)[:, 0], here - most, here + most)
         if self._late:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
@@ -190,8 +198,10 @@ class WarpSim:
 
     def step(self, ctrl: Any, ids: Any = None) -> None:
         """The same as BatchSim.step; all are stepped, and those that should not move are put back."""
-        torch.clamp(self.array(ctrl), self._low, self._high, out=self.ctrl)
-        before = {} if ids is None else self.state()
+        before, ctrl = {} if ids is None else self.state(), self.array(ctrl)
+        if self._most is not None:
+            ctrl = torch.clamp(ctrl, self.ctrl - self._most, self.ctrl + self._most)
+        torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
         for worlds, _ in self._in_turn():
             worlds.step()
         if self._late:  # a float32 tells physics steps apart for minutes only, so the clock starts again

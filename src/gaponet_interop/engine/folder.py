@@ -173,6 +173,9 @@ def _notes(robot: RobotSpec, facts: dict[str, Any], to: str) -> tuple[str, ...]:
             told.append(
                 f"{name} met something at {at} rad in the recordings; the file keeps its range: was that a stop?"
             )
+    if robot.target_speed.any():
+        ramps = ", ".join(f"{n} {v:.3g}" for n, v in zip(robot.joint_names, robot.target_speed, strict=True) if v)
+        told.append(f"servos' own ramps ({ramps} rad/s) are in no engine: limit targets so, as check's motions have it")
     if any(s["delay"] for s in facts["plain"].values()):
         told += {"newton": ["Newton has no delays: check.py has a buffer of five lines"],
                  "drake": ["Drake has no delays: check.py has a buffer of five lines; friction is robot_cfg.py's"],

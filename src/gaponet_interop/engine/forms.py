@@ -15,7 +15,7 @@ from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.eval.candidate import read_origin
 from gaponet.robot import LAW, RobotSpec
-from gaponet.sim.batch import Condition
+from gaponet.sim.batch import Condition, ramped
 from gaponet.sim.identify import identify
 from gaponet.sim.replay import replay
 
@@ -108,4 +108,5 @@ def check_motions(recordings: ListOf[Sequence], robot: RobotSpec) -> list[Sequen
     first = {s.meta.motion: s for s in reversed(recordings)}
     low, high = robot.qpos_range.T
     parts = [s.rows(slice(0, round(LONGEST / s.dt))) for s in list(first.values())[:CHECKED]]
-    return [replace(s, ctrl=np.clip(s.ctrl, low, high)) for s in parts]
+    speed = np.where(robot.target_speed > 0, robot.target_speed, np.inf)
+    return [replace(s, ctrl=ramped(np.clip(s.ctrl, low, high), s.qpos[0], speed, s.dt)) for s in parts]
