@@ -91,7 +91,7 @@ def test_holding_for_ten_seconds_is_mujocos(name):
 
 @pytest.mark.parametrize("rates", [(0.02, 0.02, 0.02), (0.01, 0.02, 0.01)])
 def test_some_step_alone_and_a_state_comes_back(tmp_path, rates):
-    robot = replace(write_arm(tmp_path), delay=[0.03, 0.0])
+    robot = replace(write_arm(tmp_path), delay=[0.03, 0.0], target_speed=[0.0, 0.8])
     sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1), "warp-cpu")
     sim.reset(slice(None), np.zeros((3, 2)), np.zeros((3, 2)), past=np.zeros((3, 4, 2)))
     for _ in range(3):

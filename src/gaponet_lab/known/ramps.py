@@ -65,7 +65,10 @@ def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     joints = np.arange(len(op))
     speed, (power, most) = tried[best, joints], asked[:, best, joints]
     ramp = (share < LESS).all(axis=0) & (np.sqrt(power / rows.sum()) > ASKED) & (most > LONG * speed)
-    return np.where(ramp, _on_the_way(parts, np.where(ramp, speed, 1e-6)), 0.0)
+    speed[~ramp] = 0.0
+    if ramp.any():
+        speed[ramp] = _on_the_way([(c[:, ramp], q[:, ramp], dt) for c, q, dt in parts], speed[ramp])
+    return np.asarray(speed)
 
 
 def _on_the_way(parts: list[tuple[Array, Array, float]], speed: Array) -> Array:
