@@ -27,7 +27,7 @@ SHARES = np.geomspace(0.7, 1.25, 30)  # of a joint's greatest speed
 TOP = 0.995  # quantile of a speed that is its greatest
 SPAN = 0.06  # s over which a speed is seen
 SLUGGISH = (0.0, 0.02, 0.04, 0.08, 0.16, 0.32)  # s, time constants of a servo without a ramp
-LESS = 0.7  # of the error, in both halves of the recordings: a ramp
+LESS = 0.8  # of the error, in both halves of the recordings: a ramp
 ASKED, LONG = 0.02, 0.3  # rad RMS and s by which a ramp must be behind its command
 
 
