@@ -26,6 +26,7 @@ COLUMNS = {  # field → heading, factor from SI
     "armature": ("armature, g·m²", 1e3),
     "offset": ("offset, mrad", 1e3),
     "delay": ("delay, ms", 1e3),
+    "target_speed": ("ramp, rad/s", 1.0),
     "stribeck": ("more at rest, N·m", 1.0),
     "stribeck_speed": ("until, mrad/s", 1e3),
     "friction_motor": ("friction, % of motor", 1e2),

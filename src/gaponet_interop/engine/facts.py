@@ -19,7 +19,7 @@ from gaponet_interop.engine.scene_facts import joint_fields, solver_options
 UNITS = {
     "kp": "N·m/rad", "kd": "N·m·s/rad", "effort_limit": "N·m", "armature": "kg·m²", "damping": "N·m·s/rad",
     "frictionloss": "N·m", "delay": "s", "offset": "rad", "zero": "rad", "home": "rad", "range": "rad", "dt": "s",
-    "payload_mass": "kg", "stribeck": "N·m", "stribeck_speed": "rad/s", "friction_motor": "1",
+    "payload_mass": "kg", "stribeck": "N·m", "stribeck_speed": "rad/s", "target_speed": "rad/s", "friction_motor": "1",
     "friction_external": "1", "min_torque": "N·m", "encoder_step": "rad",
 }  # fmt: skip
 Joints = dict[str, dict[str, Any]]  # name → numbers of its joint and servo, SI
@@ -109,5 +109,5 @@ def _numbers(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
         "kp": float(robot.kp[i]), "kd": float(robot.kd[i]), "effort_limit": float(robot.effort_limit[i]),
         "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
         "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
-        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]),
+        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
     }  # fmt: skip
