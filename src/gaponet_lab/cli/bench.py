@@ -89,7 +89,7 @@ def _real(
     found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets, questions)
     screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
     for name, remarks in found["labels"].items():
-        screen.say(f"{name}: {'; '.join(remarks)}", "labels")
+        screen.say(f" of {name}: {'; '.join(remarks)}", "labels")
     for path in write_page(found, out):
         screen.say(f"written: {path!s}")
     screen.result(found)

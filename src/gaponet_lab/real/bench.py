@@ -166,7 +166,7 @@ class Bench:
             for q, (errors, _, _) in zip(folds, found, strict=True):
                 for s, motion, e in zip(q.test, q.motion, errors, strict=True):
                     by_motion.setdefault(motion, []).append(e)
-                    if len(columns := recorded(s, q.robot)) == 1:
+                    if len(columns := recorded(s, q.robot)) == 1 < len(q.robot.operated):
                         cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
                         cells.setdefault(cell, {}).setdefault(motion, []).append(1e3 * e)
             left = np.array([np.mean(v) for v in by_motion.values()])
