@@ -8,8 +8,9 @@ from arm import TOML, recordings, write_arm
 
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
+from gaponet.sim.axes import Bounds
 from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import Tried, _Limbs, identify, with_stops
+from gaponet.sim.identify import Tried, _Judge, _Limbs, identify, with_stops
 
 
 @pytest.fixture(scope="module")
@@ -110,3 +111,12 @@ def test_what_is_told_of_limbs_is_told_of_their_joints():
 def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, kept):
     before = np.arange(len(falls)) ** 2 + 1.0  # some motions are followed worse than others by far
     assert Tried("load", before, before * (1 - np.array(falls))).kept is kept
+
+
+def test_recordings_of_one_motion_judge_as_one(tmp_path):
+    robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
+    again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, payload_mass=0.3))]
+    values = Bounds(robot, logs).first
+    once, twice = (_Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
+    assert len(once) == len(twice) == 3
+    np.testing.assert_allclose(twice[1:], once[1:])

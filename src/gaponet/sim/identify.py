@@ -299,11 +299,12 @@ def _with_terms(
 
 
 class _Judge:
-    """Motions that were not fitted, whole, in the simulator of the whole robot."""
+    """Motions that were not fitted, whole, in the whole robot's simulator; recordings of one motion count as one."""
 
     def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
         self.runs = FreeRuns(sequences, robot, nthread, touch=_touching_rows(sequences, robot, below))
-        each = [self.runs.window == i for i in range(len(sequences))]
+        names = [s.meta.motion for s in sequences]  # repetitions, payloads and gains of one motion are one judge
+        each = [np.array([n == name for n in names])[self.runs.window] for name in dict.fromkeys(names)]
         self.motions = [rows for rows in each if rows.any()]
         self.known: dict[bytes, Array] = {}
 
