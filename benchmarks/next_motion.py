@@ -53,8 +53,8 @@ HELD, NOISE = 0.3, 4e-4  # kg of the known payload, rad of the encoder
 FIRST_ARM = 2001  # of the fleet's units: of no other benchmark
 Found = tuple[RobotSpec, Knowledge, Telling, list[int]]  # fitted, how sure, what the candidates were to tell, picked
 BASE = "at random, 32 s"
-TOGETHER = (4,)  # iterations of all joints
-MANY, JUDGES = 40, 40  # windows of a real arm that give the values others are held against, and that judge
+TOGETHER = (3,)  # iterations of all joints
+POOL, MANY, JUDGES = 90, 40, 40  # windows of a real arm: to pick among, that the values come from, that judge
 SETS = {
     "nothing more": 0.0, "chosen, 32 s": 32.1, "farthest first, 32 s": 32.1, "at random, 32 s": 32.1,
     "at random, 64 s": 64.1,
@@ -70,8 +70,9 @@ def fitted(
     fit = Fit(JointRuns(cut(logs, 10**6), robot, below, nthread=1), robot, bounds)
     begin = bounds.start if start is robot else {f: own.first[f] for f in CLASSIC}
     alone = fit.search(CLASSIC, begin, clock, "")
+    fit.learn_lasting(alone)
     whole = Fit(fit.runs, robot, bounds, FreeRuns(fit.runs.parts, robot, 1, touch=fit.runs.touch))
-    whole.noise = fit.noise
+    whole.noise, whole.lasts = fit.noise, fit.lasts
     first = Axes(whole.bounds, CLASSIC, bounds.start).of(alone)[None]
     values = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "")
     whole.uncertainty(values)
@@ -228,7 +229,7 @@ def real(folder: Path, day: Path, work: Path, draws: int) -> None:
     for k in range(len(done), draws):
         began, rng = time.process_time(), np.random.default_rng([k, 7])
         order = rng.permutation(len(windows))
-        before, rest = [windows[i] for i in order[:3]], [windows[i] for i in order[3:]]
+        before, rest = [windows[i] for i in order[:3]], [windows[i] for i in order[3 : 3 + POOL]]
         record = lambda p: [rest[i] for i in p]  # noqa: E731, B023
         found, _, _ = compared(robot, before, rest, record, rng, work / "robot", below)
         line = {name: judged(whole, best, wrong, *of) for name, of in found.items()}

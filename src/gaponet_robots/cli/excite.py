@@ -124,7 +124,7 @@ def _tell(screen: Out, spec: RobotSpec, now: dict[str, dict[str, float]], then: 
     fields = [f for f in next(iter(now.values())) if any(by[f] > 0 for by in now.values())]
     for start in range(0, len(fields), WIDE):
         part = fields[start : start + WIDE]
-        title = f"{spec.name}: standard errors, now → expected" if start == 0 else "The same"
+        title = f"{spec.name}: standard errors, now → at best" if start == 0 else "The same"
         screen.table(title, ["joint", *(COLUMNS[f][0] for f in part)], [
             [j, *(" → ".join(f"{float(f'{by[j][f] * COLUMNS[f][1]:.2g}'):g}" for by in (now, then)) for f in part)]
             for j in now
