@@ -113,9 +113,9 @@ def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, kept):
     assert Tried("load", before, before * (1 - np.array(falls))).kept is kept
 
 
-def test_recordings_of_one_motion_judge_as_one(tmp_path):
+def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
     robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
-    again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, payload_mass=0.3))]
+    again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
     values = Bounds(robot, logs).first
     once, twice = (_Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
     assert len(once) == len(twice) == 3

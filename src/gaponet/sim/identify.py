@@ -299,12 +299,13 @@ def _with_terms(
 
 
 class _Judge:
-    """Motions that were not fitted, whole, in the whole robot's simulator; recordings of one motion count as one."""
+    """Motions that were not fitted, whole, in the whole robot's simulator; repetitions count as one."""
 
     def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
         self.runs = FreeRuns(sequences, robot, nthread, touch=_touching_rows(sequences, robot, below))
-        names = [s.meta.motion for s in sequences]  # repetitions, payloads and gains of one motion are one judge
-        each = [np.array([n == name for n in names])[self.runs.window] for name in dict.fromkeys(names)]
+        # Repetitions and gains of what one unit plays with one payload are one judge.
+        of = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
+        each = [np.array([one == key for one in of])[self.runs.window] for key in dict.fromkeys(of)]
         self.motions = [rows for rows in each if rows.any()]
         self.known: dict[bytes, Array] = {}
 
