@@ -96,10 +96,7 @@ def keeper(artifact: Path) -> Path:
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO}
-    told = {
-        name: value
-        for name, value in values.items()
-        if np.isfinite(value) and (value or name not in (*LAW, "target_speed"))
-    }
+    none = (*LAW, "target_speed")  # where they are 0
+    told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in none)}
     lines = [f"{name} = {value!r}\n" for name, value in told.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)

@@ -107,11 +107,11 @@ class Identified:
     Attributes:
         robot: The same robot with identified parameters; as it was given where nothing did better.
         before, after: Mean |error| of the motions that judged, rad: of the given robot, of this one.
-        chosen: What did best: given, joints (each on its own), whole (all together), limbs (as one), mixed, or torque.
+        chosen: What did best: given, joints (each alone), whole (all together), limbs (as one), mixed, torque or ramp.
         warnings: What ended at a bound, what to look at, and what the recordings do not determine (last).
         undetermined: Joint → fields that the recordings do not determine; all of a joint that is never moved.
         std: Joint → field → standard error; none of a shared law.
-        tried: The terms of the law in the order tried; then torque, by motions.
+        tried: The terms of the law in the order tried; then torque and ramps, by motions.
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
         by_joint: Joint → mean |error| before and after, rad.
@@ -216,14 +216,15 @@ def identify(
         budget: s that the searches may take, the table's apart; without one results are the same on every machine.
         stops: Give joints that stayed behind several commands a stop there.
     """
-    options = (validation, windows, terms, table, shared, nthread, progress, budget, stops)
+    options = (validation, windows, terms, table, shared, nthread, progress, stops)
+    fit = lambda one, seconds: _identify(sequences, one, *options, seconds)  # noqa: E731
     ramps = offered("PROVIDES").get("servos' own ramps") if validation else None
-    return named(ramps)(_identify, sequences, robot, *options) if ramps else _identify(sequences, robot, *options)
+    return named(ramps)(fit, sequences, robot, validation, budget) if ramps else fit(robot, budget)
 
 
 def _identify(
     sequences: ListOf[Sequence], robot: RobotSpec, validation: ListOf[Sequence], windows: int, terms: tuple[str, ...],
-    table: bool, shared: bool, nthread: int, progress: Progress, budget: float | None, stops: bool,
+    table: bool, shared: bool, nthread: int, progress: Progress, stops: bool, budget: float | None,
 ) -> Identified:  # fmt: skip
     """What `identify` does, with targets that move as the robot's servos are said to move them."""
     clock = Clock(budget, len(terms), progress)

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from gaponet.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import ramped
-from gaponet.sim.identify import ALONE_BETTER, Identified, Tried
+from gaponet.sim.identify import Identified, Tried
 from gaponet.sim.replay import whole_errors
 
 FINEST, LATEST, LAGS = 0.01, 0.3, 16  # s between rows, s of lag, and how many lags
@@ -34,14 +33,16 @@ ASKED, LONG = 0.02, 0.3  # rad RMS and s by which a ramp must be behind its comm
 def target_speeds(sequences: ListOf[Sequence], robot: RobotSpec) -> Array:
     """Speed of each operated joint's ramp, (n,), rad/s; 0 where a sluggish servo explains the state as well."""
     op = robot.operated_index
-    if len(sequences) < 2:
-        return np.zeros(len(op))
     low, high = robot.qpos_range[op].T
     parts = []
     for s in sequences:
+        if s.duration < 2 * LATEST:
+            continue
         every = max(1, round(FINEST / s.dt))
         ctrl, qpos = np.clip(s.ctrl[::every, op], low, high).astype(float), s.qpos[::every, op].astype(float)
         parts.append((ctrl, qpos, every * s.dt))
+    if len(parts) < 2:
+        return np.zeros(len(op))
     span = [max(1, round(SPAN / dt)) for _, _, dt in parts]
     speeds = [np.abs(q[k:] - q[:-k]) / (k * dt) for (_, q, dt), k in zip(parts, span, strict=True) if len(q) > k]
     top = np.quantile(np.concatenate(speeds), TOP, axis=0)  # (n,)
@@ -79,7 +80,7 @@ def _on_the_way(parts: list[tuple[Array, Array, float]], speed: Array) -> Array:
         k, late = max(1, round(SPAN / dt)), round(LONG / 2 / dt)  # so late the joint goes as its ramp does
         moved = np.abs(qpos[late + k :] - qpos[late:-k]) / (k * dt)
         seen.append(np.where(behind[: len(moved)] > LONG / 2 * speed, moved, np.nan))
-    return np.asarray(np.nanmedian(np.concatenate(seen), axis=0))
+    return np.asarray(np.nanmedian(np.concatenate([*seen, speed[None]]), axis=0))
 
 
 def _sluggish(ctrl: Array, dt: float) -> Array:
@@ -93,34 +94,39 @@ def _sluggish(ctrl: Array, dt: float) -> Array:
 
 
 def with_ramps(
-    fit: Callable[..., Identified],
+    fit: Callable[[RobotSpec, float | None], Identified],
     sequences: ListOf[Sequence],
     robot: RobotSpec,
     validation: ListOf[Sequence],
-    *options: Any,
+    budget: float | None,
 ) -> Identified:
     """What `fit` finds of a robot; with ramps where the recordings show some and motions that were not fitted are
-    followed better by a tenth.
+    surely followed better.
 
     Args:
-        fit: Takes recordings, a robot, recordings that judge, and the options.
+        fit: Takes a robot to start from and the time that it may take, s.
         sequences: Recordings that are fitted.
         robot: Where the fit starts; the ramps that it has are believed.
-        validation: Others, which judge.
-        options: Handed on.
+        validation: Others, which judge, motion by motion.
+        budget: Time for all fits together, s; None for as long as they take.
     """
-    made = fit(sequences, robot, validation, *options)
     speeds = {} if robot.target_speed.any() else dict(zip(robot.operated, target_speeds(sequences, robot), strict=True))
     slow = {j: {"target_speed": float(f"{v:.3g}")} for j, v in speeds.items() if v}
     if not slow:
-        return made
-    other = fit(sequences, robot.with_servos(slow), validation, *options)
-    tried = Tried("ramp", *(whole_errors(validation, m.judged or m.robot) for m in (made, other)))
-    if not tried.kept or tried.gain[0] < ALONE_BETTER * tried.before.mean():
+        return fit(robot, budget)
+    made, other = (fit(r, budget and budget / 2) for r in (robot, robot.with_servos(slow)))
+    motions = np.array([s.meta.motion for s in validation])
+    of = [motions == m for m in dict.fromkeys(motions.tolist())]
+    left = [whole_errors(validation, m.judged or m.robot) for m in (made, other)]
+    tried = Tried("ramp", *(np.array([e[rows].mean() for rows in of]) for e in left))
+    if not tried.kept:
         return replace(made, tried=(*made.tried, tried))
     told = ", ".join(f"{joint} {v['target_speed']:.3g}" for joint, v in slow.items())
     warning = (
         f"servos move their targets at most so fast, rad/s: {told}. That is a setting of theirs (profile velocity, "
         "goal speed): recorded and run with the same one, it is in the simulator; engines that load an export know none"
     )
-    return replace(other, before=made.before, tried=(*other.tried, tried), warnings=(warning, *other.warnings))
+    return replace(
+        other, before=made.before, chosen=other.chosen if other.better else "ramp", tried=(*other.tried, tried),
+        warnings=(warning, *other.warnings),
+    )  # fmt: skip
