@@ -78,12 +78,15 @@ def import_logs(
         )  # fmt: skip
 
 
-def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> Diagnosis:
+def doctor(
+    dataset: Dataset | Place, robot: RobotSpec | Place | None = None, executor: str | Executor = "local"
+) -> Diagnosis:
     """Look through a dataset: order, sign, unit, range, rate, gaps, saturation, stuck channels, lag, sag, torque.
 
     Args:
         dataset: Recordings; also the address of a dataset that was pushed to a bucket.
         robot: Another robot than the one that the dataset keeps.
+        executor: Where recordings are looked at that were not yet, if they are many: as for `pair`.
 
     Returns:
         verdict, one sentence; findings, worst first; one row of numbers per sequence and per joint.
@@ -92,13 +95,12 @@ def doctor(dataset: Dataset | Place, robot: RobotSpec | Place | None = None) -> 
         DatasetError: The folder is no dataset, or damaged.
     """
     from gaponet.data.doctor import Diagnosis
-    from gaponet.sim.dynamics import gravity_of
-    from gaponet.sim.touching import tip_heights
+    from gaponet.sim.dynamics import gravity_of, tips_of
+    from gaponet.sim.model import model_hash
 
     data, spec = _opened(dataset, robot)
     with bar("examining") as update:
-        heights = (lambda sequence: tip_heights([sequence], spec)[0]) if spec.tips else None
-        return Diagnosis.of(data, spec, update, gravity_of(spec), heights)
+        return Diagnosis.of(data, spec, update, gravity_of(spec), tips_of(spec), model_hash(spec), executor)
 
 
 def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, executor: str | Executor = "local") -> int:

@@ -17,4 +17,7 @@ FORMATS = {
     name: f"gaponet_interop.formats.{name}" for name in ("lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")
 }
 WRITERS = {name: f"gaponet_interop.writers.{name}" for name in ("lerobot", "asap", "mcap")}
-PROVIDES = {"dataset behind an address": "gaponet_interop.share.stream:Streamed"}
+PROVIDES = {
+    "dataset behind an address": "gaponet_interop.share.stream:Streamed",
+    "strangers' pickles": "gaponet_interop.formats.pickles:load",
+}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,11 +14,13 @@ from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.rests import rests
-from gaponet.data.checks.touching import Heights, Standing, touching
+from gaponet.data.checks.touching import Heights, touching
+from gaponet.data.looked import Looked
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey
 from gaponet.errors import DatasetError
+from gaponet.executor import LOCAL
 from gaponet.progress import Progress, silent
 from gaponet.robot import RobotSpec
 
@@ -61,29 +64,27 @@ class Diagnosis:
         progress: Progress = silent,
         model: Gravity | None = None,
         heights: Heights | None = None,
+        simulator: str = "",
+        executor: str | Executor = LOCAL,
     ) -> Diagnosis:
-        """Survey every sequence, one in memory at a time, and judge them together.
+        """Survey every sequence that was not yet, and judge them together; what is found of each is kept (data.looked).
 
         Args:
             robot: The dataset's robot.
             model: Gravity of the nominal model, to tell wrong zeros and signs from torques; default: not looked for.
-            heights: Lowest tip of a sequence in every row, m, to tell motions that press on something; needs `model`.
+            heights: Lowest tip in postures, m, to tell motions that press on something; needs `model`.
+            simulator: Hash of the model that both are of.
+            executor: Where much that is new is looked at; default: on this machine's cores.
         """
         dataset.require_robot(robot)
         if not dataset.entries:
             raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-        surveys: list[Survey] = []
-        stands: list[Standing] = []
-        for entry in dataset.entries:
-            sequence = dataset.read(entry)
-            surveys.append(Survey.of(entry, sequence, robot))
-            if model is not None and heights is not None:
-                stands.append(Standing.of(sequence, robot, heights, model))
-            progress(len(surveys), len(dataset), entry.meta.motion)
+        looked = Looked(dataset, robot, model, heights, simulator)
+        surveys = looked.surveys(progress, executor)
         findings = [f for check in CHECKS for f in check(surveys, robot)]
         if model is not None:
             findings += _weighed(findings, surveys, robot, model)
-        findings += touching(stands)
+        findings += touching(looked.sample, looked.standing)
         findings.sort(key=lambda f: -LEVELS.index(f.level))
         return Diagnosis(findings, [_sequence_row(s, robot) for s in surveys], _joint_rows(surveys, robot))
 

@@ -6,6 +6,7 @@
     offsets.json            static offsets of each unit as fitted at import (data.offsets); recorded, never applied
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
     twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
+    surveys/<id>            what the doctor found in each (data.looked)
     card.json, CARD.md      what is in it (data.card)
     splits/<name>.json      which sequences are for training, validation, test (data.split)
 
@@ -49,7 +50,7 @@ from gaponet.structure import Name, parse_json, read_format
 
 FORMAT = 1
 MEND = "restore the file or import the log again"
-KIND, JOURNAL = "dataset", "sequences.jsonl"
+KIND, JOURNAL, SURVEYS = "dataset", "sequences.jsonl", "surveys"
 LIST_S = 1.0  # of many recordings that are appended
 LARGEST_TABLE = 1 << 30  # bytes of what is read of one sequence at once
 
@@ -276,7 +277,11 @@ class Dataset:
             kept = [line for line, e in zip(lines, self.entries, strict=True) if e not in gone]
             write_text(self.path / JOURNAL, b"".join(kept).decode())
             for entry in gone:  # unlisted files are none of the dataset's, should this be cut short
-                for file in (self._file(entry), *self.path.glob(f"twins/*/{entry.id}.parquet")):
+                for file in (
+                    self._file(entry),
+                    self.path / SURVEYS / entry.id,
+                    *self.path.glob(f"twins/*/{entry.id}.parquet"),
+                ):
                     file.unlink(missing_ok=True)
             self._load()
         return gone

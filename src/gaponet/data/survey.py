@@ -74,7 +74,7 @@ class Survey:
             where the joint does not move.
         as_velocity, as_torque: Correlation of the command with the measured velocity and torque, (n).
         halted_s: Longest time for which all joints stood at once while the commands of half of them moved on, s.
-        loads: Joint angles and torques, (k, n) each, in slow rows; None where no torque was recorded.
+        loads: Joint angles and torques, (2, k, n), in slow rows; None where no torque was recorded.
     """
 
     entry: Entry
@@ -107,7 +107,7 @@ class Survey:
     as_velocity: Array
     as_torque: Array
     halted_s: float
-    loads: tuple[Array, Array] | None
+    loads: Array | None
 
     @property
     def motion(self) -> str:
@@ -245,12 +245,12 @@ def _dropped(sequence: Sequence, notes: dict[str, Any], robot: RobotSpec) -> int
     return count
 
 
-def _loads(sequence: Sequence) -> tuple[Array, Array] | None:
+def _loads(sequence: Sequence) -> Array | None:
     if sequence.tau is None:
         return None
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW).all(axis=1))
     rows = slow[:: max(1, len(slow) // LOADS)]
-    return sequence.qpos[rows].astype(float), sequence.tau[rows].astype(float)
+    return np.stack([sequence.qpos[rows], sequence.tau[rows]]).astype(float)
 
 
 def _qvel_gain(sequence: Sequence) -> Array:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import mujoco
 import numpy as np
 
-from gaponet.robot import RobotSpec
+from gaponet.robot import RobotSpec, Tip
 from gaponet.sim.model import build_model
 
 Array = np.ndarray
@@ -46,12 +48,33 @@ def static_torque(model: mujoco.MjModel, qpos: Array) -> Array:
 
 def gravity_of(robot: RobotSpec) -> Callable[[Array, float, str], Array]:
     """Gravity of the nominal model with a payload, as data.offsets wants it; each model is compiled once."""
-    models: dict[tuple[float, str], mujoco.MjModel] = {}
+    return partial(_gravity, robot, {})  # other processes can be given it
 
-    def gravity(qpos: Array, payload_mass: float, payload_side: str) -> Array:
-        key = (payload_mass, payload_side)
-        if key not in models:
-            models[key] = build_model(robot, *key)
-        return static_torque(models[key], qpos)
 
-    return gravity
+def _gravity(
+    robot: RobotSpec,
+    models: dict[tuple[float, str], mujoco.MjModel],
+    qpos: Array,
+    payload_mass: float,
+    payload_side: str,
+) -> Array:
+    key = (payload_mass, payload_side)
+    if key not in models:
+        models[key] = build_model(robot, *key)
+    return static_torque(models[key], qpos)
+
+
+def tips_of(robot: RobotSpec) -> Callable[[Array], Array] | None:
+    """Lowest point of any tip in postures (k, n), (k,) m; None where robot.toml names no tip."""
+    return partial(_lowest_tip, build_model(replace(robot, table=None), bare=True), robot.tips) if robot.tips else None
+
+
+def _lowest_tip(model: mujoco.MjModel, tips: tuple[Tip, ...], postures: Array) -> Array:
+    data, height = mujoco.MjData(model), np.full(len(postures), np.inf)
+    at = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in tips]
+    qpos, xpos, xmat = data.qpos, data.xpos, data.xmat  # views, looked up once
+    for t, row in enumerate(postures):
+        qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        height[t] = min(xpos[b, 2] + xmat[b, 6:] @ p - r for b, p, r in at)
+    return height

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 from scipy.optimize import Bounds, OptimizeResult, differential_evolution
 
@@ -18,8 +17,8 @@ from gaponet.data.sequence import Sequence
 from gaponet.metrics import standard_error
 from gaponet.robot import RobotSpec, Table
 from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.dynamics import tips_of
 from gaponet.sim.joint_runs import SETTLE, SOFT
-from gaponet.sim.model import build_model
 from gaponet.sim.multistart import soft
 from gaponet.sim.replay import idle_limbs, rollout, whole_errors
 from gaponet.sim.table import write_table
@@ -58,20 +57,8 @@ class Touch:
 
 def tip_heights(sequences: ListOf[Sequence], robot: RobotSpec) -> list[Array]:
     """Lowest point of any tip in every row, (rows,) m; none where robot.toml names no tip."""
-    if not robot.tips:
-        return []
-    model = build_model(replace(robot, table=None), bare=True)
-    data = mujoco.MjData(model)
-    tips = [(model.body(tip.body).id, np.array(tip.pos), tip.radius) for tip in robot.tips]
-    found, qpos, xpos, xmat = [], data.qpos, data.xpos, data.xmat  # views, looked up once
-    for s in sequences:
-        height = np.full(len(s), np.inf)
-        for t, row in enumerate(s.qpos):
-            qpos[:] = row
-            mujoco.mj_kinematics(model, data)
-            height[t] = min(xpos[b, 2] + xmat[b, 6:] @ p - r for b, p, r in tips)
-        found.append(height)
-    return found
+    heights = tips_of(robot)
+    return [heights(s.qpos) for s in sequences] if heights else []
 
 
 def touching_below(robot: RobotSpec, heights: ListOf[Array]) -> float:

@@ -2,7 +2,7 @@
 
 `action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's configuration. A file
 of ours says scale and default positions itself; for others logs.toml says action_scale, and home in robot.toml is the
-default position. Joints have no names in it: logs.toml lists them. Opened as data.formats.pickles says: nothing runs.
+default position. Joints have no names in it: logs.toml lists them. Opened as formats.pickles says: nothing runs.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, restated
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.formats import DESCRIBED, files_under
 from gaponet.data.sequence import OPTIONAL
 from gaponet.errors import LogError
 from gaponet.process.sandbox import inside
 from gaponet.structure import LARGEST_ARRAYS, parse_json
+from gaponet_interop.formats import pickles
 
 OPTIONS = DESCRIBED
 EXTRA = ""

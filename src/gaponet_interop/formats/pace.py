@@ -1,6 +1,6 @@
 """PACE's .pt, or a folder of them: time, dof_pos, des_dof_pos as tensors or NumPy arrays, gains where it states them.
 
-Nothing pickled runs and torch is not needed (data.formats.pickles). The file does not name its joints; without joints
+Nothing pickled runs and torch is not needed (formats.pickles). The file does not name its joints; without joints
 in logs.toml the robot's own order is not assumed either. kp and kd, one number a joint or one for all, are the gains
 while recording. Files of other names work as well: logs.toml says which tensor is what.
 """
@@ -16,10 +16,11 @@ import numpy as np
 
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading
-from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.formats import DESCRIBED, files_under
 from gaponet.errors import LogError
 from gaponet.process.sandbox import inside
 from gaponet.structure import LARGEST_ARRAYS
+from gaponet_interop.formats import pickles
 
 OPTIONS = DESCRIBED
 EXTRA = ""

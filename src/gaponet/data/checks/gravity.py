@@ -151,7 +151,7 @@ def _torques(surveys: list[Survey]) -> Loads:
     told = [s for s in surveys if s.loads is not None and s.torque is not None]
     if not any((s.torque.low < 0).any() for s in told if s.torque):
         return {}
-    return _joined((s, s.loads) for s in told if s.loads)
+    return _joined((s, (s.loads[0], s.loads[1])) for s in told if s.loads is not None)
 
 
 def _rests(surveys: list[Survey], robot: RobotSpec) -> Loads:

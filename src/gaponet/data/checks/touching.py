@@ -6,7 +6,7 @@ leave it where tips are high, and the servos draw more current.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +17,7 @@ from gaponet.data.offsets import Gravity
 from gaponet.data.sequence import Sequence
 from gaponet.robot import RobotSpec
 
-Heights = Callable[[Sequence], Array]  # lowest tip in every row, m
+Heights = Callable[[Array], Array]  # lowest tip in postures (k, n), (k,) m
 
 LOW, HIGH = 0.03, 0.05  # m above the lowest tip of all
 STANDS = 0.05  # rad/s
@@ -42,14 +42,20 @@ class Standing:
         op, meta = robot.operated_index, sequence.meta
         sequence = sequence.rows(slice(None, None, max(1, round(1 / (RATE * sequence.dt)))))
         still = np.flatnonzero(np.abs(sequence.qvel[:, op]).max(axis=1) < STANDS)
-        qpos = sequence.qpos[still]  # of a hundred hours, all of these are kept
+        qpos = sequence.qpos[still]
         load = gravity(qpos.astype(float), meta.payload_mass, meta.payload_side)[:, op].astype(np.float32)
         torque = np.zeros(len(still)) if sequence.tau is None else np.abs(sequence.tau)[still][:, op].max(axis=1)
-        return Standing(meta.motion, heights(sequence)[still], (sequence.ctrl[still] - qpos)[:, op], load, torque)
+        return Standing(meta.motion, heights(qpos), (sequence.ctrl[still] - qpos)[:, op], load, torque)
+
+    def every(self, step: int) -> Standing:
+        """One row in so many, and the lowest, in memory of their own."""
+        rows = np.arange(0, len(self.height), step)
+        rows = np.union1d(rows, self.height.argmin()) if len(rows) else rows
+        return Standing(self.motion, self.height[rows], self.error[rows], self.load[rows], self.torque[rows])
 
 
-def touching(found: list[Standing]) -> Iterator[Finding]:
-    """Which motions press on something?"""
+def touching(found: list[Standing], every: Callable[[], Iterable[Standing]]) -> Iterator[Finding]:
+    """Which motions press on something? What is usual is told from a sample, and then each of `every` is looked at."""
     if not found:
         return
     height, error, load, torque = (
@@ -65,7 +71,7 @@ def touching(found: list[Standing]) -> Iterator[Finding]:
     beyond = lambda e, g: np.abs(e - sag * g - rest)  # noqa: E731
     usual = np.percentile(beyond(error[high], load[high]), 95, axis=0)
     pressed: dict[str, int] = {}
-    for s in found:
+    for s in every():
         further = (beyond(s.error, s.load) > MORE * usual).any(axis=1)
         hit = (s.height < lowest + LOW) & further & (s.torque >= CURRENT * drawn)
         if hit.sum() >= ROWS:
