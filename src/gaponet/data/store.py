@@ -12,7 +12,7 @@
 
 A sequence is written to a temporary file, renamed, on the disk, and only then listed (of many, once a second): a file
 that is not listed does not exist, nor does a line cut short by a crash. One process writes at a time (gaponet.files);
-reading needs no lock and changes nothing. Real data is never rewritten; twins can be computed again.
+reading needs no lock and changes no recording. Real data is never rewritten; twins can be computed again.
 """
 
 from __future__ import annotations
