@@ -146,7 +146,7 @@ class Rows:
         if not (folder / "model" / "card.json").is_file():
             run("train", self.bench.data.path, "--robot", robot.folder, "--out", folder, "--model", model,
                 "--budget", self.budget, "--seed", seed, *self.held_out(),
-                *[word for option in more for word in f"--{option}".split("=")],
+                *[word for option in more for word in f"--{option}".replace("=", " ").split()],
                 *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
         return folder
 

@@ -38,10 +38,9 @@ class FirstRow:
         return low
 
 
-@pytest.mark.parametrize("change", [{}, {"delta_hold": 3}], ids=["plain", "delta held"])
-def test_training_and_free_run_give_the_network_the_same_numbers(change, tmp_path):
+def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path):
     robot = write_arm(tmp_path)
-    config = ModelConfig(history=2, stride=2, num_probes=3, **change)
+    config = ModelConfig(history=2, stride=2, num_probes=3)
     sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
     free: list = []
 
@@ -56,31 +55,9 @@ def test_training_and_free_run_give_the_network_the_same_numbers(change, tmp_pat
     trained = []
     while not env.ended()[0]:
         trained.append(env.get_observations()["actor"].numpy())
-        for _ in range(config.delta_hold):
-            env.advance(np.full((1, 2), 0.01, np.float32))
-    assert len(trained) == 13 // config.delta_hold
+        env.advance(np.full((1, 2), 0.01, np.float32))
+    assert len(trained) == 13
     np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
-
-
-def test_a_correction_is_held(tmp_path):
-    robot = write_arm(tmp_path)
-    answers = iter(np.arange(1, 100) / 1000)
-    holding = corrector(lambda x: np.full((1, 2), next(answers)), ModelConfig(delta_hold=3), robot)
-    sequence = recordings(robot, 1, rows=9)
-    twin = replay(sequence, robot, holding, nthread=1)[0]
-    added = np.round((twin.ctrl - sequence[0].ctrl)[:8, 0] * 1000)
-    assert added.tolist() == [1, 1, 1, 2, 2, 2, 3, 3]
-
-
-def test_robots_decide_at_their_own_times_where_one_began_later():
-    config, answers = ModelConfig(delta_hold=3), iter(np.arange(1, 100) / 1000)
-    network = FunctionNetwork(lambda x: np.full((2, 2), next(answers)), config.input_dim(2), 2)
-    loop, state, added = DeltaLoop(config, LIMITS, 2, network), np.zeros((2, 2)), []
-    for t in range(6):
-        if t == 1:
-            loop.reset(np.array([1]))
-        added.append(np.round(loop.delta(state, state, state, 0.0)[:, 0] * 1000).tolist())
-    assert added == [[1, 1], [1, 2], [1, 2], [3, 2], [3, 4], [3, 4]]
 
 
 class TorchRule:
@@ -98,7 +75,7 @@ class TorchRule:
         return Bound(x, delta, lambda: delta.copy_(x @ weights))
 
 
-@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"delta_hold": 2}, {"payload_input": False}])
+@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"payload_input": False}])
 def test_torch_and_numpy_arrays_give_the_same_corrections(change):
     config = ModelConfig(**{"history": 3} | change)
     rule, rng = TorchRule(config), np.random.default_rng(1)

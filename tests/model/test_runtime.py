@@ -48,13 +48,11 @@ def artifact(robot, tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [
-        {}, {"coupling": "full"}, {"sensors": "off"}, {"sensors": "off", "coupling": "full"},
-        {"branch_history": False}, {"branch_history": False, "coupling": "full"},
+        {}, {"coupling": "full"}, {"sensors": "predicted"}, {"sensors": "predicted", "coupling": "full"},
         {"payload_input": False}, {"payload_input": False, "coupling": "full"},
-        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensor_hidden": (16,)},
+        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensors": "predicted", "sensor_hidden": (16,)},
         {"branch_hidden": (16, 8), "trunk_hidden": (8,)}, {"kind": "shared_mlp"},
-        {"kind": "shared_mlp", "sensors": "off", "payload_input": False},
-        {"kind": "shared_mlp", "branch_history": False},
+        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
     ],
 )  # fmt: skip
 def test_the_fused_form_is_the_network(how):
@@ -132,7 +130,7 @@ def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
 @pytest.mark.parametrize(
     "how",
     [
-        {"kind": "transformer"}, {"kind": "fno"}, {"delta_hold": 2},
+        {"kind": "transformer"}, {"kind": "fno"},
         {"kind": "mlp", "mlp_match": True},
     ],
 )  # fmt: skip
@@ -196,14 +194,6 @@ def test_other_shapes_are_refused(artifact):
         loop.delta(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), 0.0)
     with pytest.raises(UsageError, match="give the 2 operated joints"):
         loop.delta(np.zeros(3), np.zeros(2), np.zeros(2), 0.0)
-
-
-def test_the_torch_export_refuses_what_it_does_not_hold(robot, tmp_path):
-    how = {"delta_hold": 2}
-    net = trained(**how)
-    export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), torch.randn(20, net.config.input_dim(2)).numpy())
-    with pytest.raises(ModelError, match="which torch exports do not; train"):
-        export_program(GapModel.load(tmp_path), tmp_path, tmp_path)
 
 
 def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):

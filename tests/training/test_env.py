@@ -119,33 +119,13 @@ def test_the_actor_never_sees_the_recorded_state(robot):
     assert not torch.equal(before["critic"], after["critic"])
 
 
-def hold_env(robot, hold, rows=60):
-    sequences = recordings(robot, 2, rows=rows, kp=0.6)
-    return DeltaEnv(sequences, robot, ModelConfig(delta_hold=hold), 8, 1000, RewardConfig(), seed=0, nthread=1)
-
-
-def test_a_held_correction_earns_the_mean_reward_of_its_periods(robot):
-    held, single = hold_env(robot, 3), hold_env(robot, 1)
-    single.rng = np.random.default_rng(5)
-    single.reset()
-    for name in ("row", "first", "last", "group"):
-        getattr(held, name)[:] = getattr(single, name)
-    held.sim.reset(slice(None), single.sim.qpos, single.sim.qvel)
-    action = np.full((8, 2), 0.02, np.float32)
-    alive = single.row + 3 <= single.last
-    rewards = [single.step(action)[0] for _ in range(3)]
-    reward, _ = held.step(action)
-    assert alive.sum() >= 4
-    np.testing.assert_allclose(reward[alive], np.mean(rewards, axis=0)[alive], rtol=1e-5)
-
-
-def test_a_decision_never_runs_past_the_end_of_a_motion(robot):
-    env = hold_env(robot, 4, rows=10)
+def test_a_step_never_runs_past_the_end_of_a_motion(robot):
+    env = DeltaEnv(recordings(robot, 2, rows=10), robot, ModelConfig(), 8, 1000, RewardConfig(), seed=0, nthread=1)
     for _ in range(12):
-        assert (env.row + 4 <= env.last).all()
+        assert (env.row < env.last).all()
         env.step(np.zeros((8, 2), np.float32))
 
 
-def test_a_motion_shorter_than_a_decision_is_refused(robot):
-    with pytest.raises(UsageError, match=r"motion motion0 has 4 rows, .* lower --model\.delta-hold"):
-        hold_env(robot, 4, rows=4)
+def test_a_motion_of_one_row_is_refused(robot):
+    with pytest.raises(UsageError, match="motion motion0 has 1 row and a step needs two"):
+        DeltaEnv(recordings(robot, 2, rows=1), robot, ModelConfig(), 8, 1000, RewardConfig())

@@ -25,7 +25,7 @@ def test_moving_a_posture_changes_no_relative_feature():
 def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path):
     torch.manual_seed(0)
     robot = write_arm(tmp_path)
-    config = ModelConfig(history=2, num_probes=4, sensor_hidden=(64, 64))
+    config = ModelConfig(history=2, sensors="predicted", num_probes=4, sensor_hidden=(64, 64))
     env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
     report = fit_inputs(net, env, env.get_observations()["actor"], 2048, seed=0)

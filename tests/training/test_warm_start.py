@@ -1,6 +1,4 @@
-"""The supervised start: labels of held corrections, the baseline's recipe, the sensor predictor's features."""
-
-from dataclasses import replace
+"""The supervised start: the baseline's recipe, the sensor predictor's features."""
 
 import numpy as np
 import pytest
@@ -40,14 +38,3 @@ def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
     assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
-
-
-def test_a_held_correction_has_the_mean_label_of_its_rows(fitted):
-    held = replace(fitted.net.config, delta_hold=3)
-    env = DeltaEnv(
-        recordings(fitted.env.robot, 1, rows=10), fitted.env.robot, held, 2, 10**9, RewardConfig(), nthread=1
-    )
-    labels = np.zeros((10, 2), np.float32)
-    labels[:4, 0] = [1.0, 2.0, 6.0, 4.0]
-    found = WarmStart(fitted.net, env, labels, WarmStartConfig(num_envs=2, steps=4), seed=0).labels
-    assert found[:2, 0].tolist() == [3.0, 4.0]

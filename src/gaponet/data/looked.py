@@ -166,7 +166,7 @@ def _leaves(found: object, within: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _unpacked(content: bytes) -> dict[str, Any]:
-    """By name; views of the bytes."""
+    """Arrays by name, views of the bytes."""
     head, found = json.loads(content[: (at := content.index(b"\n"))]), {}
     at += 1
     for name, (kind, shape) in head.items():

@@ -331,8 +331,6 @@ class Compensator:
 def _corrected(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
     """The simulator in which a model is asked: the given one, or that of its training; refuses what cannot be."""
     model.require_rate(dt)
-    if model.config.delta_hold > 1:
-        raise ModelError(f"{model.path}: holds corrections; to be inverted it must be trained with delta_hold 1")
     if model.corrects(robot):
         return robot
     if config.aim == "simulator":

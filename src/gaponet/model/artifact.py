@@ -33,7 +33,7 @@ RECORDED_TOLERANCE = 0.02  # relative, of gains
 # Switches of earlier versions that cards still name, and the value that they would have today.
 RETIRED = {
     "payload_trunk": True, "payload_predictor": True, "sensor_hold": 1, "sensor_target": "delta", "context": "none",
-    "branch": "unstacked",
+    "branch": "unstacked", "branch_history": True, "delta_hold": 1,
 }  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 

@@ -14,7 +14,7 @@ OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk t
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
-    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max", "delta_hold",
+    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
     "transformer_width", "transformer_layers", "transformer_heads", "fno_width", "fno_layers", "fno_modes",
 )  # fmt: skip
 
@@ -38,23 +38,19 @@ class ModelConfig:
     """Mass that counts as 1 at the input, kg."""
     delta_max: Annotated[float, Interval(gt=0, le=10)] = 0.3
     """Largest correction, rad."""
-    delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
-    """Control periods that a correction is held; the reward of a decision is the mean over them."""
     num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
     """m, how many targets the simulator is asked about."""
     probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
     """Probe that reads gains and friction, rad."""
     probe_large: Annotated[float, Interval(ge=0, le=10)] = 0.4
     """Probe that reads inertia, payload and saturation, rad."""
-    sensors: Literal["predicted", "off"] = "predicted"
-    """predicted: the sensor predictor stands in for the simulator's probes. off: the branch sees o_t only."""
-    branch_history: bool = True
-    """Whether the branch also sees the observation. Probe responses depend on the state alone, so without it no delay
-    can be corrected (docs/log.md)."""
-    coupling: Literal["posture", "joint", "full"] = "posture"
+    sensors: Literal["off", "predicted"] = "off"
+    """off: the branch sees the observation. predicted: a sensor predictor's stand-in for the simulator's probes as
+    well, as in the paper; worth nothing where it was measured (docs/results/unnamed.md)."""
+    coupling: Literal["posture", "full"] = "posture"
     """posture: branch and trunk are shared by the joints; the branch sees a joint's own past, and of all joints
-    position, speed and how far behind their targets they are. joint: its own alone. full: the paper's, every joint sees
-    every joint. The mlp is always full."""
+    position, speed and how far behind their targets they are. full: the paper's, every joint sees every joint. The mlp
+    is always full."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)

@@ -40,11 +40,10 @@ class _SensorPredictor(nn.Module):
 
 
 class OperatorNet(DeltaNet):
-    """Δa = bounded(⟨branch(sensors), trunk(a, P)⟩ + c), a DeepONet.
+    """Δa = bounded(⟨branch(o [, sensors]), trunk(a, P)⟩ + c), a DeepONet.
 
-    Coupling "joint": one branch and one trunk, shared by all joints, take what belongs to a joint and its name; what
-    other joints do reaches it through its sensors. "posture": the branch is told q, q̇ and a − q of all joints as well.
-    "full": the paper's, every joint sees every joint.
+    Coupling "posture": one branch and one trunk, shared by all joints, take what belongs to a joint and its name; the
+    branch is told q, q̇ and a − q of all joints as well. "full": the paper's, every joint sees every joint.
     """
 
     which: Tensor
@@ -53,12 +52,11 @@ class OperatorNet(DeltaNet):
         super().__init__(config, n)
         if config.sensors == "predicted":
             self.predictor = _SensorPredictor(config, n)
-        self.sees_observation = config.branch_history or config.sensors == "off"
         self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)
         sensed, seen, asked = self.input_dims(config, n)
         outputs = config.num_basis * (1 if self.per_joint else n)
-        inputs = sensed * (config.sensors != "off") + seen * self.sees_observation + n * self.per_joint
+        inputs = sensed * (config.sensors != "off") + seen + n * self.per_joint
         self.branch_inputs = inputs
         self.branch: nn.Module = dense(inputs, config.branch_hidden, outputs)
         self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
@@ -69,8 +67,7 @@ class OperatorNet(DeltaNet):
         """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
         payload = int(config.payload_input)
         if config.joint_wise:
-            others = 3 * n if config.coupling == "posture" else 0
-            return 2 * config.num_probes, 2 + 3 * config.history + payload + others, 1 + payload
+            return 2 * config.num_probes, 2 + 3 * config.history + payload + 3 * n, 1 + payload
         return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
 
     def prepare(self, x: Tensor) -> Tensor:
@@ -94,7 +91,7 @@ class OperatorNet(DeltaNet):
 
     def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self.features.layout
-        see = ([] if sensors is None else [sensors]) + ([z[:, at.observation]] if self.sees_observation else [])
+        see = ([] if sensors is None else [sensors]) + [z[:, at.observation]]
         # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
         ask = [z[:, at.q], z[:, at.action]] + ([z[:, at.payload]] if self.config.payload_input else [])
         return torch.cat(see, dim=1), torch.cat(ask, dim=1)
@@ -106,11 +103,8 @@ class OperatorNet(DeltaNet):
         see = [which]
         if sensors is not None:
             see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
-        if self.sees_observation:
-            see += [self.features.joint_wise(z), *payload]
-            if self.config.coupling == "posture":
-                all_joints = torch.cat([z[:, at.state], z[:, at.action]], dim=1)
-                see.append(all_joints.unsqueeze(1).expand(-1, n, 3 * n))
+        all_joints = torch.cat([z[:, at.state], z[:, at.action]], dim=1)
+        see += [self.features.joint_wise(z), *payload, all_joints.unsqueeze(1).expand(-1, n, 3 * n)]
         ask = [which, z[:, at.action].unsqueeze(2), *payload]
         return torch.cat(see, dim=2), torch.cat(ask, dim=2)
 

@@ -55,8 +55,7 @@ def _full(net: OperatorNet) -> dict[str, Array]:
         predictor[0] = (_rows(predictor[0][0], np.arange(dim - n), dim), predictor[0][1])
         parts.append(last[:, :sensed] @ w[:sensed])
         b = b + last_bias[:sensed] @ w[:sensed]
-    seen = w[sensed:] if net.sees_observation else np.zeros((dim - n, w.shape[1]))
-    parts.append(_rows(seen, np.arange(dim - n), dim))
+    parts.append(_rows(w[sensed:], np.arange(dim - n), dim))
     branch[0] = (np.concatenate(parts), b)
     asked = [*range(n), *range(dim - n, dim), *([dim - n - 1] if net.config.payload_input else [])]
     trunk[0] = (_rows(trunk[0][0], np.array(asked), dim), trunk[0][1])
@@ -67,7 +66,7 @@ def _full(net: OperatorNet) -> dict[str, Array]:
 def _joint(net: OperatorNet) -> dict[str, Array]:
     n, dim, config = net.n, net.features.dim, net.config
     depth, payload = 2 + 3 * config.history, int(config.payload_input)
-    others = [*range(2 * n), *range(dim - n, dim)] if config.coupling == "posture" else []
+    others = [*range(2 * n), *range(dim - n, dim)]
     known = depth + payload + 1 + len(others)
     width, names = known + n, known + np.arange(n)
     own = np.arange(depth) * n  # columns of joint 0; those of joint j are j further on
@@ -94,10 +93,8 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
         order = (np.arange(sensed)[None, :] * n + np.arange(n)[:, None]).ravel()  # joint by joint
         predictor[-1] = (predictor[-1][0][:, order], predictor[-1][1][order])
         parts.append(w[n : n + sensed])
-    seen = _rows(w[:n] + b, names, width)
-    if net.sees_observation:
-        told = [*range(depth + payload), *range(depth + payload + 1, known)]
-        seen += _rows(w[n + sensed : net.branch_inputs], np.array(told), width)
+    told = [*range(depth + payload), *range(depth + payload + 1, known)]
+    seen = _rows(w[:n] + b, names, width) + _rows(w[n + sensed : net.branch_inputs], np.array(told), width)
     asked = np.array([depth + payload] + [depth] * payload)
     if alone:
         query = w[net.branch_inputs :]

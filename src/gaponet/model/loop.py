@@ -1,5 +1,4 @@
-"""The loop around a network: past frames, holds, limits. The one state machine of training, free runs,
-simulators and robots.
+"""The loop around a network: past frames, limits. The one state machine of training, free runs, simulators and robots.
 
 It takes numpy arrays or, where the network's buffers are torch tensors, those; all of operated joints, (num_envs, n).
 """
@@ -55,8 +54,6 @@ class DeltaLoop:
         self.low, self.high = (
             np.array(side[None], float) if self._host else x.new_tensor(side) for side in np.transpose(qpos_range)
         )
-        self.held = np.full(num_envs, config.delta_hold)  # control periods since the correction was decided
-        self.kept = zeros_like(self.x, num_envs, n)  # the correction decided then
         self.applied: Any = zeros_like(self.x, num_envs, n)
         self.fresh = np.ones(num_envs, bool)  # robots without a past
         self.any_fresh = True
@@ -65,7 +62,7 @@ class DeltaLoop:
 
     def reset(self, ids: Array | slice = slice(None)) -> None:
         """Forget the past of robots `ids`: at the next observation their present frame, repeated, is the history."""
-        self.held[ids], self.fresh[ids] = self.config.delta_hold, True
+        self.fresh[ids] = True
         self.any_fresh = True
 
     def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
@@ -78,8 +75,6 @@ class DeltaLoop:
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """One control period has passed: the state before it and the target applied over it, (num_envs, n) each."""
         self.history.push(qpos, qvel, u)
-        if self.config.delta_hold > 1:
-            self.held += 1
 
     # ---- a period
 
@@ -118,7 +113,9 @@ class DeltaLoop:
             UsageError: Arrays of another shape.
         """
         q, v, a = self._rows(qpos, qvel, ctrl)
-        free = a + self._decide(q, v, a, payload_mass)
+        self.observe(q, v, a, payload_mass)
+        self.bound.run()
+        free = a + self.bound.delta
         self.applied = self._xp.minimum(self._xp.maximum(free, self.low), self.high)
         self.push(q, v, self.applied)
         return (self.applied - a).reshape(ctrl.shape if hasattr(ctrl, "shape") else np.shape(ctrl))
@@ -144,20 +141,6 @@ class DeltaLoop:
         return wanted + offset
 
     # ---- parts
-
-    def _decide(self, q: Any, v: Any, a: Any, payload_mass: Any) -> Any:
-        """This period's Δa before limits: the network's, or what it said when it was last asked."""
-        if self.config.delta_hold == 1:
-            self.observe(q, v, a, payload_mass)
-            self.bound.run()
-            return self.bound.delta
-        due = self.held >= self.config.delta_hold
-        if due.any():
-            self.observe(q, v, a, payload_mass)
-            self.bound.run()
-            self.kept[due] = self.bound.delta[due]
-            self.held[due] = 0
-        return self.kept
 
     def _rows(self, *given: Any) -> tuple[Any, ...]:
         rows = tuple(map(np.asarray, given)) if self._host else given

@@ -61,7 +61,7 @@ class PPOConfig:
     num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
     """Simulations."""
     num_steps: Annotated[int, Interval(ge=1, le=100000)] = 32
-    """Decisions between updates; a decision is model.delta_hold control periods."""
+    """Control periods between updates."""
     epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over each batch."""
     mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 4

@@ -28,8 +28,6 @@ AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 class DeltaEnv:
     """num_envs simulations, each following one recording from a random frame on.
 
-    A step is a decision: its correction is held for config.delta_hold control periods; its reward is their mean.
-
     Observation groups: "actor" = x = [o_t | a_t]; "critic" = the recorded state now, recorded
     positions and commands to come, payload, rate (training only: the recorded state never reaches the actor). An
     environment keeps its payload, rate and gains for life, in proportion to the frames recorded under them. A motion's
@@ -48,7 +46,7 @@ class DeltaEnv:
         nthread: int = 0,
         device: str = "cpu",
     ) -> None:
-        """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
+        """Every sequence needs two rows; `episode_steps` counts control periods.
 
         On "cpu" C MuJoCo steps and arrays are numpy's; elsewhere mujoco_warp's (sim/warp.py), tensors that stay there.
         """
@@ -86,12 +84,9 @@ class DeltaEnv:
         recorded = [x[:, self.op] for x in (self.qpos, self.qvel, self.ctrl)]
         self.track = np.ascontiguousarray(np.concatenate(recorded, axis=1), np.float32)  # take() copies anything else
         length = np.array([len(s) for s in sequences])
-        if length.min() <= self.config.delta_hold:
+        if length.min() < 2:
             short = sequences[int(length.argmin())]
-            raise UsageError(
-                f"motion {short.meta.motion} has {len(short)} rows, and a correction is held for "
-                f"{self.config.delta_hold} of them: drop the motion, or lower --model.delta-hold"
-            )
+            raise UsageError(f"motion {short.meta.motion} has {len(short)} row and a step needs two: drop the motion")
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
         keys = [(Condition.of(s, self.robot), s.meta.unrecorded) for s in sequences]
@@ -140,7 +135,7 @@ class DeltaEnv:
             mine = self.group[ids] == g
             seq[mine] = self.rng.choice(self.members[g], size=mine.sum(), p=self.weights[g])
         first, last = self.seq_first[seq], self.seq_last[seq]
-        t = self.rng.integers(first, last - self.config.delta_hold + 1)
+        t = self.rng.integers(first, last)
         before = first[:, None] + History.rows_before(t - first, self.depth)
         first, last, t, before = (self.sim.array(x) for x in (first, last, t, before))
         self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
@@ -163,20 +158,18 @@ class DeltaEnv:
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
 
     def step(self, delta: Any) -> tuple[Any, Any]:
-        """Hold corrections for delta_hold control periods; each is compared with the recording one row on.
+        """Correct targets for a control period, and compare with the recording one row on.
 
         Args:
             delta: (num_envs, n) rad, numpy or torch.
 
         Returns:
-            Mean reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
+            Reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
             arrays of the simulator's kind.
         """
         delta = self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max)
-        reward = zeros_like(self.now, self.num_envs, self.num_actions)
-        for _ in range(self.config.delta_hold):
-            self.advance(delta)
-            reward += self._reward() / self.config.delta_hold
+        self.advance(delta)
+        reward = self._reward()
         done = self.ended() | (self.elapsed >= self.max_episode_length)
         ids = indices(done)
         if ids.size:
@@ -184,8 +177,8 @@ class DeltaEnv:
         return reward, done
 
     def ended(self) -> Any:
-        """Whether the recording has too few rows left for one more decision, (num_envs,)."""
-        return self.row > self.last - self.config.delta_hold
+        """Whether the recording has no row left, (num_envs,)."""
+        return self.row >= self.last
 
     def advance(self, delta: Any) -> None:
         """Step all simulations by one control period, without reward or reset; delta (num_envs, n_operated)."""

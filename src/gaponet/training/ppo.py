@@ -78,14 +78,13 @@ class Learner:
         ranks.spread(self.critic)
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
-        held = env.robot.dt * env.config.delta_hold
-        self.kept = math.exp(-held / config.noise_time) if config.noise_time else 0.0
+        self.kept = math.exp(-env.robot.dt / config.noise_time) if config.noise_time else 0.0
         self.spread = config.std * math.sqrt(1 - self.kept**2)
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
         self.updates, self.ready, self.found = 0, False, Update()
 
     def update(self) -> Update:
-        """Run num_steps decisions in every environment, then learn from them."""
+        """Run num_steps control periods in every environment, then learn from them."""
         batch = self.collect()
         self.learn(batch)
         self.updates += 1
@@ -97,7 +96,7 @@ class Learner:
         explored = (torch.rand_like(self.noise) < config.noise_share).float()
         self.noise *= explored
         rows: list[dict[str, Tensor]] = []
-        gamma = config.gamma**env.config.delta_hold  # a step is a decision
+        gamma = config.gamma
         with torch.no_grad():
             for _ in range(config.num_steps):
                 row = self.look()

@@ -209,7 +209,7 @@ class Trainer:
         while self._spent() < 1:
             self.found = learner.update()
             self.kept.updates += 1
-            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
+            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps
             self._tick()
             if self.kept.updates % self.config.validate_every == 0:
                 self.kept.learner, self.kept.env = learner.state(), env.state()

@@ -55,11 +55,10 @@ class WarmStart:
         seed: int,
         nthread: int = 0,
     ) -> None:
-        """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
+        """labels: Δa* of every row of the environment's data, (N, n)."""
         self.net, self.env, self.config = net, env, config
-        held = _held_labels(labels, env.config.delta_hold)
-        self.labels: Any = env.sim.array(held)
-        self.unit = float(np.sqrt(np.nanmean(np.square(held)))) or 1.0
+        self.labels: Any = env.sim.array(labels)
+        self.unit = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
         self.seed, self.nthread = seed, nthread
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
@@ -83,8 +82,7 @@ class WarmStart:
         env.reset()
         net.eval()
         xs, ys = [], []
-        hold = env.config.delta_hold
-        for _ in range(0, self.config.steps, hold):
+        for _ in range(self.config.steps):
             x = env.get_observations()["actor"]
             y = self.labels[env.row] + env.unsaid
             xs.append(x)
@@ -94,8 +92,7 @@ class WarmStart:
             else:
                 with torch.inference_mode():
                     delta = net(x)
-            for _ in range(hold):
-                env.advance(delta)
+            env.advance(delta)
             ended = indices(env.ended())
             if ended.size:
                 env.reset(ended)
@@ -166,9 +163,3 @@ class WarmStart:
 
 def _rms(losses: Array) -> float:
     return float(np.sqrt(ranks.mean(losses.mean())[0])) if len(losses) else float("nan")
-
-
-def _held_labels(labels: Array, hold: int) -> Array:
-    """Mean of the labels of rows t … t + hold − 1, (N, n) → (N − hold + 1, n); a motion's last rows mean nothing."""
-    rows = len(labels) - hold + 1
-    return np.mean([labels[i : rows + i] for i in range(hold)], axis=0, dtype=labels.dtype)

@@ -19,7 +19,7 @@ CHECKED = 12  # control periods
 
 
 class DeltaStep(nn.Module):
-    """Models that hold nothing: state, command and past of B worlds → Δa and the new past.
+    """A model as a function: state, command and past of B worlds → Δa and the new past.
 
     Attributes:
         depth: Frames in the past; a frame is [q | q̇ | target applied], 3n numbers.
@@ -66,14 +66,7 @@ class DeltaStep(nn.Module):
 
 
 def delta_step(model: GapModel, run: Path) -> DeltaStep:
-    """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz.
-
-    Raises:
-        ModelError: The model holds corrections.
-    """
-    config = model.config
-    if config.delta_hold > 1:
-        raise ModelError(f"{model.path}: holds corrections, which torch exports do not; train with delta_hold 1")
+    """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz."""
     return DeltaStep(torch_network(model, run), model)
 
 

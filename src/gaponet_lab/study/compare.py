@@ -39,7 +39,7 @@ class Compare:
     """
 
     models: tuple[str, ...] = MODELS
-    """Kinds, each with changed fields where wanted: mlp:mlp_hidden=256,128 or gaponet:sensors=off:history=8.
+    """Kinds, each with changed fields where wanted: mlp:mlp_hidden=256,128 or gaponet:sensors=predicted:history=8.
     identified+KIND trains in the identified simulator (with --identify)."""
     holdout_units: tuple[str, ...] = ()
     """Units never trained on; shown as a group of their own."""

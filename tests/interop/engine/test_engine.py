@@ -13,7 +13,6 @@ from arm import write_arm
 from runs import random_run
 
 from gaponet.cli.main import main
-from gaponet.errors import ModelError
 from gaponet.identity import lines
 from gaponet.robot import LAW, load_robot
 from gaponet.sim.batch import BatchSim, Condition
@@ -341,11 +340,3 @@ def test_a_network_without_a_fused_form_ships_too(tmp_path):
     model = random_run(tmp_path / "run", robot, kind="transformer")
     assert not (tmp_path / "run/model/weights.npz").exists()
     assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
-
-
-def test_a_model_that_holds_corrections_is_not_exported(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    model = random_run(tmp_path / "run", robot, delta_hold=2)
-    with pytest.raises(ModelError, match="which torch exports do not; train"):
-        export_model(model, tmp_path / "run", tmp_path / "torch")
-    assert not (tmp_path / "torch").exists()

@@ -46,16 +46,16 @@ def test_a_matched_mlp_has_the_operators_parameters_within_one_percent(config):
 
 
 @pytest.mark.parametrize("n", [2, 10])
-def test_the_shared_mlp_has_the_weights_of_branch_and_trunk_and_sees_one_joint_at_a_time(n):
-    config = ModelConfig(coupling="joint", sensors="off")
+def test_the_shared_mlp_has_the_weights_of_branch_and_trunk_and_of_other_joints_no_past(n):
+    config = ModelConfig()
     operator, shared = (build_network(replace(config, kind=kind), n) for kind in ("gaponet", "shared_mlp"))
     assert abs(size(shared) / size(operator) - 1) < 0.02
     torch.nn.init.normal_(shared.net[-1].weight)
     data = x(shared.config, n, batch=1).requires_grad_(True)
     shared(data)[0, 0].backward()
-    state = data.grad[0, : 2 * n].reshape(2, n)
-    assert (state[:, 0] != 0).all()
-    assert (state[:, 1:] == 0).all()
+    past = data.grad[0, 2 * n : 2 * n + 3 * n * config.history].reshape(-1, n)
+    assert (past[:, 0] != 0).all()
+    assert (past[:, 1:] == 0).all()
 
 
 def test_building_a_matched_mlp_leaves_the_seed_alone():

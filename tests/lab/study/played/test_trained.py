@@ -42,7 +42,7 @@ def test_methods_come_in_order_and_changed_models_are_passed_over(arm, runs, tmp
     runs("a", "gaponet", 1, [])
     runs("b", "gaponet", 0, [])
     runs("c", "mlp", 0, ["mlp_match=on"])
-    runs("d", "gaponet", 0, ["sensors=off"])
+    runs("d", "gaponet", 0, ["sensors=predicted"])
     runs("identified", "gaponet", 0, [])
     expected = [("mlp", 0), ("gaponet", 0), ("gaponet", 1), ("identified+gaponet", 0)]
     for folder in (tmp_path, tmp_path / "cells"):
