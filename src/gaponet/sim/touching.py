@@ -30,6 +30,7 @@ WINDOW = 5.0  # s
 WINDOWS, PER_MOTION = 14, 2
 HEIGHTS, STEP = 10, 0.005  # tried first, from the lowest tip upwards, and m between them
 CANDIDATES, GENERATIONS, AROUND = 16, 10, 1.5  # of the search, and how wide it begins, in large changes
+EARLY = 3  # generations after which a start goes on only if no other one cost less by then
 ZERO, PRICE = 0.02, 2e-3  # rad: an ordinary zero, and what it costs (soft square of one for a row)
 # Table's friction and stiffness (N/m): lowest, highest, a large change, first guess; stiffness in its logarithm.
 FRICTION = (0.0, 1.5, 0.15, 0.3)
@@ -122,7 +123,8 @@ def fit_table(
     guesses[:, 0], guesses[:, 2] = np.tile(heights, len(STARTS)), np.repeat(STARTS, len(heights))
     costs = soft(scene.soft_errors(guesses)).reshape(len(STARTS), -1)
     starts = guesses.reshape(*costs.shape, -1)[np.arange(len(STARTS)), costs.argmin(axis=1)]
-    found = [_searched(scene, start, measured is not None, progress) for start in starts]
+    pace, best_first = [np.inf], starts[costs.min(axis=1).argsort()]
+    found = [_searched(scene, start, measured is not None, progress, pace) for start in best_first]
     tables = [_with_table(robot, x) for x, _ in found]
     errors = [whole_errors(validation, one, nthread).mean() for one in tables] if validation else [x[1] for x in found]
     best = int(np.argmin(errors))
@@ -131,8 +133,11 @@ def fit_table(
     return Touch(tables[best] if kept else robot, kept, without, within, motions)
 
 
-def _searched(scene: _Scene, start: Array, measured: bool, progress: Callable[[float], None]) -> tuple[Array, float]:
-    """Table and zeros (3 + n,) near a start that fit best, and their cost; its height stays where it was measured."""
+def _searched(
+    scene: _Scene, start: Array, measured: bool, progress: Callable[[float], None], pace: list[float]
+) -> tuple[Array, float]:
+    """Table and zeros (3 + n,) near a start that fit best, and their cost; its height stays where it was measured, and
+    it ends after EARLY generations where another start cost less by then (`pace`)."""
     n, rows = len(scene.op), scene.counted.sum() * len(scene.op)
     unit = np.array([0.004, FRICTION[2], STIFFNESS[2], *np.full(n, 0.5 * ZERO)])
     low = np.array([start[0] - 0.03 * (not measured), FRICTION[0], STIFFNESS[0], *np.full(n, -5 * ZERO)])
@@ -144,6 +149,10 @@ def _searched(scene: _Scene, start: Array, measured: bool, progress: Callable[[f
 
     def tell(intermediate_result: OptimizeResult) -> None:
         progress(SOFT * float(np.sqrt(2 * intermediate_result.fun / rows)))
+        if intermediate_result.nit == EARLY:
+            if intermediate_result.fun > min(pace):
+                raise StopIteration
+            pace.append(intermediate_result.fun)
 
     # Contacts come and go: the surface has no slopes to follow, and its valley of heights and zeros has walls.
     rng = np.random.default_rng(0)
