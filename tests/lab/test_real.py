@@ -94,7 +94,7 @@ def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, play
 def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_identified_robot(
     arm, played, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(brief, "BRIEF", replace(brief.BRIEF, num_envs=12, gradient_steps=2, sensor_states=16))
+    monkeypatch.setattr(brief, "BRIEF", replace(brief.BRIEF, num_envs=12, gradient_steps=0, sensor_states=16))
     (question,) = questions("new motions", played, arm, None)
     methods = {title: method for title, method in brief.networks(240).values() if title != "shared MLP"}
     with pytest.raises(UsageError, match="networks need a folder"):

@@ -56,8 +56,8 @@ class Looked:
         self._find = partial(_look, robot=robot, model=model, heights=heights)
         self._elsewhere: TemporaryDirectory[str] | None = None
         self._every = 1 + int(RATE * 3600 * dataset.hours() / SAMPLE)
-        code = [p.read_bytes() for p in sorted(Path(__file__).parent.rglob("*.py"))]
-        code += [(Path(__file__).parents[1] / "sim" / "dynamics.py").read_bytes(), np.__version__.encode()]
+        code = [p.read_bytes() for p in sorted(Path(__file__).parents[1].rglob("*.py"))]
+        code += [(Path(__file__).parents[2] / "sim" / "dynamics.py").read_bytes(), np.__version__.encode()]
         names = (f.name for f in fields(robot) if f.name not in PLACES)
         known = [np.asarray(getattr(robot, name)).tolist() for name in names]
         self._from = hashlib.sha256(b"\0".join([*code, repr((known, simulator, self.stands)).encode()]))
