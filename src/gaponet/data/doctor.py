@@ -12,10 +12,10 @@ import numpy as np
 from gaponet.data.checks import CHECKS
 from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
+from gaponet.data.checks.looked import Looked
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
 from gaponet.data.checks.rests import rests
 from gaponet.data.checks.touching import Heights, touching
-from gaponet.data.checks.looked import Looked
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey
@@ -67,7 +67,7 @@ class Diagnosis:
         simulator: str = "",
         executor: str | Executor = LOCAL,
     ) -> Diagnosis:
-        """Survey every sequence that was not yet, and judge them together; what is found of each is kept (data.checks.looked).
+        """Survey every sequence that was not yet, and judge them together; what is found of each is kept (checks.looked).
 
         Args:
             robot: The dataset's robot.
