@@ -67,7 +67,7 @@ class Diagnosis:
         simulator: str = "",
         executor: str | Executor = LOCAL,
     ) -> Diagnosis:
-        """Survey every sequence that was not yet, and judge them together; what is found of each is kept (checks.looked).
+        """Survey every sequence that was not yet, and judge them together; what each has is kept (checks.looked).
 
         Args:
             robot: The dataset's robot.
