@@ -14,6 +14,17 @@ def test_the_gain_with_the_least_error_is_kept(kind, ideal, chosen):
     assert net.bounded.gain.item() == chosen
 
 
+def test_no_smaller_gain_is_asked_once_one_does_worse():
+    net, asked = build_network(ModelConfig(), 3), []
+
+    def error():
+        asked.append(net.bounded.gain.item())
+        return abs(asked[-1] - 0.8)
+
+    assert choose_gain(net, error, 0.2) == 0.75
+    assert asked == [0.75, 0.5]
+
+
 def test_the_gain_scales_a_small_correction():
     net = build_network(ModelConfig(kind="mlp"), 2)
     torch.nn.init.constant_(net.net[-1].bias, 0.01)

@@ -240,9 +240,10 @@ def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(tr
 
 
 def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
-    def error(trainer, net):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+    def error(trainer, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
         fitted = net is not None and bool(net.trunk[-1].weight.any())
-        return 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
+        mean = 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
+        return np.full(len(trainer.val_set), mean)
 
     monkeypatch.setattr(Trainer, "validate", error)
     model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
@@ -253,9 +254,9 @@ def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot,
 def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, robot, trained, monkeypatch):
     seen = []
 
-    def error(trainer, net):
+    def error(trainer, net, robot=None):
         seen.append((trainer.stage, net is not None and bool(net.trunk[-1].weight.any())))
-        return 0.6 if trainer.stage == "warm start" else 0.5
+        return np.full(len(trainer.val_set), 0.6 if trainer.stage == "warm start" else 0.5)
 
     monkeypatch.setattr(Trainer, "validate", error)
     config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=2), validate_every=1,

@@ -20,10 +20,12 @@ from dataclasses import replace
 from datetime import timedelta
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from gaponet.arrays import Array
 from gaponet.errors import ModelError, UsageError
 from gaponet.model.layers import Standardise
 from gaponet.training.config import TrainConfig
@@ -190,12 +192,13 @@ def mean(*numbers: float) -> list[float]:
     return own.tolist()
 
 
-def mean_over(parts: Sequence[T], error: Callable[[Sequence[T]], float]) -> float:
-    """error(parts), a mean over them, of which each rank finds its own part."""
+def each(parts: Sequence[T], errors: Callable[[Sequence[T]], Array]) -> Array:
+    """errors(parts), (len(parts),), of which each rank finds its own part."""
     if world() == 1:
-        return error(parts)
-    own = parts[rank() :: world()]
-    return mean(error(own) * len(own) if own else 0.0)[0] * world() / len(parts)
+        return errors(parts)
+    found, own = np.zeros(len(parts)), slice(rank(), None, world())
+    found[own] = errors(parts[own]) if parts[own] else 0.0
+    return np.array(mean(*found.tolist())) * world()
 
 
 def pool(module: nn.Module) -> None:

@@ -11,6 +11,7 @@ A run that was stopped and resumed equals one that was not, bit for bit, as long
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import os
 import platform
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gaponet.arrays import Array
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains
 from gaponet.data.split import parts_of, spread
@@ -102,7 +104,7 @@ class Trainer:
             torch.manual_seed(_seed(config.seed))
         self.untrained = copy.deepcopy(self.net.state_dict())
         self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
-        self.nominal, self.found = float("nan"), Update()
+        self.nominal, self.found, self.measured = float("nan"), Update(), dict[bytes, Array]()
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
@@ -125,10 +127,11 @@ class Trainer:
 
     def _run(self) -> GapModel:
         ranks.once(self._fit_baseline)
-        self.nominal = self.validate(None)
+        self.nominal = float(self.validate(None, self.robot.nominal).mean())
         try:
-            if not np.isfinite(self.kept.best):
-                self._consider()  # the untrained network corrects nothing: nothing worse is ever kept
+            if not np.isfinite(self.kept.best):  # the untrained network corrects nothing: nothing worse is ever kept
+                self.measured[self._key(self.net)] = self.validate(None)
+                self._consider()
             if self.kept.learner is None and recipe(self.config).rounds > self.kept.rounds_done:
                 self._warm_start()
             elif not recipe(self.config).rounds and self.kept.learner is None:
@@ -239,27 +242,24 @@ class Trainer:
         with torch.random.fork_rng():
             net = build_network(self.config.model, self.n)
         net.load_state_dict(self.kept.trained_state)
-        if choose_gain(net, lambda: self.validate(net), self.kept.trained) < 1.0:
+        if choose_gain(net, lambda: float(self.validate(net).mean()), self.kept.trained) < 1.0:
             self._consider(net)
 
     def finish(self) -> GapModel:
         """Export the best model and write its card."""
         self.stage = "export"
         self._tick()
-        ranks.once(self._export)
-        return GapModel.load(self.out)
-
-    def _export(self) -> None:
         net = build_network(self.config.model, self.n)
         net.load_state_dict(self.kept.best_state)
         net.eval()
+        adds, error = added(self.val_set, self.validate(None), self.validate(net))
+        ranks.once(lambda: self._export(net, {"added": adds} | ({} if np.isnan(error) else {"error": error})))
+        return GapModel.load(self.out)
+
+    def _export(self, net: DeltaNet, worth: dict[str, float]) -> None:
         env = self._env(max(64, len(self._conditions())), 10, 0, "cpu")
         self.loggers.close()
-        what = self.val_set, self.robot, self.config.model
-        before, after = (errors(*what, network, self.own.threads) for network in (None, net))
-        adds, error = added(self.val_set, before, after)
-        card = self._card({"added": adds} | ({} if np.isnan(error) else {"error": error}))
-        export(net, self.out / "model", card, env.get_observations()["actor"].numpy())
+        export(net, self.out / "model", self._card(worth), env.get_observations()["actor"].numpy())
 
     def _env(
         self, num_envs: int, episode_steps: int, seed: int, device: str | None = None,
@@ -271,19 +271,28 @@ class Trainer:
 
     # ---- validation, checkpoints, card
 
-    def validate(self, net: DeltaNet | None) -> float:
-        """MPJAE of whole-motion free runs over the validation motions, rad; None for the nominal simulator.
+    def validate(self, net: DeltaNet | None, robot: RobotSpec | None = None) -> Array:
+        """MPJAE of a whole-motion free run of each validation recording, (k,) rad, found once.
 
-        Nominal is the simulator before identification, also where training starts from an identified one.
+        Args:
+            net: Corrects; None for the simulator as it is.
+            robot: The simulator, if not the one that is trained in.
         """
-        what = self.config.model, net, self.own.threads
-        robot = self.robot if net is not None else self.robot.nominal or self.robot
-        return ranks.mean_over(self.val_set, lambda own: float(errors(own, robot, *what).mean()))
+        key = self._key(net, robot)
+        if key not in self.measured:
+            what = robot or self.robot, self.config.model, net, self.own.threads
+            self.measured[key] = ranks.each(self.val_set, lambda own: errors(own, *what))
+        return self.measured[key]
+
+    @staticmethod
+    def _key(net: DeltaNet | None, robot: RobotSpec | None = None) -> bytes:
+        weights = [] if net is None else [x.cpu().numpy().tobytes() for x in net.state_dict().values()]
+        return hashlib.sha256(b"".join([repr(robot).encode(), *weights])).digest()
 
     def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
         net = shrunk or self.net
-        self.kept.val = self.validate(net)
+        self.kept.val = float(self.validate(net).mean())
         if self.kept.val < self.kept.best:
             self.kept.best, self.kept.best_state = self.kept.val, copy.deepcopy(net.state_dict())
         if self.stage in ("warm start", "ppo") and self.kept.val < self.kept.trained:

@@ -46,18 +46,19 @@ def added(sequences: ListOf[Sequence], before: Array, after: Array) -> tuple[flo
 
 
 def choose_gain(net: DeltaNet, error: Callable[[], float], whole: float) -> float:
-    """Set the gain with the least error, and return it.
+    """Set the gain with the least error, and return it; less of a correction is tried as long as it does better.
 
     Args:
         net: Its gain is changed in place.
         error: That of the network as it is when called.
         whole: The error with gain 1.
     """
-    found = {1.0: whole}
+    best = 1.0
     for gain in GAINS:
         net.bounded.gain.fill_(gain)
-        found[gain] = error()
-    best = min(found, key=lambda gain: found[gain])
+        if (found := error()) >= whole:
+            break
+        best, whole = gain, found
     net.bounded.gain.fill_(best)
     return best
 
