@@ -4,10 +4,10 @@
 
 Collects the fleet (recipe of virtual_h1_2.py), runs `gaponet identify` and `gaponet train` on virtual-1 to virtual-3 as
 a user would, and measures virtual-4 playing other motions, whole-motion free run. Rivals: a shared MLP trained as the
-operator is, and gradient-boosted trees on the same labels, one per joint, on position, speed and a − q of all joints
-and the payload (needs scikit-learn), with every recording's own labels and with another one's. With --data all learn
-from these recordings, and are asked the motions of the fleet that are not among them, if there are such (postures left
-out); else (other units) the same motions as always. What is found in WORK is kept. Every number is from VIRTUAL robots.
+operator is, and gradient-boosted trees (trees.py), with every recording's own labels and with another one's. With
+--data all learn from these recordings, and are asked the motions of the fleet that are not among them, if there are
+such (postures left out); else (other units) the same motions as always. What is found in WORK is kept. Every number is
+from VIRTUAL robots.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from trees import LIMIT, Trees
 from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run
 
 from gaponet.arrays import Array
@@ -31,64 +32,11 @@ from gaponet.metrics import standard_error
 from gaponet.model import calibration
 from gaponet.model.artifact import GapModel
 from gaponet.robot import RobotSpec, load_robot
-from gaponet.sim.replay import Corrector, replay
+from gaponet.sim.replay import Corrector
 from gaponet.spread import Spread, Table
 from gaponet.training.labels import trajectory_labels
 
-LIMIT, ROUNDS, TREES, LEAF, MOST = 0.3, 1, 120, 60, 60_000  # rad, rounds of DAgger, of each joint, rows, rows fitted
 SHUFFLED = "trees-shuffled"
-
-
-class Trees:
-    """Gradient-boosted trees, one ensemble per joint, in the loop. Implements sim.replay.Corrector."""
-
-    def __init__(self, robot: RobotSpec) -> None:
-        self.robot, self.op, self.models = robot, robot.operated_index, []
-
-    def fit(self, x: Array, y: Array, seed: int) -> None:
-        """Inputs (N, 3n + 1), labels (N, n) rad."""
-        from sklearn.ensemble import HistGradientBoostingRegressor
-
-        rows = np.random.default_rng(seed).permutation(len(x))[:MOST]
-        self.models = [
-            HistGradientBoostingRegressor(max_iter=TREES, min_samples_leaf=LEAF, early_stopping=False).fit(
-                x[rows], column
-            )
-            for column in y[rows].T
-        ]
-
-    @staticmethod
-    def inputs(qpos: Array, qvel: Array, ctrl: Array, payload: Array) -> Array:
-        """(k, 3n + 1) of operated joints."""
-        return np.concatenate([qpos, qvel, ctrl - qpos, payload[:, None]], axis=1)
-
-    def reset(self, start: ListOf[Sequence]) -> None:
-        self.payload = np.array([s.meta.payload_mass for s in start])
-
-    def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
-        x, out = self.inputs(qpos[:, self.op], qvel[:, self.op], target[:, self.op], self.payload), np.array(target)
-        out[:, self.op] += np.stack([m.predict(x) for m in self.models], axis=1)
-        return np.clip(out, *self.robot.qpos_range.T)
-
-
-def trees(bench: Bench, robot: RobotSpec, labels: Array, seed: int) -> Trees:
-    """Fitted on the states that the labels lead to, then on those that the trees lead to as well."""
-    op, model = robot.operated_index, Trees(robot)
-    deltas = np.split(labels, np.cumsum([len(s) for s in bench.train])[:-1])
-    told = [s.ctrl.copy() for s in bench.train]
-    for ctrl, delta in zip(told, deltas, strict=True):
-        ctrl[:, op] += delta
-    led = [replace(s, ctrl=ctrl) for s, ctrl in zip(bench.train, told, strict=True)]
-    runs, x = replay(led, robot, lock_idle=True), []
-    for again in range(ROUNDS + 1):
-        x += [
-            Trees.inputs(t.qpos[:, op], t.qvel[:, op], s.ctrl[:, op], np.full(len(s), s.meta.payload_mass))
-            for s, t in zip(bench.train, runs, strict=True)
-        ]
-        model.fit(np.concatenate(x), np.concatenate([labels] * (again + 1)), seed)
-        if again < ROUNDS:
-            runs = replay(bench.train, robot, model, lock_idle=True)
-    return model
 
 
 def of_others(bench: Bench, labels: Array) -> Array:
@@ -135,9 +83,9 @@ class Rows:
     def corrector(self, kind: str, robot: RobotSpec, seed: int) -> Corrector:
         """Trees, or gaponet train as it comes."""
         if kind == "trees":
-            return trees(self.bench, robot, self.labels(robot), seed)
+            return Trees.trained(self.bench.train, robot, self.labels(robot), seed)
         if kind == SHUFFLED:
-            return trees(self.bench, robot, of_others(self.bench, self.labels(robot)), seed)
+            return Trees.trained(self.bench.train, robot, of_others(self.bench, self.labels(robot)), seed)
         return GapModel.load(self.trained(kind, robot, seed)).corrector(robot)
 
     def trained(self, kind: str, robot: RobotSpec, seed: int) -> Path:

@@ -22,7 +22,7 @@ from gaponet_lab.real.rivals import LEFT_OUT, Answer, Method, fitted, identified
 
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
-TRAINED = (("", "shared_mlp"), ("", "gaponet"), ("identification + ", "gaponet"))
+TRAINED = tuple((base, kind) for base in BASES for kind in ("shared_mlp", "gaponet"))
 WHOLE = 600_000  # control steps from which training is that of gaponet train
 # Fewer are one round of its supervised start.
 BRIEF = WarmStartConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)

@@ -1,0 +1,91 @@
+"""A rival of networks: gradient-boosted trees on the same labels, one ensemble for each joint.
+
+    gaponet bench real --method benchmarks/trees.py:on_identified        needs scikit-learn
+
+They see position, speed and a − q of all operated joints and the payload; fitted on the states that the labels lead to,
+then on those that the trees themselves lead to as well. Among the methods of the real robots they stand on top of
+identification, and are left out where validation says that they add nothing, as networks are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from gaponet.arrays import Array
+from gaponet.data.sequence import Sequence
+from gaponet.eval.verdict import Added
+from gaponet.robot import RobotSpec
+from gaponet.sim.replay import replay
+from gaponet.training.labels import trajectory_labels
+from gaponet.training.validation import added
+from gaponet_lab.real.questions import Question, rehearsal
+from gaponet_lab.real.rivals import LEFT_OUT, Answer, identified
+
+LIMIT, ROUNDS, TREES, LEAF, MOST = 0.3, 1, 120, 60, 60_000  # rad, rounds of DAgger, of each joint, rows, rows fitted
+
+
+class Trees:
+    """One ensemble for each operated joint, in the loop. Implements sim.replay.Corrector."""
+
+    def __init__(self, robot: RobotSpec) -> None:
+        self.robot, self.op, self.models = robot, robot.operated_index, []
+
+    @classmethod
+    def trained(cls, sequences: ListOf[Sequence], robot: RobotSpec, labels: Array, seed: int) -> Trees:
+        """Fitted to the labels of these recordings, (rows of all, n) rad."""
+        model, ends = cls(robot), np.cumsum([0, *map(len, sequences)])
+        deltas = [np.nan_to_num(labels[start:end]) for start, end in pairwise(ends)]
+        told = [s.ctrl.copy() for s in sequences]
+        for ctrl, delta in zip(told, deltas, strict=True):
+            ctrl[:, model.op] += delta
+        led = [replace(s, ctrl=ctrl) for s, ctrl in zip(sequences, told, strict=True)]
+        runs, x = replay(led, robot, lock_idle=True), []
+        for again in range(ROUNDS + 1):
+            x += [
+                cls.inputs(t.qpos[:, model.op], t.qvel[:, model.op], s.ctrl[:, model.op], s.meta.payload_mass)
+                for s, t in zip(sequences, runs, strict=True)
+            ]
+            model.fit(np.concatenate(x), np.concatenate([labels] * (again + 1)), seed)
+            if again < ROUNDS:
+                runs = replay(sequences, robot, model, lock_idle=True)
+        return model
+
+    def fit(self, x: Array, y: Array, seed: int) -> None:
+        """Inputs (N, 3n + 1), labels (N, n) rad, NaN where a joint has none; a joint without any keeps its target."""
+        from sklearn.ensemble import HistGradientBoostingRegressor
+
+        rows, self.models = np.random.default_rng(seed).permutation(len(x)), []
+        for column in y.T:
+            some = rows[np.isfinite(column[rows])][:MOST]
+            model = HistGradientBoostingRegressor(max_iter=TREES, min_samples_leaf=LEAF, early_stopping=False)
+            self.models.append(model.fit(x[some], column[some]) if len(some) else None)
+
+    @staticmethod
+    def inputs(qpos: Array, qvel: Array, ctrl: Array, payload: Array | float) -> Array:
+        """(k, 3n + 1) of operated joints; payload kg, of each or of all."""
+        return np.concatenate([qpos, qvel, ctrl - qpos, np.broadcast_to(payload, len(qpos))[:, None]], axis=1)
+
+    def reset(self, start: ListOf[Sequence]) -> None:
+        self.payload = np.array([s.meta.payload_mass for s in start])
+
+    def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
+        x, out = self.inputs(qpos[:, self.op], qvel[:, self.op], target[:, self.op], self.payload), np.array(target)
+        for joint, model in zip(self.op, self.models, strict=True):
+            out[:, joint] += 0.0 if model is None else model.predict(x)
+        return np.clip(out, *self.robot.qpos_range.T)
+
+
+def on_identified(question: Question) -> Answer:
+    """Trees on the identified robot, which stays as it is where validation says that they add nothing."""
+    start, (train, val) = identified(question), rehearsal(question)
+    labels = trajectory_labels(train, start.robot, LIMIT)
+    answer = replace(start, corrector=Trees.trained(train, start.robot, labels, 0))
+    before, after = (np.array(one.errors(val)) for one in (start, answer))
+    less, error = added(val, before, after)
+    worth = Added("identification", less, error, float(before.mean()))
+    told = f"{100 * worth.less / worth.left:.0f} % less on validation"
+    return replace(answer, note=told) if worth.helps else replace(start, note=f"{LEFT_OUT}: {told}")
