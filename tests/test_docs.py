@@ -44,7 +44,6 @@ def widths(layers: tuple[int, ...]) -> str:
         ("algorithm.md", f"Oracle answers at {TRAIN.warm_start.sensor_states} states"),
         ("algorithm.md", f"tokens of {MODEL.transformer_width} numbers, {MODEL.transformer_layers} blocks of "
                          f"{MODEL.transformer_heads} heads"),
-        ("algorithm.md", f"{MODEL.fno_layers} spectral layers of {MODEL.fno_width} channels"),
         ("algorithm.md", f"{PRIOR} rad per unit of scale"),
         ("experiments.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],

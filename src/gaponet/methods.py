@@ -21,7 +21,6 @@ METHODS = {  # name, colour
     "shared_mlp": ("MLP", "#3b7dd8"),
     "mlp": ("MLP, full coupling", "#7a8fe0"),
     "transformer": ("Transformer", "#56c1e8"),
-    "fno": ("FNO", "#ded06a"),
     "gaponet": ("GAPONet", "#c8102e"),
     "calibrated": ("calibrated to the unit", "#6a1b9a"),
     "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),

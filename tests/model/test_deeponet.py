@@ -16,9 +16,8 @@ def x(config, n, batch=7, scale=1.0):
     "config",
     [ModelConfig(), ModelConfig(kind="mlp"), ModelConfig(sensors="predicted"),
      ModelConfig(payload_input=False, stride=2), ModelConfig(coupling="full", sensors="predicted"),
-     ModelConfig(coupling="full", payload_input=False), ModelConfig(kind="transformer"),
-     ModelConfig(kind="fno", payload_input=False)],
-    ids=["gaponet", "mlp", "sensors", "no-payload", "full-sensors", "full", "transformer", "fno"],
+     ModelConfig(coupling="full", payload_input=False), ModelConfig(kind="transformer", payload_input=False)],
+    ids=["gaponet", "mlp", "sensors", "no-payload", "full-sensors", "full", "transformer"],
 )  # fmt: skip
 def test_corrections_are_bounded_whatever_comes_in(config):
     net = build_network(config, 3)

@@ -130,7 +130,7 @@ def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
 @pytest.mark.parametrize(
     "how",
     [
-        {"kind": "transformer"}, {"kind": "fno"},
+        {"kind": "transformer"},
         {"kind": "mlp", "mlp_match": True},
     ],
 )  # fmt: skip

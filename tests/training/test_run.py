@@ -77,7 +77,7 @@ def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
         Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "shared_mlp", "transformer", "fno", "inverse"])
+@pytest.mark.parametrize("kind", ["mlp", "shared_mlp", "transformer", "inverse"])
 def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
     data, run, _ = trained
     config = replace(
@@ -86,8 +86,6 @@ def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tm
             SMALL.model,
             kind=kind,
             mlp_hidden=(64,),
-            fno_width=16,
-            fno_layers=1,
             transformer_width=16,
             transformer_layers=1,
         ),

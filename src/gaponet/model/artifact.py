@@ -33,7 +33,8 @@ RECORDED_TOLERANCE = 0.02  # relative, of gains
 # Switches of earlier versions that cards still name, and the value that they would have today.
 RETIRED = {
     "payload_trunk": True, "payload_predictor": True, "sensor_hold": 1, "sensor_target": "delta", "context": "none",
-    "branch": "unstacked", "branch_history": True, "delta_hold": 1,
+    "branch": "unstacked", "branch_history": True, "delta_hold": 1, "fno_width": 32, "fno_layers": 3,
+    "fno_modes": 4,
 }  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 

@@ -9,13 +9,13 @@ from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
 
-Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "fno", "inverse"]
+Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "inverse"]
 OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
     "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
-    "transformer_width", "transformer_layers", "transformer_heads", "fno_width", "fno_layers", "fno_modes",
+    "transformer_width", "transformer_layers", "transformer_heads",
 )  # fmt: skip
 
 
@@ -26,8 +26,8 @@ class ModelConfig:
     kind: Kind = "gaponet"
     """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as
     its branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form.
-    transformer: attention over the past frames and the present. fno: Fourier neural operator over the same time axis.
-    inverse: the mlp fitted once to the labels on the recorded motions, without roll-outs of its own and without PPO."""
+    transformer: attention over the past frames and the present. inverse: the mlp fitted once to the labels on the
+    recorded motions, without roll-outs of its own and without PPO."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1
@@ -69,12 +69,6 @@ class ModelConfig:
     """Blocks of attention and MLP."""
     transformer_heads: Annotated[int, Interval(ge=1, le=256)] = 4
     """Attention heads; they share the width."""
-    fno_width: Annotated[int, Interval(ge=1, le=4096)] = 32
-    """Channels of the Fourier neural operator."""
-    fno_layers: Annotated[int, Interval(ge=1, le=64)] = 3
-    """Spectral layers."""
-    fno_modes: Annotated[int, Interval(ge=1, le=1024)] = 4
-    """Lowest frequencies kept, the mean included; at most history + 2 exist."""
 
     def __post_init__(self) -> None:
         for field in POSITIVE:

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from gaponet.model.baselines.fno import DeltaFNO
 from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.baselines.transformer import DeltaTransformer
 from gaponet.model.config import ModelConfig
@@ -137,8 +136,6 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         return SharedMLP(config, n)
     if config.kind == "transformer":
         return DeltaTransformer(config, n)
-    if config.kind == "fno":
-        return DeltaFNO(config, n)
     if not config.mlp_match:
         return DeltaMLP(config, n)
     weights = _operator_size(config, n)

@@ -1,4 +1,4 @@
-"""Learned baselines: size, what they see, the Fourier matrices."""
+"""Learned baselines: size, what they see."""
 
 from dataclasses import replace
 
@@ -6,12 +6,11 @@ import pytest
 import torch
 
 from gaponet.errors import UsageError
-from gaponet.model.baselines.fno import _SpectralConv
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
 from gaponet.model.layers import size
 
-KINDS = ("mlp", "shared_mlp", "transformer", "fno")
+KINDS = ("mlp", "shared_mlp", "transformer")
 
 
 def x(config, n, batch=7):
@@ -74,26 +73,3 @@ def test_proportions_are_needed_to_match():
 def test_heads_share_the_width():
     with pytest.raises(UsageError, match="multiple of transformer_heads"):
         ModelConfig(transformer_width=30)
-
-
-def test_all_frequencies_give_the_samples_back():
-    for count in (2, 5, 9):
-        forward, inverse = _SpectralConv.dft(count, count + 1)
-        assert torch.allclose(inverse @ forward, torch.eye(count), atol=1e-5)
-
-
-def test_the_matrices_are_the_fourier_transform_of_a_padded_signal():
-    signal = torch.randn(5)
-    expected = torch.fft.rfft(signal, 10)[:4]
-    answer = _SpectralConv.dft(5, 4)[0] @ signal
-    assert torch.allclose(answer[:4], expected.real, atol=1e-5)
-    assert torch.allclose(answer[4:], expected.imag, atol=1e-5)
-
-
-def test_a_spectral_layer_multiplies_frequencies_by_complex_matrices():
-    torch.manual_seed(0)
-    layer, data = _SpectralConv(5, 3, 4), torch.randn(2, 5, 3)
-    weight = torch.complex(layer.weight[0], layer.weight[1])
-    spectrum = torch.zeros(2, 6, 3, dtype=torch.complex64)
-    spectrum[:, :4] = torch.einsum("bki,kio->bko", torch.fft.rfft(data, 10, dim=1)[:, :4], weight)
-    assert torch.allclose(layer(data), torch.fft.irfft(spectrum, 10, dim=1)[:, :5], atol=1e-5)

@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from gaponet.model.baselines.tokens import Tokens
 from gaponet.model.config import ModelConfig
-from gaponet.model.layers import DeltaNet, dense
+from gaponet.model.layers import DeltaNet, Features, dense
+
+
+class _Tokens(nn.Module):
+    """Features → tokens, oldest first, the present last.
+
+    A past frame is [q_s − q_t, q̇_s, u_s − q_t]; the present is [q_t, q̇_t, a_t − q_t, payload], and so has weights of
+    its own. Where in time a token stands is a learned vector added to it.
+    """
+
+    def __init__(self, features: Features, config: ModelConfig, width: int) -> None:
+        super().__init__()
+        n, self.layout = features.n, features.layout
+        self.count = config.history + 1
+        self.past = nn.Linear(3 * n, width)
+        self.present = nn.Linear(3 * n + int(config.payload_input), width)
+        self.place = nn.Parameter(0.02 * torch.randn(self.count, width))
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Standardised features (B, dim) → (B, H + 1, width)."""
+        at = self.layout
+        past = z[:, at.past].reshape(-1, at.history, 3 * at.n).flip(1)
+        present = torch.cat([z[:, at.state], z[:, at.action], z[:, at.payload]], dim=1)
+        return torch.cat([self.past(past), self.present(present).unsqueeze(1)], dim=1) + self.place
 
 
 class _Block(nn.Module):
@@ -36,7 +59,7 @@ class DeltaTransformer(DeltaNet):
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
         width = config.transformer_width
-        self.tokens = Tokens(self.features, config, width)
+        self.tokens = _Tokens(self.features, config, width)
         self.blocks = nn.Sequential(
             *(_Block(width, config.transformer_heads) for _ in range(config.transformer_layers))
         )
