@@ -21,8 +21,8 @@ from gaponet.robot import RobotSpec
 from gaponet.sim.replay import replay
 from gaponet.sim.touching import tip_heights
 
-ITERATIONS, GAIN = 6, 0.6
-LEAD, SMOOTH, NEAR = 0.1, 0.06, 0.01  # s: how much later a correction shows, σ of the filter; m: a tip is at the table
+ITERATIONS, GAIN = 3, 0.8
+LEAD, SMOOTH, NEAR = 0.12, 0.06, 0.01  # s: how much later a correction shows, σ of the filter; m: a tip is at the table
 
 
 def trajectory_labels(
