@@ -345,6 +345,7 @@ def evaluate(
     also: tuple[Place, ...] = (),
     motions: tuple[str, ...] = (),
     robot: RobotSpec | Place | None = None,
+    units: tuple[str, ...] = (),
 ) -> Evaluation:
     """Step simulators through logs they never saw: nominal, identified, and with the shipped model on top.
 
@@ -355,6 +356,7 @@ def evaluate(
         motions: Only these.
         robot: Another robot than the one that the dataset keeps. If it is not the simulator that the run was trained
             in, it is shown as it is, and with the run transferred into it (deploy/transfer.py).
+        units: Only recordings of these, such as the one held out from training.
 
     Raises:
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
@@ -373,7 +375,7 @@ def evaluate(
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
     with bar("evaluating") as update:
-        found = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, update, target)
+        found = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, update, target, units)
     found.save(folder)
     return found
 

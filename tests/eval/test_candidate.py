@@ -9,7 +9,7 @@ from runs import untrained
 import gaponet as gp
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.errors import RobotError, UsageError
+from gaponet.errors import DatasetError, RobotError, UsageError
 from gaponet.eval.candidate import Candidate, choose
 from gaponet.eval.verdict import added, next_step, verdict
 from gaponet.robot_folder import ORIGIN, save_robot
@@ -51,6 +51,12 @@ def test_an_identified_folder_is_taken_where_a_run_is(fitted, data, arm, capsys)
     said = " ".join(capsys.readouterr().out.split())
     assert "Identification leaves" in said
     assert f"next: gaponet export {fitted}" in said
+
+
+def test_one_unit_alone_can_be_asked(fitted, data):
+    assert choose([fitted], data, units=("a",)) == choose([fitted], data)
+    with pytest.raises(DatasetError, match="no unit 'other'; it holds: a"):
+        choose([fitted], data, units=("other",))
 
 
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):

@@ -75,11 +75,12 @@ def evaluate(
     also: tuple[Path, ...] = (),
     motions: Motions = (),
     robot: Robot = None,
+    units: tuple[str, ...] = (),
     json: Json = False,
 ) -> None:
     """Measure robots and runs on motions that they never saw."""
     out = Out(json)
-    evaluation = api.evaluate(run, dataset, also, motions, robot)
+    evaluation = api.evaluate(run, dataset, also, motions, robot, units)
     if not evaluation.result["unseen"]:
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"

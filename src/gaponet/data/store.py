@@ -199,17 +199,17 @@ class Dataset:
         """The entry with this content, if any."""
         return self._by_hash.get(content_hash)
 
-    def select(self, motions: tuple[str, ...] = ()) -> list[Entry]:
-        """Entries of these motions, all by default; refuses a motion that is not there."""
-        present = {e.meta.motion for e in self.entries}
-        for motion in motions:
-            if motion not in present:
-                raise DatasetError(
-                    f"{self.path}: no motion '{motion}'; it holds: {', '.join(sorted(present)) or 'nothing'}"
-                )
+    def select(self, motions: tuple[str, ...] = (), units: tuple[str, ...] = ()) -> list[Entry]:
+        """Entries of these motions and units, all by default; refuses one that is not there."""
+        for what, field_, wanted in (("motion", "motion", motions), ("unit", "unit_id", units)):
+            present = {getattr(e.meta, field_) for e in self.entries} if wanted else set()
+            if strange := sorted(set(wanted) - present):
+                held = ", ".join(sorted(present)) or "nothing"
+                raise DatasetError(f"{self.path}: no {what} '{strange[0]}'; it holds: {held}")
         if not self.entries:
             raise DatasetError(f"{self.path}: holds no sequences yet; import or collect some")
-        return [e for e in self.entries if not motions or e.meta.motion in motions]
+        chosen = [e for e in self.entries if not motions or e.meta.motion in motions]
+        return [e for e in chosen if not units or e.meta.unit_id in units]
 
     def state(self, **fields: str) -> None:
         """Write what only a person can say (licence, source) into dataset.json; an empty text takes it away."""

@@ -101,23 +101,26 @@ def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
     return require_kept(run, robot, ModelError, DATA)
 
 
-def choose(folders: list[Path], dataset: Dataset, motions: tuple[str, ...] = ()) -> tuple[list[Entry], bool]:
+def choose(
+    folders: list[Path], dataset: Dataset, motions: tuple[str, ...] = (), units: tuple[str, ...] = ()
+) -> tuple[list[Entry], bool]:
     """Entries to evaluate, and whether none of them was seen by any of the candidates.
 
     By default the first one's test part, or else everything, each without what any has seen; where all motions were
     seen, recordings that were not. A robot folder that does not say what it was identified from counts as having seen
-    everything, and gets everything.
+    everything, and gets everything. Of all these the ones of `units`, if such are named.
     """
     seen = [Seen.by(folder) for folder in folders]
     if None in seen:
-        return dataset.select(motions), False
+        return dataset.select(motions, units), False
     known = [s for s in seen if s is not None]
-    fresh = [e for e in dataset.entries if not any(e in s for s in known)]
+    mine = dataset.select(units=units)
+    fresh = [e for e in mine if not any(e in s for s in known)]
     if motions:
-        entries = dataset.select(motions)
+        entries = dataset.select(motions, units)
     else:
         entries = [e for e in fresh if e.hash in known[0].test] or fresh
-        entries = entries or [e for e in dataset.entries if not any(e.hash in s.hashes for s in known)]
+        entries = entries or [e for e in mine if not any(e.hash in s.hashes for s in known)]
     if not entries:
         raise DatasetError(
             f"{dataset.path}: every sequence was used in training; give logs the runs never saw, or --motions"

@@ -96,6 +96,7 @@ def evaluate(
     motions: tuple[str, ...] = (),
     progress: Progress = silent,
     target: RobotSpec | None = None,
+    units: tuple[str, ...] = (),
 ) -> Evaluation:
     """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
 
@@ -106,6 +107,7 @@ def evaluate(
         motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
             trained on.
         target: Another simulator, to be shown as it is and with the first of folders transferred into it.
+        units: Only recordings of these.
     """
     dataset.require_robot(robot)
     known: dict[str, Candidate] = {}
@@ -117,7 +119,7 @@ def evaluate(
     first = next(iter(known.values()))
     models = {name: c.model for name, c in known.items() if c.model is not None}
     nominal = first.robot.before_identification
-    entries, unseen = choose(list(folders), dataset, motions)
+    entries, unseen = choose(list(folders), dataset, motions, units)
     sequences = dataset.sequences(entries)
     for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
         model.require(known[name].robot, dt)

@@ -263,6 +263,7 @@ def _identify(
     wide = {joint: fields for joint, (fields, _) in unknown.items()}
     made = Identified(found, began, ended, chosen, doubts, std, tried, touch, tuple(common), by_joint, sure, wide)
     rival = offered("PROVIDES").get("identification from torque") if validation else None
+    clock.progress(clock.iterations, clock.iterations, "the robot that was found, and what torque says of it")
     return named(rival)(made, sequences, validation, given, nthread) if rival else made
 
 
