@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.robot import available, load_robot
+from gaponet.robot import LAW, available, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
 pytest.importorskip("torch")
@@ -138,3 +138,28 @@ def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
     assert still > 10 * STOPPED  # without the law they are elsewhere
     for name, x in ours.state().items():
         assert theirs.state()[name].shape == x.shape
+
+
+@pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("min_torque",), LAW])
+def test_the_law_of_a_physics_step_is_c_mujocos_but_for_rounding(tmp_path, parts):
+    law = dict(zip(LAW, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3), strict=True))
+    robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
+    robot = robot.with_servos({"elbow": {"offset": 0.1}})
+    ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)
+    for x in ours.law.values.values():
+        x[:, 0] *= [0.0, 1.0, 2.0]
+    theirs, rng = WarpSim(ours, "warp-cpu"), np.random.default_rng(0)
+    model = theirs._worlds[0].model
+    for ids in (np.arange(3), np.array([0, 2])):
+        qpos, qvel, past = (rng.normal(0, 0.3, (len(ids), *more)) for more in ((2,), (2,), (1, 2)))
+        target = np.clip(ours.qpos + rng.choice([1e-4, 0.1], (3, 2)), *ours.range.T)
+        for sim in (ours, theirs):
+            sim.reset(ids, qpos, qvel, past=past)
+        for name, x in ours.state().items():
+            np.testing.assert_allclose(theirs.state()[name], x, rtol=1e-5, atol=1e-6)
+        ours.ctrl[:] = target
+        ours.law.before()
+        theirs.step(target)
+        for name in ("actuator_biasprm", "dof_frictionloss"):
+            np.testing.assert_allclose(getattr(model, name).numpy(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5)
+        ours.set_state({name: x.numpy() for name, x in theirs.state().items()})

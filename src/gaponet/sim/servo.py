@@ -4,7 +4,7 @@ The encoder counts in steps; a motor that is told to turn at all turns with a le
 larger at rest (Stribeck) and grows with what the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024).
 MuJoCo integrates: these laws only move the actuator's bias and the limit of friction, so friction sticks as MuJoCo's
 does. The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_runs.py) compute with
-them. A compiled model carries the numbers in actuator_user; without any, nothing here runs.
+them; sim/warp.py has this law as a kernel. A model's actuator_user carries the numbers; without, nothing here runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array, copy_of, library, like, zeros_like
+from gaponet.arrays import Array, library
 from gaponet.robot import LAW
 
 Law = dict[str, Any]  # name of LAW → values that broadcast to the simulations' joints, numpy or torch
@@ -119,7 +119,7 @@ def advance(
 
 
 class ServoLaw:
-    """The servos of every simulation in a batch.
+    """The servos of every simulation in a batch, whose actuators stand in the order of its joints.
 
     Attributes:
         values: Name of LAW → (nsim, nu); may be written.
@@ -130,51 +130,35 @@ class ServoLaw:
     """
 
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
-        """Take the model's numbers for all simulations.
-
-        batch: A mujoco.batch.Batch, or what has its bind, expand and forward.
-        """
+        """Take the model's numbers for all simulations of a mujoco.batch.Batch, or of what has its bind and expand."""
         self.batch, self.model = batch, model
         user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(LAW)))
         self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
-        dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-        self.dof = slice(dof[0], dof[-1] + 1) if (np.diff(dof) == 1).all() else like(self._qpos, dof)  # a view
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
         self.values: Law = {name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(LAW)}
-        self.frictionloss, self.bias = copy_of(self._limit[:, self.dof]), copy_of(self._bias[:, :, 0])
-        self.torque, self.load = (zeros_like(self._force, *self._force.shape) for _ in range(2))
+        self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
+        self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self.active = present(self.values)
 
-    def take(self, other: ServoLaw, rows: Array) -> None:
-        """Be servos of another batch, its simulations `rows`."""
-        self.bias[:] = like(self.bias, other.bias[rows])
-        self.frictionloss[:] = like(self.bias, other.frictionloss[rows])
-        self.values = {name: like(self.bias, x[rows]) for name, x in other.values.items()}
-        self.active = present(self.values)
-
-    def reset(self, ids: Any, target: Any) -> None:
+    def reset(self, ids: Array, target: Array) -> None:
         """Simulations `ids` were put into a state, under position targets (k, nu) rad."""
-        error = target - self._qpos[ids][:, self.dof]
-        low, high = like(error, self.model.actuator_forcerange.T)
-        self.torque[ids] = (self._gain[ids][..., 0] * error + self.bias[ids]).clip(low, high)
+        asked = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
+        self.torque[ids] = asked.clip(*self.model.actuator_forcerange.T)
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
-        self.load[ids] = self._passing[ids][:, self.dof]
+        self.load[ids] = self._passing[ids]
 
     def before(self) -> None:
         """Set bias and friction for the next physics step."""
-        law, gain = self.active, self._gain[:, :, 0]
+        law, gain, qpos = self.active, self._gain[:, :, 0], self._qpos
         if "encoder_step" in law or "min_torque" in law:
             # Of a late servo (MuJoCo delays ctrl behind this) the least torque goes by the target that is under way.
-            qpos = self._qpos[:, self.dof]
             aim = self._ctrl + self.bias / gain
             self._bias[:, :, 0] = servo_torque(law, gain, aim, qpos) - gain * (self._ctrl - qpos)
-        qvel = self._qvel[:, self.dof]
-        self._limit[:, self.dof] = friction_limit(law, self.frictionloss, qvel, self.torque, self.load)
+        self._limit[:] = friction_limit(law, self.frictionloss, self._qvel, self.torque, self.load)
 
     def after(self, ids: Any = None) -> None:
         """A physics step of these simulations has passed."""
         moved = slice(None) if ids is None else ids
-        self.torque[moved] = self._force[moved]
-        self.load[moved] = self._passing[moved][:, self.dof]
+        self.torque[moved], self.load[moved] = self._force[moved], self._passing[moved]

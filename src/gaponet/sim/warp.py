@@ -1,12 +1,12 @@
 """BatchSim's simulations on Warp's device by mujoco_warp: thousands side by side on a GPU, or on the CPU, to test that.
 
-Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
+_Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
 identification and robots stay on C MuJoCo, from which these simulations part by about 1e-6 rad in a second.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import mujoco
@@ -18,22 +18,45 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from gaponet.errors import UsageError
+from gaponet.robot import LAW
+from gaponet.sim import servo
 from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
-from gaponet.sim.servo import ServoLaw
 
 CONTACTS, ROWS = 48, 4  # of a simulation whose links touch, and constraints of each
 STATE = {"qpos": "qpos", "qvel": "qvel", "qacc_warmstart": "warmstart"}  # field of Data → name in BatchSim.state
 LATE = {"history": "history", "time": "time"}
-LAW = {"servo_torque": "servo_torque", "servo_load": "servo_load"}
+SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 AIM = {"ctrl": "ctrl"}
+
+_Floats: Any = warp.array2d(dtype=float)
+_Numbers: Any = warp.array2d(dtype=warp.types.vector(len(LAW), float))  # in the order of LAW
+_Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
+_passing = warp.func(servo.passing_friction)
+
+
+@warp.kernel(enable_backward=False)
+def _set_servos(
+    law: _Numbers, dead: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
+    qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats,
+) -> None:  # fmt: skip
+    """ServoLaw.before: bias and friction of servo j of world i for the next physics step."""
+    i, j = warp.tid()
+    own, kp, q = law[i, j], gain[i, j][0], qpos[i, j]
+    resting = own[0] * warp.exp(-abs(qvel[i, j]) / max(own[1], servo.SLOWEST))
+    limit[i, j] = dry[i, j] + _passing(own[2], own[3], torque[i, j], load[i, j]) + resting
+    least, step = own[4], own[5]
+    if least > 0.0 or step > 0.0:
+        read = warp.where(step > 0.0, warp.rint(q / max(step, servo.FINEST)) * step, q)
+        asked = kp * (ctrl[i, j] + offset[i, j] / kp - read)
+        turning = warp.sign(asked) * max(abs(asked), least)
+        bias[i, j][0] = warp.where(abs(asked) > dead * step * kp, turning, 0.0) - kp * (ctrl[i, j] - q)
 
 
 class _Worlds:
     """Simulations of one rate: mujoco_warp steps all of its worlds or none, and all as often."""
 
     def __init__(self, sim: BatchSim, rows: np.ndarray, device: str) -> None:
-        self.device, self.nstep, self._graph = warp.get_device(device), int(sim.nstep[rows[0]]), None
-        self.law: ServoLaw | None = None
+        self.device, self.nstep, self._graphs = warp.get_device(device), int(sim.nstep[rows[0]]), dict[Any, Any]()
         model = next(iter(sim.models.values()))
         own = {name: x[rows] for name in sorted(MODEL_FIELDS) if (x := sim.batch.expanded(name)) is not None}
         timestep = own.pop("opt.timestep", np.full(len(rows), model.opt.timestep))
@@ -49,64 +72,72 @@ class _Worlds:
             self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
+            self._law = self._law_of(sim.law, rows) if sim.law is not None else None
         for name, x in own.items():
-            view = self.expand(name)
+            view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
-        if sim.law is not None:
-            self.law = ServoLaw(self, model)
-            self.law.take(sim.law, rows)
+
+    def _law_of(self, law: servo.ServoLaw, rows: np.ndarray) -> list[Any]:
+        """What _set_servos is given."""
+        m, d, active = self.model, self.data, servo.present(law.values)
+        stated = np.stack([law.values[name][rows] for name in LAW], axis=-1)
+        self._offset = warp.array(law.bias[rows], dtype=float)
+        own = [warp.array(stated, dtype=_Numbers.dtype), 0.5 * ("min_torque" in active), self._offset]
+        own += [warp.array(law.frictionloss[rows], dtype=float), m.actuator_gainprm, d.ctrl, d.qpos, d.qvel]
+        return [*own, d.actuator_force, d.qfrc_bias, m.actuator_biasprm, m.dof_frictionloss]
 
     def bind(self, name: str) -> Tensor:
-        """A live view of a field of all worlds, (nworld, …); of the law's state too."""
-        if name in LAW:
-            assert self.law
-            return self.law.torque if name == "servo_torque" else self.law.load
+        """A live view of a field of all worlds, (nworld, …)."""
         return warp.to_torch(getattr(self.data, name))
-
-    def expand(self, name: str) -> Tensor:
-        """A live view of a field of the model, (nworld, …) where the BatchSim's was expanded."""
-        return warp.to_torch(getattr(self.model, name))
-
-    def forward(self, ids: Any = None, stage: int = 0) -> None:
-        """Compute what follows from positions and velocities, of all worlds."""
-        stream = warp.stream_from_torch(torch.cuda.current_stream()) if self.device.is_cuda else None
-        with warp.ScopedDevice(self.device), warp.ScopedStream(stream):
-            mujoco_warp.step1(self.model, self.data)
 
     def step(self) -> None:
         """Advance by a control period."""
-        if self.law is None:
-            self._launch(self.nstep)
-            return
+        self._launch(self._period)
+
+    def reset_law(self, put: Tensor, target: Tensor) -> None:
+        """ServoLaw.reset, of the worlds where `put` (nworld,) is true, under targets (nworld, nu) rad."""
+        torque, load = self.bind("actuator_force"), self.bind("qfrc_bias")
+        gain, offset = warp.to_torch(self.model.actuator_gainprm)[..., 0], warp.to_torch(self._offset)
+        asked = gain * (target - self.bind("qpos")) + offset
+        low, high = warp.to_torch(self.model.actuator_forcerange).unbind(-1)
+        before, put = load.clone(), put[:, None]
+        self._launch(self._bias)
+        torque.copy_(torch.where(put, asked.clip(low, high), torque))
+        load.copy_(torch.where(put, load, before))
+
+    def _period(self) -> None:
         for _ in range(self.nstep):
-            self.law.before()
-            self._launch(1)
-            self.law.after()
+            if self._law is not None:
+                warp.launch(_set_servos, self.data.ctrl.shape, self._law)
+            mujoco_warp.step(self.model, self.data)
 
-    def _launch(self, count: int) -> None:
+    def _bias(self) -> None:
+        """Gravity's and Coriolis forces, of all worlds: a small part of a step."""
+        for part in (mujoco_warp.fwd_kinematics, mujoco_warp.com_vel, mujoco_warp.rne):
+            part(self.model, self.data)
+
+    def _launch(self, kernels: Callable[[], None]) -> None:
+        """Launch kernels; on a GPU as one CUDA graph, on torch's stream."""
         if self.device.is_cuda:
-            self._graph = self._graph or self._captured(count)
-            warp.capture_launch(self._graph, warp.stream_from_torch(torch.cuda.current_stream()))
+            graph = self._graphs[kernels] = self._graphs.get(kernels) or self._captured(kernels)
+            warp.capture_launch(graph, warp.stream_from_torch(torch.cuda.current_stream()))
         else:
-            self._steps(count)
+            with warp.ScopedDevice(self.device):
+                kernels()
 
-    def _steps(self, count: int) -> None:
-        with warp.ScopedDevice(self.device):
-            for _ in range(count):
-                mujoco_warp.step(self.model, self.data)
-
-    def _captured(self, count: int) -> Any:
-        """The kernels of so many physics steps as one CUDA graph; compiled by stepping once, which is undone."""
-        moved = [self.bind(name) for name in (*STATE, *LATE) if getattr(self.data, name).size]
+    def _captured(self, kernels: Callable[[], None]) -> Any:
+        """These kernels as a CUDA graph; compiled by launching them once, which is undone."""
+        moved = [self.bind(name) for name in (*STATE, *LATE, *SERVO) if getattr(self.data, name).size]
         before = [x.clone() for x in moved]
         torch.cuda.synchronize()
-        self._steps(count)
-        warp.synchronize_device(self.device)
-        for x, old in zip(moved, before, strict=True):
-            x.copy_(old)
-        torch.cuda.synchronize()
-        with warp.ScopedCapture(self.device) as capture:
-            self._steps(count)
+        with warp.ScopedDevice(self.device):
+            kernels()
+            warp.synchronize_device(self.device)
+            for x, old in zip(moved, before, strict=True):
+                x.copy_(old)
+            torch.cuda.synchronize()
+            with warp.ScopedCapture(self.device) as capture:
+                kernels()
         return capture.graph
 
 
@@ -136,9 +167,8 @@ class WarpSim:
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
-        self._kept = (
-            STATE | (LATE if self._late else {}) | ({} if sim.law is None else LAW) | ({} if sim.most is None else AIM)
-        )
+        self._kept = STATE | (LATE if self._late else {}) | (SERVO if sim.law else {})
+        self._kept |= {} if sim.most is None else AIM
         names = [*self._kept, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
         if len(self._worlds) == 1:
@@ -158,9 +188,10 @@ class WarpSim:
         self.set_state(sim.state())
 
     def array(self, values: Any) -> Tensor:
-        """Values as the device has them: floats of 32 bits, whole numbers of 64."""
+        """Values as the device has them, floats of 32 bits; the host does not wait until they are there."""
         values = torch.as_tensor(values)
-        return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else values.dtype)
+        kind = torch.float32 if values.is_floating_point() else values.dtype
+        return values.to(self.qpos.device, kind, non_blocking=True)
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """The same as BatchSim.reset; arrays of any kind."""
@@ -175,15 +206,13 @@ class WarpSim:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
-        if LAW.keys() <= self._kept.keys():
+        if SERVO.keys() <= self._kept.keys():
             put, target = torch.zeros_like(self.nstep, dtype=torch.bool), self.qpos.clone()
             put[ids] = True
             if past is not None:
                 target[ids] = self.array(past)[:, 0]
             for worlds, rows in self._in_turn():
-                assert worlds.law
-                mine = put[rows].nonzero()[:, 0]
-                worlds.law.reset(mine, target[rows[mine]])
+                worlds.reset_law(put[rows], target[rows])
 
     def _in_turn(self) -> Iterator[tuple[_Worlds, Tensor]]:
         """The worlds of each rate with their simulations' state, which is taken back."""
