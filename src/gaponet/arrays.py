@@ -36,8 +36,3 @@ def copy_of(x: Any) -> Any:
 def host(x: Any) -> Array:
     """The same in numpy; a copy of a tensor on a GPU."""
     return x if isinstance(x, np.ndarray) else x.cpu().numpy()
-
-
-def indices(mask: Any) -> Array:
-    """Where a mask (k,) is true, on the host."""
-    return np.flatnonzero(mask) if isinstance(mask, np.ndarray) else host(mask.nonzero()[:, 0])

@@ -10,6 +10,7 @@ from arm import recordings, write_arm
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
+from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
 from gaponet.training.config import RewardConfig, WarmStartConfig
 from gaponet.training.env import AHEAD, DeltaEnv
@@ -31,7 +32,7 @@ def test_without_correction_the_environment_is_the_replay(robot):
     sequences = recordings(robot, 2, rows=60, kp=0.6)
     env = make(robot, sequences)
     for i in range(env.num_envs):  # put everyone at a motion's first row
-        env.row[i] = env.first[i]
+        env.row[i] = env.here[i] = env.first[i]
     env.sim.reset(slice(None), env.qpos[env.row], env.qvel[env.row])
     first = env.first.copy()
     for _ in range(59):
@@ -92,12 +93,13 @@ def test_the_critic_looks_ahead_of_the_simulation(robot):
 
 
 def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
-    env = make(robot, recordings(robot, 4, rows=60))
+    sequences = recordings(robot, 4, rows=60)
+    env = make(robot, sequences)
     masses = {env.conditions[g][0] for g in env.group}
     assert masses == {0.0, 0.2}
     for i in range(env.num_envs):
         member = np.flatnonzero(env.seq_first == env.first[i])[0]
-        assert member in env.members[env.group[i]]
+        assert env.conditions[env.group[i]] == Condition.of(sequences[member], robot)
 
 
 def test_a_motions_end_is_a_time_out(robot):

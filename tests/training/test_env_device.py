@@ -1,5 +1,7 @@
 """The training environment on Warp's CPU device: the same numbers as on C MuJoCo's, and none that go to the host."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -19,9 +21,9 @@ pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
 STEPS, HIDDEN = 200, ("branch_hidden", "trunk_hidden", "sensor_hidden")
 
 
-def make(folder, device, rows=60, **model):
-    robot = write_arm(folder)
-    sequences = recordings(robot, 4, rows=rows, kp=0.6)
+def make(folder, device, servo=None, **model):
+    robot = replace(write_arm(folder), **servo or {})
+    sequences = recordings(robot, 4, rows=60, kp=0.6)
     return DeltaEnv(sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device)
 
 
@@ -64,18 +66,20 @@ def test_a_tensor_that_goes_to_the_host_is_noted():
     assert len(crossings.seen) >= 2
 
 
-def test_nothing_but_the_list_of_resets_goes_to_the_host(tmp_path):
-    env = make(tmp_path, "warp-cpu", history=2)
+@pytest.mark.parametrize("servo", [{}, {"stribeck": 0.05, "stribeck_speed": 0.2, "delay": [0.03, 0.0]}])
+def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
+    env = make(tmp_path, "warp-cpu", servo, history=2, stride=2)
     delta, resets = torch.zeros(8, 2), 0
     for _ in range(60):
-        before = env.elapsed.clone()
+        before = env.elapsed.copy()
         with Crossings() as crossings:
             env.get_observations()
             _, done = env.step(delta)
-        assert (env.elapsed == torch.where(done, 0, before + 1)).all()
-        ended = int(done.sum())
-        assert crossings.seen == [("cpu", torch.int64, (ended,)), ("numpy", torch.int64, (ended,))]
-        resets += ended
+        assert crossings.seen == []
+        np.testing.assert_array_equal(env.elapsed, np.where(done, 0, before + 1))
+        np.testing.assert_array_equal(env.here, env.row)
+        np.testing.assert_array_equal(env.until, env.last)
+        resets += int(done.sum())
     assert resets
 
 

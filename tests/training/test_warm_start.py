@@ -1,5 +1,7 @@
 """The supervised start: the baseline's recipe, the sensor predictor's features."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from arm import recordings, write_arm
 
 from gaponet.model.config import ModelConfig
 from gaponet.model.deeponet import build_network
+from gaponet.training import warm_start
 from gaponet.training.config import RewardConfig, TrainConfig, WarmStartConfig
 from gaponet.training.env import DeltaEnv
 from gaponet.training.warm_start import WarmStart, recipe
@@ -38,3 +41,19 @@ def test_the_predictor_is_fitted_on_the_features_that_it_is_asked_with(fitted):
     fitted.round(lambda: 0.0)
     assert torch.equal(net.features.standardise.mean, before)
     assert fitted.pool_x[0].shape == (32 * 64, net.config.input_dim(2))
+
+
+def test_of_too_many_states_the_pool_keeps_a_part_of_every_environment(fitted, monkeypatch):
+    env, rows = fitted.env, []
+    fitted.config = replace(fitted.config, rounds=2, steps=6)
+    for most in (10**6, 2 * 6 * 32 // 3):
+        monkeypatch.setattr(warm_start, "MOST", most)
+        fitted.pool_x.clear(), fitted.pool_y.clear()
+        env.rng = np.random.default_rng(0)
+        fitted.collect(follow_labels=True)
+        rows.append(fitted.pool_x[0].numpy())
+        assert len(fitted.pool_y[0]) == len(rows[-1])
+    every, some = rows
+    assert len(every) == 6 * 32
+    kept = np.arange(6 * 32).reshape(6, 32)
+    np.testing.assert_array_equal(some, every[np.concatenate([kept[t, t % 3 :: 3] for t in range(6)])])

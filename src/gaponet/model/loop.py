@@ -67,10 +67,10 @@ class DeltaLoop:
 
     def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
         """Give robots `ids` a past: frames (k, depth, n), newest first, or (k, 1, n), repeated; rad, rad/s, rad."""
-        self.reset(ids)
         self.history.reset(ids, qpos, qvel, u)
-        self.fresh[ids] = False
-        self.any_fresh = bool(self.fresh.any())
+        if self.any_fresh:
+            self.fresh[ids] = False
+            self.any_fresh = bool(self.fresh.any())
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """One control period has passed: the state before it and the target applied over it, (num_envs, n) each."""

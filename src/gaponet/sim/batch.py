@@ -235,25 +235,24 @@ class BatchSim:
                 the robot's) and LAW, each (num_envs, k). A damping below zero takes from the servo's own kd.
         """
         model, batch = next(iter(self.models.values())), self.batch
-        dof = np.array([model.joint(j).dofadr[0] for j in joints])
-        act = np.array([model.actuator(j).id for j in joints])
+        at = np.array([model.actuator(j).id for j in joints])  # of the joint and of its degree of freedom too
         gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         kp = values["kp"] * self._stiffer[:, self.robot.index(joints)]
-        gain[:, act, 0], bias[:, act, 1] = kp, -kp
-        bias[:, act, 0] = kp * values["offset"]
+        gain[:, at, 0], bias[:, at, 1] = kp, -kp
+        bias[:, at, 0] = kp * values["offset"]
         kd = self._kd[:, self.robot.index(joints)]
-        bias[:, act, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
-        batch.expand("dof_damping")[:, dof] = np.maximum(values["damping"], 0.0)
+        bias[:, at, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
+        batch.expand("dof_damping")[:, at] = np.maximum(values["damping"], 0.0)
         for name in ("frictionloss", "armature"):
-            batch.expand(f"dof_{name}")[:, dof] = values[name]
+            batch.expand(f"dof_{name}")[:, at] = values[name]
         if "delay" in values and model.nhistory:
-            batch.expand("actuator_delay")[:, act] = values["delay"]
+            batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:
-            batch.expand("qpos0")[:, dof] = -values["zero"]
+            batch.expand("qpos0")[:, at] = -values["zero"]
         if self.law is not None:
-            self.law.bias[:, act], self.law.frictionloss[:, act] = bias[:, act, 0], values["frictionloss"]
+            self.law.bias[:, at], self.law.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
             for name in LAW:
-                self.law.values[name][:, act] = values.get(name, 0.0)
+                self.law.values[name][:, at] = values.get(name, 0.0)
 
     def state(self) -> dict[str, Array]:
         """Copies of all that the next step follows from."""
@@ -318,12 +317,12 @@ class CommandHistory:
         self.cursor, self.times = parts[..., :2], parts[..., 2 : -self.samples]
         self.values = parts[..., -self.samples :]
         self.ago = like(time, np.arange(self.samples, 0, -1))  # oldest first
+        self._newest, self._each = like(time, [0.0, self.samples - 1.0]), like(time, np.arange(len(time))[:, None])
 
     def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
         """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""
         self.time[ids] = 0.0
-        self.cursor[ids] = like(self.time, [0.0, self.samples - 1.0])
+        self.cursor[ids] = self._newest
         self.times[ids] = (-self.ago * timestep[:, None])[:, None]
         frame = ((self.ago - 1) // nstep[:, None]).clip(max=past.shape[1] - 1)  # (k, samples)
-        each = like(self.time, np.arange(len(past)))[:, None]
-        self.values[ids] = past[each, frame].swapaxes(1, 2)
+        self.values[ids] = past[self._each[: len(past)], frame].swapaxes(1, 2)

@@ -72,57 +72,42 @@ class _Worlds:
             self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
-            self._law = self._law_of(sim.law, rows) if sim.law is not None else None
+            self._law = None if sim.law is None else self._inputs(sim.law, rows)
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
 
-    def _law_of(self, law: servo.ServoLaw, rows: np.ndarray) -> list[Any]:
+    def _inputs(self, law: servo.ServoLaw, rows: np.ndarray) -> list[Any]:
         """What _set_servos is given."""
-        m, d, active = self.model, self.data, servo.present(law.values)
-        stated = np.stack([law.values[name][rows] for name in LAW], axis=-1)
-        self._offset = warp.array(law.bias[rows], dtype=float)
-        own = [warp.array(stated, dtype=_Numbers.dtype), 0.5 * ("min_torque" in active), self._offset]
-        own += [warp.array(law.frictionloss[rows], dtype=float), m.actuator_gainprm, d.ctrl, d.qpos, d.qvel]
-        return [*own, d.actuator_force, d.qfrc_bias, m.actuator_biasprm, m.dof_frictionloss]
+        m, d, dead = self.model, self.data, 0.5 * law.values["min_torque"].any()
+        stated = warp.array(np.stack([law.values[name][rows] for name in LAW], axis=-1), dtype=_Numbers.dtype)
+        own = [warp.array(x[rows], dtype=float) for x in (law.bias, law.frictionloss)]
+        state = [d.ctrl, d.qpos, d.qvel, d.actuator_force, d.qfrc_bias]
+        return [stated, dead, *own, m.actuator_gainprm, *state, m.actuator_biasprm, m.dof_frictionloss]
 
     def bind(self, name: str) -> Tensor:
         """A live view of a field of all worlds, (nworld, …)."""
         return warp.to_torch(getattr(self.data, name))
 
-    def step(self) -> None:
+    def period(self) -> None:
         """Advance by a control period."""
-        self._launch(self._period)
-
-    def reset_law(self, put: Tensor, target: Tensor) -> None:
-        """ServoLaw.reset, of the worlds where `put` (nworld,) is true, under targets (nworld, nu) rad."""
-        torque, load = self.bind("actuator_force"), self.bind("qfrc_bias")
-        gain, offset = warp.to_torch(self.model.actuator_gainprm)[..., 0], warp.to_torch(self._offset)
-        asked = gain * (target - self.bind("qpos")) + offset
-        low, high = warp.to_torch(self.model.actuator_forcerange).unbind(-1)
-        before, put = load.clone(), put[:, None]
-        self._launch(self._bias)
-        torque.copy_(torch.where(put, asked.clip(low, high), torque))
-        load.copy_(torch.where(put, load, before))
-
-    def _period(self) -> None:
         for _ in range(self.nstep):
             if self._law is not None:
                 warp.launch(_set_servos, self.data.ctrl.shape, self._law)
             mujoco_warp.step(self.model, self.data)
 
-    def _bias(self) -> None:
-        """Gravity's and Coriolis forces, of all worlds: a small part of a step."""
+    def bias_forces(self) -> None:
+        """Compute gravity's and Coriolis forces from positions and velocities: a small part of a physics step."""
         for part in (mujoco_warp.fwd_kinematics, mujoco_warp.com_vel, mujoco_warp.rne):
             part(self.model, self.data)
 
-    def _launch(self, kernels: Callable[[], None]) -> None:
-        """Launch kernels; on a GPU as one CUDA graph, on torch's stream."""
-        if self.device.is_cuda:
-            graph = self._graphs[kernels] = self._graphs.get(kernels) or self._captured(kernels)
-            warp.capture_launch(graph, warp.stream_from_torch(torch.cuda.current_stream()))
-        else:
-            with warp.ScopedDevice(self.device):
+    def launch(self, kernels: Callable[[], None]) -> None:
+        """Launch the kernels of `period` or `bias_forces`; on a GPU as one CUDA graph, on torch's stream."""
+        with warp.ScopedDevice(self.device):
+            if self.device.is_cuda:
+                graph = self._graphs[kernels] = self._graphs.get(kernels) or self._captured(kernels)
+                warp.capture_launch(graph, warp.stream_from_torch(torch.cuda.current_stream()))
+            else:
                 kernels()
 
     def _captured(self, kernels: Callable[[], None]) -> Any:
@@ -130,14 +115,13 @@ class _Worlds:
         moved = [self.bind(name) for name in (*STATE, *LATE, *SERVO) if getattr(self.data, name).size]
         before = [x.clone() for x in moved]
         torch.cuda.synchronize()
-        with warp.ScopedDevice(self.device):
+        kernels()
+        warp.synchronize_device(self.device)
+        for x, old in zip(moved, before, strict=True):
+            x.copy_(old)
+        torch.cuda.synchronize()
+        with warp.ScopedCapture(self.device) as capture:
             kernels()
-            warp.synchronize_device(self.device)
-            for x, old in zip(moved, before, strict=True):
-                x.copy_(old)
-            torch.cuda.synchronize()
-            with warp.ScopedCapture(self.device) as capture:
-                kernels()
         return capture.graph
 
 
@@ -175,12 +159,14 @@ class WarpSim:
             self._all = self._views[0]
         else:
             self._all = {name: x.new_zeros(self.num_envs, *x.shape[1:]) for name, x in self._views[0].items()}
-        self.qpos, self.qvel, self.ctrl, self.torque = (
-            self._all[name] for name in ("qpos", "qvel", "ctrl", "actuator_force")
-        )
+        self.qpos, self.qvel, self.ctrl = (self._all[name] for name in ("qpos", "qvel", "ctrl"))
+        self.torque = self._all["actuator_force"]
         self._ids = [self.array(rows) for rows in rates]
         self._low, self._high = self.array(self.range.T)
         self._most = None if sim.most is None else self.array(sim.most)
+        if sim.law:
+            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.law.bias, *sim.law.model.actuator_forcerange.T
+            self._gain, self._bias, *self._limits = map(self.array, told)
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._late:
             model = next(iter(sim.models.values()))
@@ -190,8 +176,7 @@ class WarpSim:
     def array(self, values: Any) -> Tensor:
         """Values as the device has them, floats of 32 bits; the host does not wait until they are there."""
         values = torch.as_tensor(values)
-        kind = torch.float32 if values.is_floating_point() else values.dtype
-        return values.to(self.qpos.device, kind, non_blocking=True)
+        return values.to(self.qpos.device, torch.float32 if values.is_floating_point() else None, non_blocking=True)
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, past: Any = None) -> None:
         """The same as BatchSim.reset; arrays of any kind."""
@@ -207,20 +192,21 @@ class WarpSim:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
         if SERVO.keys() <= self._kept.keys():
-            put, target = torch.zeros_like(self.nstep, dtype=torch.bool), self.qpos.clone()
-            put[ids] = True
-            if past is not None:
-                target[ids] = self.array(past)[:, 0]
-            for worlds, rows in self._in_turn():
-                worlds.reset_law(put[rows], target[rows])
+            ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
+            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], *self._limits)
+            load, before = self._all["qfrc_bias"], self._all["qfrc_bias"].clone()
+            for worlds in self._in_turn():
+                worlds.launch(worlds.bias_forces)
+            before[ids] = load[ids]
+            load.copy_(before)
 
-    def _in_turn(self) -> Iterator[tuple[_Worlds, Tensor]]:
+    def _in_turn(self) -> Iterator[_Worlds]:
         """The worlds of each rate with their simulations' state, which is taken back."""
         for worlds, views, rows in zip(self._worlds, self._views, self._ids, strict=True):
             if views is not self._all:
                 for name, x in views.items():
                     x.copy_(self._all[name][rows])
-            yield worlds, rows
+            yield worlds
             if views is not self._all:
                 for name, x in views.items():
                     self._all[name][rows] = x
@@ -231,16 +217,15 @@ class WarpSim:
         if self._most is not None:
             ctrl = torch.clamp(ctrl, self.ctrl - self._most, self.ctrl + self._most)
         torch.clamp(ctrl, self._low, self._high, out=self.ctrl)
-        for worlds, _ in self._in_turn():
-            worlds.step()
+        for worlds in self._in_turn():
+            worlds.launch(worlds.period)
         if self._late:  # a float32 tells physics steps apart for minutes only, so the clock starts again
             self._commands.times -= self._commands.time[:, None, None]
             self._commands.time.zero_()
         if ids is not None:
-            still = torch.ones(self.num_envs, dtype=torch.bool, device=self.qpos.device)
-            still[self.array(ids)] = False
+            moved = self.array(ids)
             for name, x in self._state().items():
-                x[still] = before[name][still]
+                x.copy_(before[name].index_copy(0, moved, x[moved]))
 
     def state(self) -> dict[str, Tensor]:
         """The same as BatchSim.state."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.arrays import Array, copy_of, indices, library, like, zeros_like
+from gaponet.arrays import Array, copy_of, library, like, zeros_like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
@@ -21,7 +21,7 @@ from gaponet.sim.free_runs import IMMOVABLE
 from gaponet.sim.replay import idle_limbs
 from gaponet.training.config import RewardConfig
 
-ROWS = ("row", "first", "last", "now", "elapsed")  # of each environment
+ROWS = ("row", "first", "last", "elapsed")  # of each environment
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead
 
 
@@ -101,8 +101,10 @@ class DeltaEnv:
             )
         share = np.cumsum(frames) / frames.sum() * self.num_envs
         self.group = np.searchsorted(share, np.arange(self.num_envs) + 0.5).astype(int)
-        self.members = [np.flatnonzero(seq_group == g) for g in range(len(frames))]
-        self.weights = [length[m] / length[m].sum() for m in self.members]
+        # Sequences group by group, and where in its group, plus the group's number, the share of each ends.
+        members = [np.flatnonzero(seq_group == g) for g in range(len(frames))]
+        shares = [np.cumsum(length[m] / length[m].sum()) for m in members]
+        self.members, self.ends = np.concatenate(members), np.concatenate([g + s / s[-1] for g, s in enumerate(shares)])
         self.payload = np.array([c[0] for c in self.conditions], np.float32)[self.group]
         rate = np.array([1 / c[2] for c in self.conditions], np.float32)[self.group]
         self.unsaid = np.where(self.unknown[self.group][:, self.op], np.nan, 0).astype(np.float32)  # counts nowhere
@@ -120,36 +122,35 @@ class DeltaEnv:
             setattr(self, name, place(getattr(self, name)))
         self.at, self.ahead = place(self.op), place(AHEAD)
         self.low, self.high = place(sim.range[self.op].T)
-        self.elapsed = place(np.zeros(num, np.int64))  # control periods since the reset
-        self.row = place(np.zeros(num, np.int64))  # row of the recording that the simulation stands at
-        self.first = place(np.zeros(num, np.int64))  # first row of its recording
-        self.last = place(np.zeros(num, np.int64))
+        # Of each simulation the row that it stands at, its recording's first and last, and periods since the reset: on
+        # the host, which thus need not ask the device who ended; the row and the last are there as well.
+        self.row, self.first, self.last, self.elapsed = (np.zeros(num, np.int64) for _ in ROWS)
+        self.here, self.until = (copy_of(place(x)) for x in (self.row, self.last))
         self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
 
-    def reset(self, ids: Array | None = None) -> None:
+    def reset(self, ids: Any = slice(None)) -> None:
         """Put environments at uniformly drawn recorded frames, with the frames before as history; ids on the host."""
-        ids = np.arange(self.num_envs) if ids is None else ids
-        seq = np.empty(len(ids), np.int64)
-        for g in np.unique(self.group[ids]):
-            mine = self.group[ids] == g
-            seq[mine] = self.rng.choice(self.members[g], size=mine.sum(), p=self.weights[g])
+        group = self.group[ids]
+        drawn = np.minimum(group + self.rng.random(len(group)), np.nextafter(group + 1.0, 0.0))  # in its group
+        seq = self.members[np.searchsorted(self.ends, drawn, side="right")]
         first, last = self.seq_first[seq], self.seq_last[seq]
         t = self.rng.integers(first, last)
         before = first[:, None] + History.rows_before(t - first, self.depth)
-        first, last, t, before = (self.sim.array(x) for x in (first, last, t, before))
         self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
+        t, last, before = (self.sim.array(x) for x in (t, last, before))
+        ids = ids if isinstance(ids, slice) else self.sim.array(ids)
+        self.here[ids], self.until[ids], self.now[ids] = t, last, self.track[t]
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
         self.loop.begin(ids, *(x[before][..., self.at] for x in (self.qpos, self.qvel, self.ctrl)))
-        self.now[ids] = self.track[t]
 
     def get_observations(self) -> dict[str, torch.Tensor]:
         """Actor and critic observations of the present row."""
         n, sim = self.num_actions, self.sim
         q, v = sim.qpos[:, self.at], sim.qvel[:, self.at]
         actor = copy_of(self.loop.observe(q, v, self.now[:, 2 * n :], self.payload))
-        rows = library(self.row).minimum(self.row[:, None] + self.ahead, self.last[:, None])
+        rows = library(self.here).minimum(self.here[:, None] + self.ahead, self.until[:, None])
         ahead = _rows_of(self.track, rows)  # (num_envs, rows ahead, 3n)
         # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
         seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
@@ -167,29 +168,27 @@ class DeltaEnv:
             Reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
             arrays of the simulator's kind.
         """
-        delta = self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max)
-        self.advance(delta)
-        reward = self._reward()
-        done = self.ended() | (self.elapsed >= self.max_episode_length)
-        ids = indices(done)
-        if ids.size:
-            self.reset(ids)
-        return reward, done
+        self.advance(self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max))
+        return self._reward(), self.sim.array(self.restart())
 
-    def ended(self) -> Any:
-        """Whether the recording has no row left, (num_envs,)."""
-        return self.row >= self.last
+    def restart(self) -> Array:
+        """Reset whose recording has no row left or whose time is over; returns whose, (num_envs,), on the host."""
+        done = (self.row >= self.last) | (self.elapsed >= self.max_episode_length)
+        if done.any():
+            self.reset(np.flatnonzero(done))
+        return done
 
     def advance(self, delta: Any) -> None:
         """Step all simulations by one control period, without reward or reset; delta (num_envs, n_operated)."""
         at, n, target = self.at, self.sim, self.target
-        target[:] = _rows_of(self.ctrl, self.row)
+        target[:] = _rows_of(self.ctrl, self.here)
         target[:, at] = (target[:, at] + n.array(delta)).clip(self.low, self.high)
         self.loop.push(n.qpos[:, at], n.qvel[:, at], target[:, at])
         n.step(target)
         self.row += 1
-        _rows_of(self.track, self.row, out=self.now)
         self.elapsed += 1
+        self.here += 1
+        _rows_of(self.track, self.here, out=self.now)
 
     def _reward(self) -> Any:
         c, n = self.reward_config, self.num_actions
@@ -229,7 +228,9 @@ class DeltaEnv:
         """Undo `state` in an environment made alike."""
         arrays = {name: x.numpy() for name, x in state["arrays"].items()}
         for name in ROWS:
-            getattr(self, name)[:] = self.sim.array(arrays[name])
+            getattr(self, name)[:] = arrays[name]
+        self.here[:], self.until[:] = self.sim.array(self.row), self.sim.array(self.last)
+        self.now[:] = self.track[self.here]
         self.loop.history.frames[:] = like(self.loop.history.frames, arrays["frames"])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]

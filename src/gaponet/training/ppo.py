@@ -143,7 +143,7 @@ class Learner:
         batch.advantage = own / ((explored * own**2).sum(0) / count).sqrt().clamp_min(1e-8)
         distances = []
         for _ in range(config.epochs):
-            for rows in torch.randperm(len(own)).to(own.device).chunk(config.mini_batches):
+            for rows in torch.randperm(len(own), device=own.device).chunk(config.mini_batches):
                 value = self.critic(batch.features[rows], batch.seen[rows])
                 self._descend(self.critic_optimiser, (value - batch.returns[rows]).square().mean())
                 if self.ready:

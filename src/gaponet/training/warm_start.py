@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch.nn.functional import huber_loss
 
-from gaponet.arrays import Array, indices, library
+from gaponet.arrays import Array, library
 from gaponet.model.layers import DeltaNet
 from gaponet.training import ranks
 from gaponet.training.config import TrainConfig, WarmStartConfig
@@ -26,6 +26,7 @@ from gaponet.training.env import DeltaEnv
 from gaponet.training.sensor_fit import Report, fit_inputs
 
 HUBER = 0.5  # of what labels usually are: beyond it a label counts as its distance, not its square
+MOST = 2_000_000  # states in the pool; where more are visited, some environments' are kept of each period, in turn
 
 
 def recipe(config: TrainConfig) -> WarmStartConfig:
@@ -78,24 +79,23 @@ class WarmStart:
 
     def collect(self, follow_labels: bool) -> None:
         """Roll out for config.steps, motions restarting where they end."""
-        env, net = self.env, self.net
+        env, net, steps = self.env, self.net, self.config.steps
         env.reset()
         net.eval()
-        xs, ys = [], []
-        for _ in range(self.config.steps):
+        xs, ys, every = [], [], math.ceil(self.config.rounds * steps * env.num_envs / MOST) or 1
+        for t in range(steps):
+            some = slice(t % every, None, every)
             x = env.get_observations()["actor"]
-            y = self.labels[env.row] + env.unsaid
-            xs.append(x)
-            ys.append(torch.as_tensor(y, device=x.device))
+            y = self.labels[env.here] + env.unsaid
+            xs.append(x[some].contiguous())
+            ys.append(torch.as_tensor(y[some], device=x.device))
             if follow_labels:
                 delta = library(y).nan_to_num(y)
             else:
                 with torch.inference_mode():
                     delta = net(x)
             env.advance(delta)
-            ended = indices(env.ended())
-            if ended.size:
-                env.reset(ended)
+            env.restart()
         self.pool_x.append(torch.cat(xs))
         self.pool_y.append(torch.cat(ys))
 
@@ -119,7 +119,8 @@ class WarmStart:
             done = step / config.gradient_steps
             for group in self.optimiser.param_groups:
                 group["lr"] = config.learning_rate * (0.01 + 0.99 * (0.5 + 0.5 * math.cos(math.pi * done)))
-            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator).to(x.device)
+            batch = torch.randint(0, len(x), (config.batch_size,), generator=self.generator)
+            batch = batch.to(x.device, non_blocking=True)
             missed = torch.nan_to_num(net(x[batch]) - y[batch])
             loss = huber_loss(missed / self.unit, torch.zeros_like(missed), delta=HUBER)
             self.optimiser.zero_grad()
