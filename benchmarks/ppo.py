@@ -116,7 +116,7 @@ class Arm:
 
     @property
     def _update(self) -> int:
-        ppo = self.study.config.ppo
+        ppo = self.study.config.sized().ppo
         return ppo.num_envs * ppo.num_steps
 
     def panel(self) -> tuple[str, dict[str, tuple[str, list[float], list[Spread]]]]:

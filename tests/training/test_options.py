@@ -18,6 +18,14 @@ CHANGED = TrainConfig(
 )  # fmt: skip
 
 
+def test_a_gpu_has_simulations_of_its_own_number_unless_told():
+    cuda = TrainConfig(ppo=PPOConfig(num_envs=256), device="cuda")
+    assert (TrainConfig().sized().warm_start.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
+    assert (cuda.sized().warm_start.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
+    assert cuda.options() == cuda.sized().options() == ["--warm-start.num-envs", "4096", "--device", "cuda"]
+    assert TrainConfig().options() == TrainConfig().sized().options() == []
+
+
 @pytest.mark.parametrize("config", [TrainConfig(), CHANGED, replace(TrainConfig(), seed=9).fast()])
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []

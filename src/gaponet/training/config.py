@@ -34,8 +34,8 @@ class WarmStartConfig:
 
     rounds: Annotated[int, Interval(ge=0, le=100000)] = 3
     """Roll-outs: the first led by the labels, then by the present policy; 0 starts PPO from an untrained network."""
-    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
-    """Simulations per round."""
+    num_envs: Annotated[int, Interval(ge=0, le=1000000)] = 0
+    """Simulations per round; 0 for 256, with --device cuda 4,096."""
     steps: Annotated[int, Interval(ge=1, le=10000000)] = 400
     """Control periods per round."""
     rows: Annotated[int, Interval(ge=1, le=10**12)] = 200_000
@@ -58,8 +58,8 @@ class WarmStartConfig:
 class PPOConfig:
     """PPO with reward, value, advantage and ratio of each joint (training/ppo.py)."""
 
-    num_envs: Annotated[int, Interval(ge=1, le=1000000)] = 256
-    """Simulations."""
+    num_envs: Annotated[int, Interval(ge=0, le=1000000)] = 0
+    """Simulations; 0 for 256, with --device cuda 4,096."""
     num_steps: Annotated[int, Interval(ge=1, le=100000)] = 32
     """Control periods between updates."""
     epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
@@ -121,8 +121,8 @@ class TrainConfig:
     threads: Annotated[int, Interval(ge=0, le=4096)] = 0
     """Threads of the simulator, and in turn of the learner; 0 for all cores, of the learner for OMP_NUM_THREADS."""
     device: Literal["cpu", "cuda", "warp-cpu"] = "cpu"
-    """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'); warp-cpu: the same on the CPU, slowly, to
-    test it. Scores, identification and robots stay on C MuJoCo."""
+    """cuda: simulations and networks on a GPU (pip install 'gaponet[warp]'), 4,096 simulations unless you say how many;
+    warp-cpu: the same on the CPU, slowly, to test it. Scores, identification and robots stay on C MuJoCo."""
 
     def network_device(self) -> str:
         """Where networks are trained, in torch's words; refuses a GPU that is not there, or what it takes."""
@@ -146,9 +146,15 @@ class TrainConfig:
         """The same with PPO of one pass over each batch and a smaller critic; gaponet bench train shows the gain."""
         return replace(self, ppo=replace(self.ppo, epochs=1, critic_hidden=(128,)))
 
+    def sized(self) -> TrainConfig:
+        """The same with as many simulations as suit the device, where none were asked for."""
+        num, warm, ppo = 4096 if self.device == "cuda" else 256, self.warm_start, self.ppo
+        warm, ppo = replace(warm, num_envs=warm.num_envs or num), replace(ppo, num_envs=ppo.num_envs or num)
+        return replace(self, warm_start=warm, ppo=ppo)
+
     def options(self) -> list[str]:
         """The options of gaponet train that say this configuration."""
-        return _options(asdict(self), asdict(TrainConfig()), "--")
+        return _options(asdict(self.sized()), asdict(TrainConfig().sized()), "--")
 
 
 def command(

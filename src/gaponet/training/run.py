@@ -74,7 +74,7 @@ class Trainer:
     ) -> None:
         """Split the dataset and refuse what cannot work, before any time is spent; log: any of loggers.KINDS."""
         dataset.require_robot(robot)
-        config = validated(TrainConfig, asdict(config), "training options", UsageError)
+        config = validated(TrainConfig, asdict(config), "training options", UsageError).sized()
         if not resume and any((out / name).exists() for name in ("checkpoint.pt", "model/card.json")):
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():

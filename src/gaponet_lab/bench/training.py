@@ -112,7 +112,7 @@ def bench_train(
 
 def _for_envs(config: TrainConfig, num_envs: int) -> TrainConfig:
     """The config for another number of environments, with mini-batches of the same size."""
-    ppo = config.ppo
+    ppo = config.sized().ppo
     parts = max(1, ppo.mini_batches * num_envs // ppo.num_envs)
     return replace(config, ppo=replace(ppo, num_envs=num_envs, mini_batches=parts))
 

@@ -65,7 +65,7 @@ class Cell:
 
     def setup(self, data: Dataset) -> dict[str, Any]:
         """Everything that a kept cell must agree in; threads change nothing but the time."""
-        config = replace(self.variant.config, seed=self.seed, threads=0)
+        config = replace(self.variant.config, seed=self.seed, threads=0).sized()
         return json.loads(json.dumps({
             "config": asdict(config), "budget": self.budget, "holdout_units": list(self.holdout_units),
             "dataset": dataset_hash(data.entries), "simulator": model_hash(self.robot),
@@ -105,7 +105,7 @@ def plan(
         if not file.is_file():
             raise UsageError(f"{cell.folder}: is there but is no part of a comparison; choose another --out")
         kept = read_kept(file)
-        kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig()))))
+        kept["config"] = _completed(kept["config"], json.loads(json.dumps(asdict(TrainConfig().sized()))))
         if kept != wanted:
             changed = ", ".join(k for k in wanted if kept.get(k) != wanted[k])
             raise UsageError(f"{cell.folder}: kept from a comparison with another {changed}; choose another --out")
