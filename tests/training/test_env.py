@@ -102,6 +102,18 @@ def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
         assert env.conditions[env.group[i]] == Condition.of(sequences[member], robot)
 
 
+def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(robot):
+    sequences = [s for rows in (20, 40, 70) for s in recordings(robot, 4, rows=rows)]
+    env, rng = make(robot, sequences, num_envs=64), np.random.default_rng(5)
+    env.rng = np.random.default_rng(5)
+    env.reset()
+    length, drawn = np.array([len(s) for s in sequences]), []
+    for g, condition in enumerate(env.conditions):
+        mine = np.flatnonzero([Condition.of(s, robot) == condition for s in sequences])
+        drawn += rng.choice(mine, size=(env.group == g).sum(), p=length[mine] / length[mine].sum()).tolist()
+    np.testing.assert_array_equal(env.first, env.seq_first[drawn])
+
+
 def test_a_motions_end_is_a_time_out(robot):
     env = make(robot, recordings(robot, 2, rows=5))
     seen = 0

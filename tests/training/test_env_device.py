@@ -18,7 +18,7 @@ from gaponet.training.run import Trainer
 
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
 
-STEPS, HIDDEN = 200, ("branch_hidden", "trunk_hidden", "sensor_hidden")
+STEPS, CASTS = 200, ("array", "bool", "float", "int", "index")
 
 
 def make(folder, device, servo=None, **model):
@@ -45,17 +45,21 @@ def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
 
 
 class Crossings(TorchFunctionMode):
-    """Notes every way from a tensor to the host."""
+    """Notes every way from a tensor to the host, and what else a GPU is waited for: masks as indices, other arrays."""
 
-    WAYS = ("cpu", "numpy", "item", "tolist", "__array__", "__bool__", "__float__", "__int__", "__index__")
+    WAYS = ("cpu", "numpy", "item", "tolist", "nonzero", "new_tensor", *(f"__{x}__" for x in CASTS))
 
     def __init__(self):
         super().__init__()
         self.seen = []
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        if getattr(func, "__name__", "") in self.WAYS:
-            self.seen.append((func.__name__, args[0].dtype, tuple(args[0].shape)))
+        name = getattr(func, "__name__", "")
+        index = args[1] if name in ("__getitem__", "__setitem__") else ()
+        parts = index if isinstance(index, tuple) else (index,)
+        waits = [isinstance(i, np.ndarray) or getattr(i, "dtype", None) == torch.bool for i in parts]
+        if name in self.WAYS or any(waits):
+            self.seen.append((name, args[0].dtype, tuple(args[0].shape)))
         return func(*args, **(kwargs or {}))
 
 
@@ -63,7 +67,9 @@ def test_a_tensor_that_goes_to_the_host_is_noted():
     with Crossings() as crossings:
         assert float(torch.zeros(1)) == 0
         np.asarray(torch.zeros(2))
-    assert len(crossings.seen) >= 2
+        torch.zeros(2)[torch.zeros(2) > 0]
+        torch.zeros(2, 2)[:, np.array([0])] = 1.0
+    assert len(crossings.seen) >= 4
 
 
 @pytest.mark.parametrize("servo", [{}, {"stribeck": 0.05, "stribeck_speed": 0.2, "delay": [0.03, 0.0]}])
