@@ -1,10 +1,12 @@
 """Control steps per second of a robot on a GPU: bare mujoco_warp, gaponet's simulations, and those with resets.
 
     python benchmarks/gpu.py [--device cuda] [--robot so101] [--seconds 5] 1024 4096 16384
+    python benchmarks/gpu.py --reached RUN OTHER
 
 For each number of simulations, of a servo as stated and of one with a law (Stribeck friction, friction by load). "bare"
-is the CUDA graph of one control period launched again and again; in "resets" one simulation in a hundred begins anew
-in every period. benchmarks/gpu.sh runs it with a training behind it.
+is the CUDA graph of one control period, the law's kernel in it where there is one, launched again and again; in
+"resets" one simulation in a hundred begins anew in every period. --reached: how long each of two trainings took to be
+as good on validation as RUN ever was. benchmarks/gpu.sh runs both.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -54,20 +57,35 @@ def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dic
         sim.step(target)
 
     begin(torch.arange(num_envs, device=home.device))
-    turns: dict[str, Callable[[], object]] = {"gaponet": lambda: sim.step(target), "resets": with_resets}
-    if sim._worlds[0].law is None:
-        turns = {"bare": sim._worlds[0].step} | turns
+    (worlds,) = sim._worlds
+    turns: dict[str, Callable[[], object]] = {"bare": lambda: worlds.launch(worlds.period)}
+    turns |= {"gaponet": lambda: sim.step(target), "resets": with_resets}
     return {name: rate(turn, num_envs, seconds) for name, turn in turns.items()}
+
+
+def reached(runs: list[Path]) -> None:
+    """Print when each run first was as good on validation as the first of them ever was; labels and sensors count."""
+    lines = [[json.loads(x) for x in (run / "progress.jsonl").read_text("utf-8").splitlines()] for run in runs]
+    best = min(line["val_mpjae"] for line in lines[0])
+    for run, rows in zip(runs, lines, strict=True):
+        there = next((r for r in rows if r["val_mpjae"] <= best), None)
+        when = f"{there['seconds']:.0f} s, {there['steps']:,} steps" if there else "never"
+        own = min(r["val_mpjae"] for r in rows)
+        end = f"its best {own * 1e3:.3f} mrad; {rows[-1]['steps']:,} steps in {rows[-1]['seconds']:.0f} s"
+        print(f"{run.name}: {best * 1e3:.3f} mrad after {when}; {end}")
 
 
 def main() -> None:
     """Measure and print one JSON line for each size and servo."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sizes", type=int, nargs="+")
+    parser.add_argument("sizes", type=int, nargs="*")
+    parser.add_argument("--reached", type=Path, nargs=2, metavar=("RUN", "OTHER"))
     parser.add_argument("--device", default="cuda", choices=("cuda", "warp-cpu"))
     parser.add_argument("--robot", default="so101")
     parser.add_argument("--seconds", type=float, default=5.0, help="of each measurement")
     args = parser.parse_args()
+    if args.reached:
+        reached(args.reached)
     stated = load_robot(args.robot)
     for size in args.sizes:
         for servo, robot in (("stated", stated), ("law", stated.with_servos(dict.fromkeys(stated.operated, LAW)))):
