@@ -1,6 +1,6 @@
 """BatchSim's simulations on Warp's device by mujoco_warp: thousands side by side on a GPU, or on the CPU, to test that.
 
-_Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
+Numbers are float32 and stay on the device: torch tensors take the place of numpy arrays. For training; scores,
 identification and robots stay on C MuJoCo, from which these simulations part by about 1e-6 rad in a second.
 """
 
