@@ -1,6 +1,7 @@
 """The dataset folder: what is listed is complete, what is not listed does not exist."""
 
 import json
+import pickle
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -235,7 +236,29 @@ def test_a_journal_line_of_another_kind_is_refused_with_line_and_field(dataset, 
     journal = dataset.path / "sequences.jsonl"
     journal.write_text(json.dumps(json.loads(journal.read_text()) | {field: value}) + "\n")
     with pytest.raises(DatasetError, match=rf"sequences\.jsonl:1: {said}"):
-        Dataset(dataset.path)
+        _ = Dataset(dataset.path).entries[0].meta
+
+
+def test_opening_parses_only_how_a_line_begins_and_the_rest_when_it_is_asked_for(dataset):
+    journal = dataset.path / "sequences.jsonl"
+    (here,), (opened,), whole = dataset.entries, Dataset(dataset.path).entries, journal.read_bytes()
+    assert vars(opened).keys() == {"id", "hash", "dt", "rows", "channels", "_line"}
+    assert opened.line == here.line == whole[:-1]
+    assert pickle.loads(pickle.dumps(opened)) == opened == here
+    assert "_line" not in vars(opened)
+    assert opened.line == whole[:-1]
+    journal.write_bytes(whole[:-9] + b"\n")  # its end is gone, its line is not
+    again = Dataset(dataset.path)
+    assert again.find(here.hash).rows == here.rows
+    with pytest.raises(DatasetError, match=r"sequences\.jsonl:1: .*delete the line and import that log again"):
+        again.read(again.entries[0])
+
+
+def test_a_line_that_another_program_wrote_is_the_same_entry(dataset):
+    journal = dataset.path / "sequences.jsonl"
+    line = json.loads(journal.read_text())
+    journal.write_text(json.dumps(dict(reversed(line.items())), indent=None, separators=(",", ":")) + "\n")
+    assert Dataset(dataset.path).entries == dataset.entries
 
 
 def test_a_line_listed_twice_is_refused(dataset):

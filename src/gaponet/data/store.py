@@ -27,11 +27,11 @@ import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Annotated, Any, NotRequired, cast
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -53,6 +53,10 @@ MEND = "restore the file or import the log again"
 KIND, JOURNAL, SURVEYS = "dataset", "sequences.jsonl", "surveys"
 LIST_S = 1.0  # of many recordings that are appended
 LARGEST_TABLE = 1 << 30  # bytes of what is read of one sequence at once
+BEGIN = re.compile(  # of a line as it is written here: with ranges, so that nothing in it is left to be checked
+    rb'\{"id": "([\w.-]{3,200})", "hash": "([0-9a-f]{8,64})", "dt": (0\.0{0,3}[1-9]\d{0,16}), "rows": ([1-9]\d{0,7}), '
+    rb'"channels": \["(ctrl", "qpos", "qvel(?:", "(?:qacc|tau|tau_eq|temperature))*)"\], "meta": \{'
+)
 
 
 class _Header(TypedDict):
@@ -67,7 +71,7 @@ class _Header(TypedDict):
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the journal."""
+    """One line of the journal; what stands in it from `meta` on is parsed and checked when it is first asked for."""
 
     id: Name
     hash: Annotated[str, Len(8, 64)]
@@ -76,11 +80,40 @@ class Entry:
     channels: tuple[str, ...]
     meta: SequenceMeta
     findings: dict[str, dict[str, float | None]]
-    command: Sketch | None = None  # in journals from before it was kept
+    command: Sketch | None = field(default_factory=lambda: None)  # in journals from before it was kept
 
     def __post_init__(self) -> None:
         if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
             raise DatasetError(f"channels: {self.channels!r:.80} lack ctrl, qpos or qvel, or hold an unknown one")
+
+    @classmethod
+    def of(cls, line: bytes, where: str) -> Entry:
+        """The entry that a line holds; one that begins in another way than here is parsed at once."""
+        begin = BEGIN.match(line)
+        if begin is None:
+            return parse_json(cls, line, where, DatasetError, "delete the line and import that log again")
+        entry, (name, digest, dt, rows, channels) = object.__new__(cls), begin.groups()
+        there = {"id": name.decode(), "hash": digest.decode(), "dt": float(dt), "rows": int(rows)}
+        entry.__dict__.update(there, channels=tuple(channels.decode().split('", "')), _line=(line, where))
+        return entry
+
+    @property
+    def line(self) -> bytes:
+        """As it is written."""
+        if "_line" in self.__dict__:
+            return cast("bytes", self.__dict__["_line"][0])
+        return json.dumps(asdict(self), ensure_ascii=False, allow_nan=False).encode()
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            if name not in ("meta", "findings", "command") or "_line" not in self.__dict__:
+                raise AttributeError(name)
+            line, where = self._line
+            whole = parse_json(Entry, line, where, DatasetError, "delete the line and import that log again")
+            del self.__dict__["_line"]
+            self.__dict__.update(vars(whole))
+            return self.__dict__[name]
 
 
 class Dataset:
@@ -245,7 +278,7 @@ class Dataset:
         columns = {c: getattr(sequence, c) for c in entry.channels}
         self._file(entry).parent.mkdir(exist_ok=True)
         _write_table(self._file(entry), columns, sequence.dt, self.joint_names)
-        self._lines += (json.dumps(asdict(entry), ensure_ascii=False, allow_nan=False) + "\n").encode()
+        self._lines += entry.line + b"\n"
         self.entries.append(entry)
         self._by_hash[digest] = entry
         if not self._many or time.monotonic() > self._due:
@@ -272,11 +305,11 @@ class Dataset:
             for pattern in patterns:
                 if not any(fnmatchcase(e.id, pattern) for e in self.entries):
                     raise DatasetError(f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids")
-            gone = [e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)]
+            gone = {e.id: e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)}
             lines = (self.path / JOURNAL).read_bytes()[: self._end].splitlines(keepends=True)
-            kept = [line for line, e in zip(lines, self.entries, strict=True) if e not in gone]
+            kept = [line for line, e in zip(lines, self.entries, strict=True) if e.id not in gone]
             write_text(self.path / JOURNAL, b"".join(kept).decode())
-            for entry in gone:  # unlisted files are none of the dataset's, should this be cut short
+            for entry in gone.values():  # unlisted files are none of the dataset's, should this be cut short
                 for file in (
                     self._file(entry),
                     self.path / SURVEYS / entry.id,
@@ -284,7 +317,7 @@ class Dataset:
                 ):
                     file.unlink(missing_ok=True)
             self._load()
-        return gone
+        return list(gone.values())
 
     def read(self, entry: Entry, optional: bool = True) -> Sequence:
         """Load one sequence, without its optional channels where they are not asked for."""
@@ -339,7 +372,7 @@ class Dataset:
         listed: dict[str, str] = {}  # content hash → id
         for number, line in enumerate(content[: self._end].split(b"\n")[:-1], 1):
             where = f"{journal}:{number}"
-            entry = parse_json(Entry, line, where, DatasetError, "delete the line and import that log again")
+            entry = Entry.of(line, where)
             if f"{entry.id}.parquet" not in files:
                 raise DatasetError(f"{where}: {self._file(entry)} is missing; restore it or delete the line")
             if listed.setdefault(entry.hash, entry.id) != entry.id or len(listed) < number:
