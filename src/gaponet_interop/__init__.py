@@ -12,6 +12,7 @@ COMMANDS = {
     "attach": "gaponet_interop.cli.attach:attach",
     "push": "gaponet_interop.cli.share:push",
     "pull": "gaponet_interop.cli.share:pull",
+    "prune": "gaponet_interop.cli.share:prune",
 }
 FORMATS = {
     name: f"gaponet_interop.formats.{name}" for name in ("lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")

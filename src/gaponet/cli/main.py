@@ -27,7 +27,7 @@ TASKS = {
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
     "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
-    "Share it, time it": ("push", "pull", "bench"),
+    "Share it, time it": ("push", "pull", "prune", "bench"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 CORE = {

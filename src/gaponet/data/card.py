@@ -52,15 +52,37 @@ def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
             progress(done, len(dataset), entry.meta.motion)
         if repetitions.count > 1:
             repeated.append(repetitions.result())
-    return _identity(dataset) | {
-        "total": count(dataset.entries),
-        "shares": {name: _shares(dataset.entries, key) for name, key in SHARES.items()},
+    return counted(dataset) | {
         "signals": {
             name: {"unit": UNITS[name], "sequences": r.sequences, "joints": r.by_joint(dataset.joint_names)}
             for name, r in ranges.items()
             if r.sequences
         },
         "repeatability": Repetitions.summary(repeated, dataset.joint_names),
+    }
+
+
+def counted(dataset: Dataset) -> dict[str, Any]:
+    """What of the card the journal says: what the dataset is, where it comes from and how much there is."""
+    made = dataset.path / "collect.json"
+    recorded = sorted({e.meta.recorded_at for e in dataset.entries} - {""})
+    return {
+        "name": dataset.path.resolve().name,
+        "robot": dataset.robot_name,
+        "joints": list(dataset.joint_names),
+        "virtual_sequences": sum(e.meta.virtual for e in dataset.entries),
+        "licence": dataset.header.get("licence", NOT_STATED),
+        "source": dataset.header.get("source", NOT_STATED),
+        "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
+        "collected": read_json(dict[str, Any], made, DatasetError, "restore it or delete it")
+        if made.is_file()
+        else None,
+        "dataset_hash": dataset_hash(dataset.entries),
+        "format": dataset.header["format"],
+        "bytes": sum(f.stat().st_size for f in (dataset.path / "sequences").iterdir()),
+        "gaponet": __version__,
+        "total": count(dataset.entries),
+        "shares": {name: _shares(dataset.entries, key) for name, key in SHARES.items()},
     }
 
 
@@ -124,28 +146,6 @@ class _Range:
         p1, p99 = np.percentile(np.concatenate(self._kept), [1, 99], axis=0)
         columns = {"min": self._low, "p1": p1, "mean": mean, "p99": p99, "max": self._high, "std": std}
         return {j: {k: float(f"{v[i]:.6g}") for k, v in columns.items()} for i, j in enumerate(names)}
-
-
-def _identity(dataset: Dataset) -> dict[str, Any]:
-    """What the dataset is and where it comes from."""
-    made = dataset.path / "collect.json"
-    recorded = sorted({e.meta.recorded_at for e in dataset.entries} - {""})
-    return {
-        "name": dataset.path.resolve().name,
-        "robot": dataset.robot_name,
-        "joints": list(dataset.joint_names),
-        "virtual_sequences": sum(e.meta.virtual for e in dataset.entries),
-        "licence": dataset.header.get("licence", NOT_STATED),
-        "source": dataset.header.get("source", NOT_STATED),
-        "recorded": [recorded[0], recorded[-1]] if recorded else NOT_STATED,
-        "collected": read_json(dict[str, Any], made, DatasetError, "restore it or delete it")
-        if made.is_file()
-        else None,
-        "dataset_hash": dataset_hash(dataset.entries),
-        "format": dataset.header["format"],
-        "bytes": sum(f.stat().st_size for f in (dataset.path / "sequences").iterdir()),
-        "gaponet": __version__,
-    }
 
 
 def _number_or_name(text: str) -> tuple[float, str]:

@@ -10,6 +10,7 @@ from gaponet.spread import Table
 from gaponet.text import markdown
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}
+HEADS = {"min": "least", "p1": "1 %", "mean": "mean", "p99": "99 %", "max": "greatest", "std": "std"}
 ASK = "set with `gaponet data card DIR --{0} …`"
 
 
@@ -58,7 +59,9 @@ def _shares(card: dict[str, Any]) -> Iterator[str]:
 
 
 def _repeatability(card: dict[str, Any]) -> Iterator[str]:
-    found = card["repeatability"]
+    found = card.get("repeatability")
+    if found is None:  # only reading all of it says
+        return
     yield "## Repeatability"
     yield ""
     if not found["channels"]:
@@ -87,7 +90,7 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
         yield f"### {name}, {signal['unit']} ({signal['sequences']:,} sequences)"
         yield ""
         rows = tuple((joint, *map(_number, values.values())) for joint, values in signal["joints"].items())
-        heads = ("joint", "least", "1 %", "mean", "99 %", "greatest", "std")
+        heads = ("joint", *(HEADS[k] for k in next(iter(signal["joints"].values()))))
         yield from (Table(name, heads, rows).markdown(), "")
 
 

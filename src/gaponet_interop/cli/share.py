@@ -1,4 +1,4 @@
-"""gaponet push, pull."""
+"""gaponet push, pull, prune."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet_interop.share import move
 
+SHOWN = 20  # files of a list
 Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
 
 
@@ -34,5 +35,24 @@ def pull(address: Address, out: Folder, json: Json = False) -> None:
     """Fetch a dataset or a run, every file checked by its hash."""
     screen = Out(json)
     moved = move.pull(address, out)
-    screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB; all hashes are right: {out}", moved.kind)
+    if moved.files:
+        screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB; all hashes are right: {out}", moved.kind)
+    else:
+        screen.say(f"nothing is there that {out} lacks")
     screen.result({"kind": moved.kind, "path": str(out), "files": moved.files, "bytes": moved.size})
+
+
+@like(move.prune)
+def prune(address: Address, delete: Flag = False, hours: float = move.HOURS, json: Json = False) -> None:
+    """List files in a bucket that nothing names since a later push, or delete them."""
+    screen = Out(json)
+    found = move.prune(address, delete, hours)
+    for name in found.files[:SHOWN]:
+        screen.say(f"  {name}")
+    more = f"and {len(found.files) - SHOWN} more; " if len(found.files) > SHOWN else ""
+    screen.say(f"{more}{len(found.files)} files, {found.size / 1e6:,.1f} MB, {'deleted' if delete else 'to delete'}")
+    if found.young:
+        screen.say(f"{found.young} more may be in use: they, or the last push, are less than {hours:g} hours old")
+    if found.files and not delete:
+        screen.say(f"Delete them: gaponet prune {address} --delete")
+    screen.result({"files": found.files, "bytes": found.size, "young": found.young, "deleted": delete})

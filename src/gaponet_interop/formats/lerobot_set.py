@@ -35,6 +35,7 @@ STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # 
 GAINS = ("kp", "kd")
 AGAIN = "download or export it again"
 
+Findings = dict[str, dict[str, float | None]]  # of a recording; none in sets from before they were written
 Name = Annotated[str, Len(1, 200)]
 Count = Annotated[int, Interval(ge=0, le=10**9)]
 Chunk = Annotated[int, Interval(ge=0, le=10**6)]
@@ -185,7 +186,7 @@ def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
 def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     said = STATED if ours else ()
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
-    table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash"), hint)
+    table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash", "findings"), hint)
     rows = _rows(file, table)
     known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
@@ -201,7 +202,8 @@ def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
         if gains != "null":
             told[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
     stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
-    return row | {"stated": {name: stated[name] for name in STATED}}
+    found = parse_json(Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint)
+    return row | {"stated": {name: stated[name] for name in STATED}, "findings": found}
 
 
 def _rows(file: Path, table: Any) -> list[dict[str, Any]]:

@@ -12,7 +12,6 @@ import hashlib
 import re
 import shutil
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,20 +25,24 @@ from gaponet_interop.share.target import (
     Index,
     Kind,
     Part,
-    part_of,
+    Pruned,
     reaching,
+    written,
 )
 
 if TYPE_CHECKING:
     from pyarrow import NativeFile
+    from pyarrow.fs import FileInfo
 
 OBJECTS = "sha256"
-SETTLED = 86_400  # s: younger files may be of a push that is under way
+OLD = 6 * 3600  # s: what has had no name for longer may be gone in a moment, and is sent again
 PATIENCE = 20  # s that a request to gs:// is tried again; 15 minutes where nobody says, s3:// gives up after 6
 
 
 class Bucket:
     """A `Target` in object storage; credentials are found as pyarrow's file systems find them."""
+
+    at_once = True
 
     def __init__(self, address: str) -> None:
         """
@@ -56,18 +59,21 @@ class Bucket:
         with reaching(self.address, *self._errors):
             self.files, self.root = FileSystem.from_uri(address)
         self.root = self.root.rstrip("/")
+        self._index, self._since = b"", 0.0  # that was read last, and since when it has been there
+        self._there: dict[str, FileInfo] | None = None  # objects by their hash, as they were listed first
 
     def index(self, kind: Kind | None = None) -> bytes | None:
         from pyarrow.fs import FileSelector, FileType
 
-        place = f"{self.root}/{INDEX}"
+        place, self._index = f"{self.root}/{INDEX}", b""
         with reaching(self.address, *self._errors):
             info = self.files.get_file_info(place)
             if info.type == FileType.File:
                 if info.size > LARGEST_INDEX:
                     raise RemoteError(f"{self.address}: {INDEX} has more than {LARGEST_INDEX >> 20} MiB")
                 with self.files.open_input_stream(place) as content:
-                    return bytes(content.read(LARGEST_INDEX))
+                    self._index, self._since = bytes(content.read(LARGEST_INDEX)), _time(info)
+                return self._index
             bucket, inside, _ = self.root.partition("/")
             if inside and bucket and self.files.get_file_info(bucket).type == FileType.NotFound:
                 raise RemoteError(f"{self.address}: no bucket '{bucket}' there; make it first, by the provider's tools")
@@ -77,26 +83,39 @@ class Bucket:
             raise RemoteError(f"{self.address}: holds {strangers[0]} and no {INDEX}: gaponet did not push it")
         return None
 
-    def store(
-        self, kind: Kind, files: Mapping[str, Path], index: bytes, private: bool, there: bytes | None, anew: Anew
-    ) -> None:
+    def holds(self, path: str, part: Part, anew: Anew) -> bool:
+        with reaching(self.address, *self._errors):
+            self._there = self._list() if self._there is None else self._there
+            info = self._there.get(part.sha256)
+            if anew == "all" or info is None or info.size != part.size:  # it may have been cut short by a kill
+                return False
+            if anew:
+                return self._sha256(part) == part.sha256
+            return part.sha256.encode() in self._index or time.time() - _time(info) < OLD
+
+    def send(self, path: str, file: Path, part: Part) -> None:
         with reaching(self.address, *self._errors):
             if self.files.type_name == "local":
                 self.files.create_dir(f"{self.root}/{OBJECTS}", recursive=True)
-            for file in files.values():
-                part = part_of(file)
-                if anew == "all" or not self._holds(part, anew == "damaged"):
-                    with file.open("rb") as content, self.files.open_output_stream(self._object(part)) as out:
-                        shutil.copyfileobj(content, out, BLOCK)
+            with file.open("rb") as content, self.files.open_output_stream(self._object(part)) as out:
+                shutil.copyfileobj(content, out, BLOCK)
+
+    def store(self, kind: Kind, index: Index, private: bool, there: bytes | None) -> None:
+        with reaching(self.address, *self._errors):
+            listed = self._list()
+            gone = [place for place, part in index.files.items() if part.sha256 not in listed]
+            if gone:
+                raise RemoteError(f"{self.address}: {gone[0]} was removed meanwhile; push again")
             if self.index(kind) != there:
                 raise ChangedError(f"{self.address}: somebody else pushed meanwhile; push again")
             with self.files.open_output_stream(f"{self.root}/{INDEX}") as out:
-                out.write(index)
+                out.write(written(index))
 
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         out = folder / path
         with reaching(self.address, *self._errors):
-            if not self._holds(part):
+            info = self.files.get_file_info(self._object(part))
+            if not info.is_file or info.size != part.size:  # a local one may be a pipe
                 raise RemoteError(f"{self.address}: {path} is not there with {part.size:,} bytes; push it again")
             out.parent.mkdir(parents=True, exist_ok=True)
             with self.files.open_input_stream(self._object(part)) as content, out.open("wb") as file:
@@ -105,17 +124,17 @@ class Bucket:
                     file.write(block)
                     left -= len(block)
 
-    def prune(self, index: Index) -> int:
-        from pyarrow.fs import FileSelector
-
-        named, before = {part.sha256 for part in index.files.values()}, time.time() - SETTLED
+    def prune(self, named: set[str], hours: float, delete: bool) -> Pruned:
+        before = time.time() - 3600 * hours
         with reaching(self.address, *self._errors):
-            there = self.files.get_file_info(FileSelector(f"{self.root}/{OBJECTS}", allow_not_found=True))
-            left = [one for one in there if one.is_file and one.base_name not in named]
-            gone = [one.path for one in left if one.mtime is not None and one.mtime.timestamp() < before]
-            for path in gone:
-                self.files.delete_file(path)
-        return len(gone)
+            left = [info for name, info in self._list().items() if name not in named]
+            gone = [
+                info for info in left if max(_time(info), self._since) < before
+            ]  # somebody may pull what was before
+            for info in gone if delete else ():
+                if _time(self.files.get_file_info(info.path)) < before:  # not sent again meanwhile
+                    self.files.delete_file(info.path)
+        return Pruned([info.base_name for info in gone], sum(info.size for info in gone), len(left) - len(gone))
 
     def open(self, path: str, part: Part) -> NativeFile:
         """A file of the index, to read pieces of it.
@@ -129,17 +148,23 @@ class Bucket:
                 raise RemoteError(f"{self.address}: {path} has another size than {INDEX} says; push it again")
         return file
 
-    def _holds(self, part: Part, read: bool = False) -> bool:
-        """Whether there is a file of this hash by its name and size, or where it is read, by its content."""
-        info = self.files.get_file_info(self._object(part))
-        if not info.is_file or info.size != part.size:  # a local one may be a pipe, or cut short by a kill
-            return False
+    def _list(self) -> dict[str, FileInfo]:
+        from pyarrow.fs import FileSelector
+
+        there = self.files.get_file_info(FileSelector(f"{self.root}/{OBJECTS}", allow_not_found=True))
+        return {info.base_name: info for info in there if info.is_file}
+
+    def _sha256(self, part: Part) -> str:
         digest = hashlib.sha256()
-        if read:
-            with self.files.open_input_stream(self._object(part)) as content:
-                while block := content.read(BLOCK):
-                    digest.update(block)
-        return not read or digest.hexdigest() == part.sha256
+        with self.files.open_input_stream(self._object(part)) as content:
+            while block := content.read(BLOCK):
+                digest.update(block)
+        return digest.hexdigest()
 
     def _object(self, part: Part) -> str:
         return f"{self.root}/{OBJECTS}/{part.sha256}"
+
+
+def _time(info: FileInfo) -> float:
+    """When it was written, s since 1970; now, where the place does not say."""
+    return float(info.mtime.timestamp()) if info.mtime is not None else time.time()

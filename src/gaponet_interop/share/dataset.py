@@ -1,94 +1,190 @@
 """A dataset as the files that are pushed, and back.
 
 What is pushed is a LeRobot set (data.writers.lerobot), so that LeRobot and the Hub's own viewer read it; beside it, in
-gaponet/, what such a set has no place for: the nominal robot, splits, card. Twins, offsets and findings are made again.
-What comes back is imported from it as any stranger's logs are: nothing of what was downloaded stays.
+gaponet/, what such a set has no place for: the nominal robot, splits, recipe, offsets. Twins are made again.
+
+A set is laid out block by block. What a block became is noted in the dataset's pushed.jsonl under the block's key,
+which stands for all that decides its bytes: where the place holds them, nothing of it is read or made again.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gaponet.data.card import NOT_STATED, make_card, write_card
+from typing_extensions import TypedDict
+
+from gaponet.data.card import counted
 from gaponet.data.card_text import card_text
-from gaponet.data.importer import import_logs
+from gaponet.data.importer import findings
+from gaponet.data.log import UNITS
+from gaponet.data.offsets import FILE as OFFSETS
+from gaponet.data.offsets import read_offsets
+from gaponet.data.sequence import Sequence
 from gaponet.data.split import read_split
-from gaponet.data.store import Dataset, open_dataset
-from gaponet.data.writers import export
+from gaponet.data.store import Dataset, Entry
 from gaponet.errors import DatasetError
 from gaponet.files import write_text
 from gaponet.progress import Progress
 from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import KEPT, require_bare, save_robot
-from gaponet.sim.dynamics import gravity_of
 from gaponet.sim.model import model_hash
-from gaponet_interop.share.errors import RemoteError
+from gaponet.structure import parse_json
+from gaponet_interop.formats.lerobot_set import FEATURES
 from gaponet_interop.share.readme import dataset_readme
-from gaponet_interop.share.target import Index
+from gaponet_interop.share.target import Anew, Part, Target, send
+from gaponet_interop.writers.lerobot import LeRobotSet, sets_of
+from gaponet_interop.writers.lerobot_stats import EpisodeStats, plain, pool, unplain
 
 BESIDE = "gaponet"  # folder beside the LeRobot set
-COLLECTED = "collect.json"
+BROUGHT = ("collect.json", OFFSETS)  # files in it, as they lie in the dataset
+LAID = "pushed.jsonl"
 
 
-def lay_out(path: Path, folder: Path, address: str, progress: Progress) -> tuple[str, ...]:
-    """Write the files of a dataset below an empty folder; returns the hashes of its sequences."""
-    dataset, robot = open_dataset(path)
-    for entry in dataset.entries:
-        if dataset.read(entry).content_hash() != entry.hash:
-            raise DatasetError(f"{path}: '{entry.id}' is not what was recorded, by its hash; restore it first")
-    card = make_card(dataset, progress)
-    sets = [one.path.relative_to(folder).as_posix() for one in export(dataset, robot, folder, "lerobot", progress)]
-    beside = folder / BESIDE
+class _Laid(TypedDict):
+    """What a block became: its files below the set, and the statistics of its frames."""
+
+    key: str
+    files: dict[str, Part]
+    stats: dict[str, dict[str, list[float]]]
+
+
+def lay_out(
+    dataset: Dataset, robot: RobotSpec, folder: Path, target: Target, progress: Progress, anew: Anew
+) -> dict[str, Part]:
+    """Bring a dataset to a place, through an empty folder; returns its files there.
+
+    Raises:
+        DatasetError: A recording is damaged.
+    """
+    known, done = _laid(dataset), 0
+    now: dict[str, _Laid] = {}
+    files: dict[str, Part] = {}
+    sets: dict[LeRobotSet, EpisodeStats] = {}
+
+    def read(entry: Entry) -> Sequence:
+        sequence = dataset.read(entry)
+        if sequence.content_hash() != entry.hash:
+            raise DatasetError(f"{dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first")
+        return sequence
+
+    def tell(motion: str) -> None:
+        nonlocal done
+        done += 1
+        progress(done, len(dataset), motion)
+
+    for part in sets_of(dataset):
+        root, stats = folder / part.name, []
+        for block in part.blocks:
+            laid, places = known.get(block.key), {place: (Path(part.name) / place).as_posix() for place in block.places}
+            if laid is None or not all(target.holds(places[at], one, anew) for at, one in laid["files"].items()):
+                pooled = part.write_block(block, root, read, tell)
+                sent = send(target, {place: folder / place for place in places.values()}, anew)
+                parts = {at: sent[there] for at, there in places.items()}
+                laid = {"key": block.key, "files": parts, "stats": plain(pooled)}
+                if block.key not in known and not dataset.read_only:
+                    with (dataset.path / LAID).open("a", encoding="utf-8") as file:
+                        file.write(_line(laid))
+                for place in places.values() if target.at_once else ():
+                    (folder / place).unlink()
+            now[block.key] = laid
+            files |= {there: laid["files"][at] for at, there in places.items()}
+            stats.append(unplain(laid["stats"]))
+        part.write_meta(root, stats)
+        sets[part] = pool(stats)
+    _beside(dataset, robot, folder / BESIDE)
+    card = _card(dataset, sets)
+    text = dataset_readme(card, card_text(card), target.address, [part.name for part in sets])
+    write_text(folder / "README.md", text)
+    small = {file.relative_to(folder).as_posix(): file for file in folder.rglob("*") if file.is_file()}
+    files |= send(target, {place: file for place, file in small.items() if place not in files}, anew)
+    if known.keys() - now.keys() and not dataset.read_only:
+        write_text(dataset.path / LAID, "".join(map(_line, now.values())))
+    return dict(sorted(files.items()))
+
+
+def _laid(dataset: Dataset) -> dict[str, _Laid]:
+    """What earlier pushes noted; a line that was cut short is none."""
+    found, file = {}, dataset.path / LAID
+    for line in file.read_bytes().splitlines() if file.is_file() else ():
+        with suppress(DatasetError):
+            one = parse_json(_Laid, line, file, DatasetError)
+            found[one["key"]] = one
+    return found
+
+
+def _line(laid: _Laid) -> str:
+    return "\n" + json.dumps(laid, default=vars)
+
+
+def _beside(dataset: Dataset, robot: RobotSpec, beside: Path) -> None:
+    """What a LeRobot set has no place for."""
     beside.mkdir()
     save_robot(robot.nominal or robot, beside / KEPT)
     (beside / KEPT / ".gaponet").unlink()
-    for split in sorted((path / "splits").glob("*.json")):
+    for split in sorted((dataset.path / "splits").glob("*.json")):
         read_split(split, dataset)
         (beside / "splits").mkdir(exist_ok=True)
         shutil.copyfile(split, beside / "splits" / split.name)
-    if card["collected"]:
-        write_text(beside / COLLECTED, json.dumps(card["collected"], indent=1, ensure_ascii=False) + "\n")
-    write_text(
-        folder / "README.md", dataset_readme(card, card_text(card), address, ["" if s == "." else s for s in sets])
-    )
-    return tuple(sorted(entry.hash for entry in dataset.entries))
+    for name in BROUGHT:
+        if (dataset.path / name).is_file():
+            shutil.copyfile(dataset.path / name, beside / name)
 
 
-def take_in(folder: Path, index: Index, out: Path, progress: Progress) -> dict[str, Any]:
-    """Import what was downloaded into a new dataset, and compare the hash of every sequence.
+def _card(dataset: Dataset, sets: dict[LeRobotSet, EpisodeStats]) -> dict[str, Any]:
+    """The card without what only reading all of it says: percentiles and repeatability."""
+    signals = {}
+    for name, feature in FEATURES.items():
+        having = {part: stats for part, stats in sets.items() if feature in stats}
+        if having:
+            pooled = pool([{feature: stats[feature]} for stats in having.values()])[feature]
+            joints = {
+                joint: {k: float(f"{pooled[k][j]:.6g}") for k in ("min", "mean", "max", "std")}
+                for j, joint in enumerate(dataset.joint_names)
+            }
+            count = sum(len(part.entries) for part in having)
+            signals[name] = {"unit": UNITS[name], "sequences": count, "joints": joints}
+    return counted(dataset) | {"signals": signals}
+
+
+def take_in(pushed: Dataset, robot: RobotSpec, beside: Path, out: Path, progress: Progress) -> None:
+    """Copy what a dataset lacks of one that was pushed, each recording checked by its hash, in the memory of one.
+
+    Args:
+        beside: Folder of what was pushed beside the set.
+        out: Dataset; made where there is none, else brought up to date.
 
     Raises:
-        RemoteError: Sequences are missing, or are not those that were pushed.
-        GAPONetError: A file is not what it should be.
+        GAPONetError: It is another robot's, or a recording is not what was pushed.
     """
-    robot = pushed_robot(folder)
-    import_logs(
-        folder, robot, None, None, out, fmt="lerobot", gravity=gravity_of(robot), simulator=model_hash(robot),
-        progress=progress,
-    )  # fmt: skip
-    dataset = Dataset(out)
-    found = {entry.hash for entry in dataset.entries}
-    if found != set(index.contents):
-        odd = len(found ^ set(index.contents))
-        raise RemoteError(f"{odd} sequences are not those that were pushed, by their content hashes; push them again")
-    bring_beside(folder, dataset)
-    card = make_card(dataset)
-    write_card(dataset, card, card_text(card))
-    return {"sequences": len(dataset), "hours": dataset.hours(), "licence": card.get("licence", NOT_STATED)}
+    model_hash(robot)  # refused, if it is none
+    dataset = Dataset.create(out, robot)
+    stated = {k: str(v) for k, v in pushed.header.items() if k in ("licence", "source")}
+    if not dataset.entries and stated:
+        dataset.state(**stated)
+    new = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
+    with dataset.appending():
+        for done, entry in enumerate(new, 1):
+            sequence = pushed.read(entry)
+            dataset.append(sequence, entry.findings or findings(sequence), entry.hash)
+            progress(done, len(new), entry.meta.motion)
+    bring_beside(beside, dataset)
 
 
-def bring_beside(folder: Path, dataset: Dataset) -> None:
-    """Take splits and recipe out of what was downloaded into a dataset."""
-    source = folder / BESIDE / COLLECTED
-    if source.is_file():
-        shutil.copyfile(source, dataset.path / COLLECTED)
-    for split in sorted((folder / BESIDE / "splits").glob("*.json")):
-        read_split(split, dataset)
-        (dataset.path / "splits").mkdir(exist_ok=True)
-        shutil.copyfile(split, dataset.path / "splits" / split.name)
+def bring_beside(beside: Path, dataset: Dataset) -> None:
+    """Take splits, recipe and offsets, where there are none, out of what was downloaded into a dataset."""
+    files = [beside / name for name in BROUGHT] + sorted((beside / "splits").glob("*.json"))
+    for file in files:
+        place = dataset.path / file.relative_to(beside)
+        if file.is_file() and not place.exists():
+            if file.parent != beside:
+                read_split(file, dataset)
+            place.parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, place)
+    read_offsets(dataset)
 
 
 def pushed_robot(folder: Path) -> RobotSpec:

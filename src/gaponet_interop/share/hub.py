@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 
 from gaponet_interop.formats.lerobot_set import VERSION as LEROBOT_TAG
 from gaponet_interop.share.errors import RemoteError
-from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, Index, Kind, Part, reaching
+from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, Index, Kind, Part, Pruned, reaching, written
 
 TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
 MOST = 50_000  # files of a repository that are listed
@@ -25,6 +25,8 @@ BORN_WITH = {".gitattributes", "README.md"}  # files of a new repository
 
 class Hub:
     """A `Target` on the Hub, or wherever HF_ENDPOINT points; HF_TOKEN or `hf auth login` says who pushes."""
+
+    at_once = False
 
     def __init__(self, address: str) -> None:
         """
@@ -38,6 +40,8 @@ class Hub:
         self.api, self.revision = HfApi(os.environ.get("HF_ENDPOINT")), revision or "main"
         self.type, self.commit = "", ""
         self.sizes: dict[str, int] = {}
+        self.large: dict[str, str] = {}  # SHA-256 of files that are stored by it
+        self.adds: list[Any] = []
 
     def index(self, kind: Kind | None = None) -> bytes | None:
         from huggingface_hub.errors import RepositoryNotFoundError
@@ -47,11 +51,12 @@ class Hub:
                 with self._reaching(RepositoryNotFoundError):
                     info = self.api.repo_info(self.repo, repo_type=wanted, revision=self.revision)
                     tree = self.api.list_repo_tree(self.repo, recursive=True, repo_type=wanted, revision=info.sha)
-                    listed = islice(tree, MOST)
-                    sizes = {entry.path: entry.size for entry in listed if hasattr(entry, "size")}
+                    listed: list[Any] = [entry for entry in islice(tree, MOST) if hasattr(entry, "size")]
+                    sizes = {entry.path: entry.size for entry in listed}
             except RepositoryNotFoundError:
                 continue
             self.type, self.commit, self.sizes = wanted, str(info.sha), sizes
+            self.large = {entry.path: entry.lfs.sha256 for entry in listed if entry.lfs}
             if INDEX in sizes:
                 return self._small()
             if sizes.keys() - BORN_WITH:
@@ -73,22 +78,27 @@ class Hub:
         with tempfile.TemporaryDirectory() as folder, self._reaching():
             return Path(self._download(INDEX, folder)).read_bytes()
 
-    def store(
-        self, kind: Kind, files: Mapping[str, Path], index: bytes, private: bool, there: bytes | None, anew: Anew
-    ) -> None:
+    def holds(self, path: str, part: Part, anew: Anew) -> bool:
+        return anew != "all" and self.large.get(path) == part.sha256  # the Hub looked at that itself
+
+    def send(self, path: str, file: Path, part: Part) -> None:
+        from huggingface_hub import CommitOperationAdd
+
+        self.adds.append(CommitOperationAdd(path, str(file)))
+
+    def store(self, kind: Kind, index: Index, private: bool, there: bytes | None) -> None:
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
         from huggingface_hub.errors import RevisionNotFoundError
 
-        adds: list[Any] = [CommitOperationAdd(path, str(file)) for path, file in files.items()]
-        adds.append(CommitOperationAdd(INDEX, index))
-        gone = self.sizes.keys() - files.keys() - {INDEX} - BORN_WITH
+        adds = [*self.adds, CommitOperationAdd(INDEX, written(index))]
+        gone = self.sizes.keys() - index.files.keys() - {INDEX} - BORN_WITH
         with self._reaching():
             if not self.type:
                 self.api.create_repo(self.repo, repo_type=TYPES[kind], private=private or None, exist_ok=True)
             self.api.create_commit(
                 self.repo,
                 adds + [CommitOperationDelete(path) for path in sorted(gone)],
-                commit_message=f"gaponet push: {kind} of {len(files)} files",
+                commit_message=f"gaponet push: {kind} of {len(index.files)} files",
                 repo_type=TYPES[kind],
                 revision=self.revision,
                 parent_commit=self.commit or None,  # whoever pushed meanwhile is not overwritten
@@ -98,8 +108,8 @@ class Hub:
                     self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=TYPES[kind])
                 self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=TYPES[kind])
 
-    def prune(self, index: Index) -> int:
-        return 0  # a commit takes them away, and the repository's history keeps them
+    def prune(self, named: set[str], hours: float, delete: bool) -> Pruned:
+        return Pruned([], 0, 0)  # a commit takes files away, and the repository's history keeps them
 
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         if self.sizes.get(path) != part.size:

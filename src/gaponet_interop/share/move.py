@@ -6,17 +6,18 @@ its hashes, and only then gives it its name: what is there under that name is wh
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any
 
+from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import GAPONetError, UsageError
 from gaponet.files import MARK, writing
 from gaponet.progress import bar, noted
@@ -25,11 +26,25 @@ from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share import run as runs
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.open import open_target
-from gaponet_interop.share.target import INDEX, LARGEST_INDEX, Anew, ChangedError, Index, Kind, Part, Target, part_of
+from gaponet_interop.share.pushed import LARGE, Pushed
+from gaponet_interop.share.target import (
+    INDEX,
+    LARGEST_INDEX,
+    Anew,
+    ChangedError,
+    Index,
+    Kind,
+    Part,
+    Pruned,
+    Target,
+    part_of,
+    send,
+)
 
 FORMAT = 1
 AT_ONCE = 8  # downloads
 SPARE = 1 << 28  # bytes of a disk that stay free
+HOURS = 12.0  # that nothing is pruned which was written or replaced in them
 
 
 @dataclass(frozen=True)
@@ -52,8 +67,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
         address: USER/NAME on the Hugging Face Hub, or s3://, gs:// or file:// and a folder.
         private: Readable by its owner alone, where a new repository of the Hub is made for it.
         replace: Also where something is there of which this is no newer state; every file is sent anew.
-        prune: Remove from a bucket what earlier pushes left there, a day old or older. Who pulls an earlier state
-            at that moment starts again.
+        prune: Delete from a bucket what pushes before the last one left there, as `prune` does.
 
     Raises:
         RemoteError: The place cannot be reached or written, or holds something else.
@@ -66,69 +80,104 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
     there = _read(target, content)
     with _beside(path, "push") as folder, bar("reading") as update:
         _empty(folder)  # of a push that was killed
+        lay_out: Callable[[Anew], dict[str, Part]]
         if kind == "dataset":
-            contents = datasets.lay_out(path, folder / "files", target.address, update)
-            files = {f.relative_to(folder / "files").as_posix(): f for f in sorted((folder / "files").rglob("*"))
-                     if f.is_file()}  # fmt: skip
+            dataset, robot = open_dataset(path)
+            contents = tuple(sorted(entry.hash for entry in dataset.select()))
+            lay_out = partial(datasets.lay_out, dataset, robot, folder / "files", target, update)
         else:
-            files, contents = runs.lay_out(path, folder, target.address)
-        index = Index(FORMAT, kind, path.name, contents, {place: part_of(file) for place, file in files.items()})
-        written = (json.dumps(asdict(index), indent=1) + "\n").encode()
+            laid, contents = runs.lay_out(path, folder, target.address)
+            lay_out = partial(send, target, laid)
+        if there is not None and not replace:
+            _require_newer(there, kind, contents, target.address)
+        # Who pushes what is there already wants it mended.
+        files = lay_out("all" if replace else "damaged" if there and there.contents == contents else "")
+        index = Index(FORMAT, kind, path.name, contents, files)
+        named = {part.sha256 for one in (there, index) if one for part in one.files.values()}
+        pruned = len(target.prune(named, HOURS, True).files) if prune else 0
         for last in (False, False, True):
-            if there is not None and not replace:
-                _require_newer(there, kind, contents, target.address)
-            # Who pushes what is there already wants it mended.
-            anew: Anew = "all" if replace else "damaged" if there and there.contents == contents else ""
             try:
-                target.store(kind, files, written, private, content, anew)
+                target.store(kind, index, private, content)
                 break
             except ChangedError:
                 if last:
                     raise
                 content = target.index(kind)
                 there = _read(target, content)
-    return Moved(kind, address, path, len(files), index.size, {"pruned": target.prune(index) if prune else 0})
+                if there is not None and not replace:
+                    _require_newer(there, kind, contents, target.address)
+    return Moved(kind, address, path, len(files), index.size, {"pruned": pruned})
+
+
+def prune(address: str, delete: bool = False, hours: float = HOURS) -> Pruned:
+    """Find what earlier pushes left in a bucket and nothing names any more.
+
+    Args:
+        address: s3://, gs:// or file:// and a folder that was pushed to.
+        delete: Delete it; else it is only counted.
+        hours: What was written or replaced in the last so many hours stays: a push or a pull may be under way.
+
+    Raises:
+        RemoteError: Nothing was pushed there, or its index is damaged: then nothing is deleted.
+    """
+    target = open_target(address)
+    index = read_index(target, None)
+    if index is None:
+        raise RemoteError(f"{target.address}: nothing was pushed there")
+    return target.prune({part.sha256 for part in index.files.values()}, hours, delete)
 
 
 def pull(address: str, out: str | Path) -> Moved:
     """Fetch what was pushed, checked by the hash of each file and each sequence; a pull that was killed goes on.
 
+    A dataset that is there already gets the sequences that it lacks, and keeps all else as it is.
+
     Args:
         address: USER/NAME on the Hugging Face Hub (@REVISION behind it for a tag or commit), or s3://, gs:// or
             file:// and a folder.
-        out: New or empty folder.
+        out: New or empty folder, or a dataset of that robot.
 
     Raises:
         RemoteError: Nothing there, a file has another hash, or what came is no dataset or run.
         UsageError: The folder holds something.
     """
     out = Path(out)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    known = Dataset(out) if (out / "dataset.json").is_file() else None
+    if known is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is not an empty folder; choose a new one")
     target = open_target(address)
     index = read_index(target, None)
     if index is None:
         raise RemoteError(f"{target.address}: nothing was pushed there")
+    if known is not None and index.kind != "dataset":
+        raise UsageError(f"{out}: is a dataset, and {target.address} holds a run; choose a new folder")
+    if known is not None and all(known.find(digest) for digest in index.contents):
+        return Moved(index.kind, address, out, 0, 0, {"sequences": 0})
     with _beside(out.absolute(), "pull") as folder:
-        download(target, index, folder / "files")
-        made = folder / "made"
-        if made.exists():
-            shutil.rmtree(made)
-        try:
-            if index.kind == "dataset":
-                with bar("checking") as update:
-                    facts = datasets.take_in(folder / "files", index, made, update)
-            else:
-                with writing(made, "run"):
-                    facts = runs.take_in(folder / "files", index, made)
-        except GAPONetError as error:
-            _empty(folder)  # whatever it is, it is not to be gone on with
-            raise RemoteError(f"{target.address}: {str(error).replace(str(folder), '')}") from None
-        if out.exists():
-            out.rmdir()
-        made.rename(out)
+        files, made = folder / "files", folder / "made"
+        if index.kind == "dataset":
+            moved = {place: part for place, part in index.files.items() if not LARGE.fullmatch(place)}
+            download(target, moved, files)
+            with _kept_if_good(folder, target.address):
+                pushed = Pushed(target.address, index, folder)
+                new = [entry for entry in pushed.entries if known is None or known.find(entry.hash) is None]
+                large = {place: index.files[place] for place in pushed.places(new)}
+            download(target, large, files)
+            with _kept_if_good(folder, target.address), bar("checking") as update:
+                made = pushed.path
+                datasets.take_in(pushed, pushed.robot, files / datasets.BESIDE, made if known is None else out, update)
+            moved, facts = moved | large, {"sequences": len(new)}
+        else:
+            moved = index.files
+            download(target, moved, files)
+            with _kept_if_good(folder, target.address), writing(made, "run"):
+                facts = runs.take_in(files, index, made)
+        if known is None:
+            if out.exists():
+                out.rmdir()
+            made.rename(out)
         _empty(folder)
-    return Moved(index.kind, address, out, len(index.files), index.size, facts)
+    return Moved(index.kind, address, out, len(moved), sum(part.size for part in moved.values()), facts)
 
 
 def _kind(path: Path) -> Kind:
@@ -168,10 +217,10 @@ def _require_newer(there: Index, kind: Kind, contents: tuple[str, ...], address:
         )
 
 
-def download(target: Target, index: Index, folder: Path) -> None:
-    """All files of the index below the folder; those that are there with the right hash stay."""
+def download(target: Target, files: Mapping[str, Part], folder: Path) -> None:
+    """Files of an index, below the folder; those that are there with the right hash stay."""
     folder.mkdir(exist_ok=True)
-    missing = [(place, part) for place, part in index.files.items() if not _is(folder / place, part)]
+    missing = [(place, part) for place, part in files.items() if not _is(folder / place, part)]
     needed, free = sum(part.size for _, part in missing), shutil.disk_usage(folder).free
     if needed + SPARE > free:
         raise RemoteError(
@@ -212,6 +261,17 @@ def _beside(path: Path, what: str) -> Iterator[Path]:
         yield folder
         _empty(folder)
     shutil.rmtree(folder)
+
+
+@contextmanager
+def _kept_if_good(folder: Path, address: str) -> Iterator[None]:
+    """What came stays, for the next pull to go on with, unless it is not what it should be."""
+    try:
+        yield
+    except GAPONetError as error:
+        _empty(folder)
+        text = str(error).replace(str(folder), "").removeprefix(f"{address}: ")
+        raise RemoteError(f"{address}: {text}") from None
 
 
 def _empty(folder: Path) -> None:

@@ -1,6 +1,6 @@
 """A dataset that was pushed, read where it lies: what is small comes at once, a recording when it is asked for.
 
-A recording is a row group of a file of about 100 MB, and its rows alone are fetched: memory holds one recording,
+A recording is a row group of a file of some megabytes, and its rows alone are fetched: memory holds one recording,
 however many there are. Twins are made in a folder that goes with the object; nothing is written to the place.
 """
 
@@ -9,37 +9,21 @@ from __future__ import annotations
 import re
 import shutil
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from gaponet.arrays import Array
-from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta, to_sequence
-from gaponet.data.store import Dataset, Entry, entry_id
-from gaponet.errors import DatasetError, GAPONetError
-from gaponet.structure import LARGEST_ARRAYS
-from gaponet_interop.formats.lerobot import read_episode
-from gaponet_interop.formats.lerobot_set import FEATURES, Set, Stated, sets_under
-from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share.bucket import Bucket
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.move import download, read_index
-from gaponet_interop.share.target import INDEX, reaching
+from gaponet_interop.share.pushed import LARGE, Pushed, rows_of
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-LARGE = re.compile(r"(?:.*/)?data/.*")  # files of a LeRobot set that are not fetched as a whole
-AGAIN = "push it again"
 
-
-class Streamed(Dataset):
-    """A dataset in a bucket, only to be read; whatever is read is compared with the content hash that was pushed."""
+class Streamed(Pushed):
+    """A dataset in a bucket."""
 
     def __init__(self, address: str) -> None:
         """Fetch the list of recordings, the robot and the splits.
@@ -53,97 +37,16 @@ class Streamed(Dataset):
             raise RemoteError(f"{self.bucket.address}: holds {'a run' if index else 'nothing'}, not a dataset")
         folder = Path(mkdtemp(prefix="gaponet-"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._index, self._files = index, folder / "files"
         self._opened: tuple[Path, Any] = Path(), None  # the data file that was read last
-        self._where: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
         small = {place: part for place, part in index.files.items() if not LARGE.fullmatch(place)}
-        download(self.bucket, replace(index, files=small), self._files)
-        with self._told():
-            self._robot, self._sets = datasets.pushed_robot(self._files), sets_under(self._files)
-            (folder / "dataset").mkdir()
-            made = Dataset.create(folder / "dataset" / index.name, self._robot)
-            for part in self._sets:
-                if part.ours is None:
-                    raise RemoteError(f"{part.path}: gaponet did not write this set")
-                made.state(**{k: str(v) for k, v in part.ours["dataset"].items() if k in Stated.__annotations__})
-            super().__init__(made.path)
-            self.address = re.sub("//[^/@:]*:[^/@]*@", "//", address)  # without keys: those are in the environment
-            if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
-                raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
-            datasets.bring_beside(self._files, self)
-
-    def read(self, entry: Entry, optional: bool = True) -> Sequence:
-        """Fetch one sequence; all of it is fetched and checked.
-
-        Raises:
-            RemoteError: It cannot be reached, or is not the one that was pushed.
-        """
-        part, episode, first = self._where[entry.hash]
-        with self._told():
-            table = self._fetch(part.data_file(episode), first, entry.rows)
-            sequence = to_sequence(read_episode(part, episode, self._robot, table), self._robot, entry.meta)
-            sequence = replace(sequence, meta=entry.meta)  # how it was first recorded, not how it was read here
-            if sequence.content_hash() != entry.hash:
-                raise RemoteError(f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}")
-        none: dict[str, Any] = {} if optional else dict.fromkeys(OPTIONAL)
-        return replace(sequence, **none)
-
-    def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
-        """Some channels of one sequence, (T, n) float32 each."""
-        sequence = self.read(entry)
-        return {name: getattr(sequence, name) for name in names}
-
-    def _append(self, sequence: Sequence, findings: dict[str, Any], digest: str) -> Entry:
-        raise self._read_only()
-
-    def state(self, **fields: str) -> None:
-        """Refused."""
-        raise self._read_only()
-
-    def _read_only(self) -> DatasetError:
-        return DatasetError(f"{self.bucket.address}: is only read; to change it, gaponet pull it and push it again")
-
-    def _journal(self) -> Iterator[Entry]:
-        for part in self._sets:
-            rows: dict[Path, int] = {}  # of a data file, before the next episode
-            for episode in part.episodes:
-                file = part.data_file(episode)
-                meta = SequenceMeta(**(episode["stated"] | {"robot": self._robot.name}))
-                digest, first = str(episode.get("content_hash")), rows.get(file, 0)
-                channels = tuple(c for c in ARRAYS if FEATURES[c] in part.features)
-                entry = Entry(entry_id(meta, digest), digest, part.dt, episode["length"], channels, meta, {})
-                self._where[digest], rows[file] = (part, episode, first), first + entry.rows
-                yield entry
+        download(self.bucket, small, folder / "files")
+        super().__init__(self.bucket.address, index, folder)
+        self.address = re.sub("//[^/@:]*:[^/@]*@", "//", address)  # without keys: those are in the environment
 
     def _fetch(self, file: Path, first: int, rows: int) -> pa.Table:
-        """Rows of a data file; they fill whole row groups, and no others are fetched."""
         import pyarrow.parquet as pq
 
         if file != self._opened[0]:
             place = file.relative_to(self._files).as_posix()
-            if place not in self._index.files:
-                raise RemoteError(f"{place} is not among the files of {INDEX}; {AGAIN}")
             self._opened = file, pq.ParquetFile(self.bucket.open(place, self._index.files[place]))
-        parquet = self._opened[1]
-        ends = np.cumsum([parquet.metadata.row_group(i).num_rows for i in range(parquet.num_row_groups)])
-        groups = np.flatnonzero((ends > first) & (ends <= first + rows)).tolist()
-        parts = [parquet.metadata.row_group(i) for i in groups]
-        if 8 * sum(part.column(k).num_values for part in parts for k in range(part.num_columns)) > LARGEST_ARRAYS:
-            raise RemoteError(f"{file}: a recording in it has more than {LARGEST_ARRAYS >> 20} MiB")
-        table = parquet.read_row_groups(groups, use_threads=False)
-        if len(table) != rows:
-            raise RemoteError(f"{file}: rows {first} to {first + rows} are not whole row groups; {AGAIN}")
-        return table
-
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Errors name the address, and not where files are read from."""
-        from pyarrow import ArrowException
-
-        address = self.bucket.address
-        try:
-            with reaching(address, ArrowException):
-                yield
-        except GAPONetError as error:
-            text = str(error).replace(f"{self._files}/", "").removeprefix(f"{address}: ")
-            raise RemoteError(f"{address}: {text}") from None
+        return rows_of(self._opened[1], file, first, rows)

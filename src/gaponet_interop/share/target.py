@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal, Protocol
 
@@ -17,7 +18,7 @@ from gaponet_interop.share.errors import RemoteError
 Kind = Literal["dataset", "run"]
 Anew = Literal["", "damaged", "all"]
 INDEX = "gaponet.json"  # names every file with its size and hash; a place without one holds nothing of ours
-LARGEST_INDEX = 16 << 20  # bytes
+LARGEST_INDEX = 96 << 20  # bytes; 67 of each sequence
 BLOCK = 1 << 20  # bytes read at once
 DEEPEST = 8  # folders below each other
 
@@ -42,7 +43,7 @@ class Index:
     format: int
     kind: Kind
     name: Name
-    contents: Annotated[tuple[Name, ...], Len(1, 200_000)]
+    contents: Annotated[tuple[Name, ...], Len(1, 1_000_000)]
     files: Annotated[dict[str, Part], Len(1, 20_000)]
 
     def __post_init__(self) -> None:
@@ -68,6 +69,15 @@ def _parents(path: str) -> Iterator[str]:
         yield path
 
 
+@dataclass(frozen=True)
+class Pruned:
+    """Files in a bucket that no index names, and their bytes; how many others may still be in use."""
+
+    files: list[str]
+    size: int
+    young: int
+
+
 class ChangedError(RemoteError):
     """Somebody else pushed to the place since its index was read."""
 
@@ -79,6 +89,7 @@ class Target(Protocol):
     """
 
     address: str
+    at_once: bool
 
     def index(self, kind: Kind | None = None) -> bytes | None:
         """Content of gaponet.json, at most LARGEST_INDEX bytes; None where nothing is there yet.
@@ -90,25 +101,50 @@ class Target(Protocol):
             RemoteError: The place cannot be reached, or holds something else.
         """
 
-    def store(
-        self, kind: Kind, files: Mapping[str, Path], index: bytes, private: bool, there: bytes | None, anew: Anew
-    ) -> None:
-        """Make the place hold these files, by their paths there, and the index; sends what is not there by its hash.
+    def holds(self, path: str, part: Part, anew: Anew) -> bool:
+        """Whether a file is there already, and need not be made or sent.
+
+        Args:
+            anew: What is not believed: nothing, what is read back with another content, or anything.
+        """
+
+    def send(self, path: str, file: Path, part: Part) -> None:
+        """Bring a file; it must stay until `store` returns, unless the place takes files `at_once`."""
+
+    def store(self, kind: Kind, index: Index, private: bool, there: bytes | None) -> None:
+        """Make what was sent, and what is held, be there under the names of the index, instead of what was.
 
         Args:
             private: Where the place is made anew and knows of it: readable by its owner alone.
             there: The index that was read, which this one takes the place of.
-            anew: What is sent though a file of its hash and size is there: nothing, what has other content, or all.
 
         Raises:
             ChangedError: Another index is there now; it stays.
         """
 
-    def prune(self, index: Index) -> int:
-        """Remove files that this index does not name and that no push under way can have brought; returns how many."""
+    def prune(self, named: set[str], hours: float, delete: bool) -> Pruned:
+        """Look for files without a name that no push or pull of the last hours can need, and delete them if asked to.
+
+        Args:
+            named: SHA-256 of those that have one.
+        """
 
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         """Copy one file of the index into a folder, under its path; its hash is the caller's to look at."""
+
+
+def written(index: Index) -> bytes:
+    """gaponet.json."""
+    return (json.dumps(asdict(index), indent=1) + "\n").encode()
+
+
+def send(target: Target, files: Mapping[str, Path], anew: Anew) -> dict[str, Part]:
+    """Send those files that a place does not hold; returns what they are."""
+    parts = {place: part_of(file) for place, file in files.items()}
+    for place, part in parts.items():
+        if not target.holds(place, part, anew):
+            target.send(place, files[place], part)
+    return parts
 
 
 def part_of(file: Path) -> Part:

@@ -2,21 +2,24 @@
 
 A LeRobot set has one rate and the same features in every frame; a dataset with several rates or choices of channels
 becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
-of its last episode says, so that a dataset that grew has its earlier files again, byte by byte, and a push sends the
-last one and what is new: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more.
+of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Files
+are laid out in blocks, each with its own file of meta/episodes, and nothing in a block depends on what comes after it:
+a dataset that grew has its earlier blocks again, byte by byte, and a push need not make them (share/dataset.py).
 
     beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
                             features.<name>.info.unit: SI
-                            columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, …
+                            columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, findings, …
                             meta/gaponet.json: exact period, robot, joint names, licence, source
 
-A reader that knows none of these finds an ordinary set. Not in it: twins and findings, which can be made again.
+A reader that knows none of these finds an ordinary set. Not in it: twins, which can be made again.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +32,7 @@ from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.data.writers import Tell, Written
 from gaponet.robot import RobotSpec
 from gaponet_interop.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
-from gaponet_interop.writers.lerobot_stats import EpisodeStats, episode_stats, pool
+from gaponet_interop.writers.lerobot_stats import EpisodeStats, episode_stats, plain, pool
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,25 +40,61 @@ if TYPE_CHECKING:
 
 Group = tuple[float, tuple[str, ...]]  # dt, channels
 
+LAYOUT = 1  # rises where the same recordings become other bytes
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
 USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
-ROWS = 200  # episodes in a row group of meta/episodes
+BLOCK_MB, BLOCK_EPISODES = 32.0, 64  # a block ends with a file, once it holds as much of both together
 INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
          "task_index": "int64"}  # fmt: skip
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
+@dataclass(frozen=True)
+class Placed:
+    """An episode, its number, that of its first frame, of its task and of its data file."""
+
+    entry: Entry
+    index: int
+    first: int
+    task: int
+    file: int
+
+
+@dataclass(frozen=True)
+class Block:
+    """Whole data files and the file of meta/episodes that lists what is in them, one of this number.
+
+    The key stands for all that decides their bytes: what is in them, and all that lies before.
+    """
+
+    key: str
+    number: int
+    episodes: list[Placed]
+
+    @property
+    def places(self) -> list[str]:
+        """Its files below the set."""
+        files = dict.fromkeys(episode.file for episode in self.episodes)
+        return [*(_place("data", file) for file in files), _place("meta/episodes", self.number)]
+
+
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
     """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate."""
+    written = []
+    for part in sets_of(dataset):
+        root = folder / part.name
+        part.write_meta(root, [part.write_block(block, root, dataset.read, tell) for block in part.blocks])
+        written.append(Written(Path(part.name), len(part.entries), part.frames, _fps(part.dt)))
+    return written
+
+
+def sets_of(dataset: Dataset) -> list[LeRobotSet]:
+    """The sets that a dataset becomes; nothing is read or written yet."""
     groups: dict[Group, list[Entry]] = {}
     for entry in dataset.entries:
         groups.setdefault((entry.dt, entry.channels), []).append(entry)
-    written = []
-    for (dt, channels), entries in groups.items():
-        part = "" if len(groups) == 1 else _folder(dt, channels, list(groups))
-        frames = _Set(dataset, folder / part, dt, channels).write(entries, tell)
-        written.append(Written(Path(part), len(entries), frames, _fps(dt)))
-    return written
+    names = {group: _folder(*group, list(groups)) if len(groups) > 1 else "" for group in groups}
+    return [LeRobotSet(dataset, names[group], *group, entries) for group, entries in groups.items()]
 
 
 def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
@@ -69,54 +108,72 @@ def _fps(dt: float) -> float:
     return round(1 / dt) if abs(round(1 / dt) * dt - 1) < 1e-9 else 1 / dt
 
 
-class _Set:
-    """One LeRobot set being written: data files as it goes, everything in meta at the end."""
+def _place(what: str, number: int) -> str:
+    return f"{what}/" + PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
 
-    def __init__(self, dataset: Dataset, root: Path, dt: float, channels: tuple[str, ...]) -> None:
-        self.dataset, self.root, self.dt, self.channels = dataset, root, dt, channels
+
+class LeRobotSet:
+    """One LeRobot set: which episodes go where, decided from the journal alone, and the writing of it."""
+
+    def __init__(self, dataset: Dataset, name: str, dt: float, channels: tuple[str, ...], entries: list[Entry]) -> None:
+        self.dataset, self.name, self.dt, self.channels, self.entries = dataset, name, dt, channels, entries
         self.n = len(dataset.joint_names)
         self.tasks: dict[str, int] = {}
-        self.rows: list[dict[str, Any]] = []  # of meta/episodes, not yet written
-        self.meta: pq.ParquetWriter | None = None
-        self.stats: EpisodeStats = {}
-        self.episodes = self.frames = self.chunk = self.file = 0
+        self.frames = 0
+        self.blocks = list(self._blocks())
 
-    def write(self, entries: list[Entry], tell: Tell) -> int:
-        """Write all episodes and the metadata; returns the number of frames."""
-        writer, size, total, ended = None, 0, 0, False
-        try:
-            for entry in entries:
-                sequence = self.dataset.read(entry)
-                columns = self._columns(sequence)
-                bytes_now = sum(x.nbytes for x in columns.values())
-                if writer is not None and (ended or size + bytes_now > FILE_MB * 1e6):
-                    writer.close()
-                    writer, size = None, 0
-                    self._next_file()
-                if writer is None:
-                    writer = self._open()
-                writer.write_table(self._table(columns))
-                size, total = size + bytes_now, total + bytes_now
-                ended = int(entry.hash[:8], 16) / 2**32 < bytes_now / max(USUAL_MB * 1e6, SHARE * total)
-                self._note(entry, columns)
-                tell(entry.meta.motion)
-            self._flush()
-        finally:
-            for open_file in (writer, self.meta):
-                if open_file is not None:
-                    open_file.close()
-        self._write_meta(entries)
-        return self.frames
+    def _blocks(self) -> Iterator[Block]:
+        row = 4 * self.n * len(self.channels) + sum(np.dtype(kind).itemsize for kind in INDEX.values())
+        said = [LAYOUT, self.dataset.robot_name, self.dataset.joint_names, self.dt, self.channels]
+        digest = hashlib.sha256(json.dumps(said).encode())
+        block: list[Placed] = []
+        file = size = total = number = 0
+        fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
+        for index, entry in enumerate(self.entries):
+            more = entry.rows * row
+            if ended or (size and size + more > FILE_MB * 1e6):
+                file, size = file + 1, 0
+                if fill >= 1:
+                    yield Block(digest.hexdigest(), number, block)
+                    block, number, fill = [], number + 1, 0.0
+            digest.update(entry.line + b"\n")
+            task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
+            block.append(Placed(entry, index, self.frames, task, file))
+            size, total, fill = size + more, total + more, fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
+            self.frames += entry.rows
+            ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
+        yield Block(digest.hexdigest(), number, block)
 
-    def _next_file(self) -> None:
-        self.file += 1
-        if self.file == CHUNK_FILES:
-            self.chunk, self.file = self.chunk + 1, 0
-
-    def _open(self) -> pq.ParquetWriter:
+    def write_block(self, block: Block, root: Path, read: Callable[[Entry], Sequence], tell: Tell) -> EpisodeStats:
+        """Write the files of a block below the set's folder; returns the statistics of its frames."""
+        import pyarrow as pa
         import pyarrow.parquet as pq
 
-        path = self.root / "data" / PLACE.format(chunk_index=self.chunk, file_index=self.file)
+        rows: list[dict[str, Any]] = []
+        stats, writer, file = [], None, -1
+        try:
+            for episode in block.episodes:
+                columns = self._columns(read(episode.entry), episode)
+                if episode.file != file:
+                    if writer is not None:
+                        writer.close()
+                    writer, file = self._open(root / _place("data", episode.file)), episode.file
+                assert writer is not None
+                writer.write_table(self._table(columns))
+                stats.append(episode_stats(columns))
+                rows.append(_row(episode, block.number, stats[-1]))
+                tell(episode.entry.meta.motion)
+        finally:
+            if writer is not None:
+                writer.close()
+        place = root / _place("meta/episodes", block.number)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(rows), place, compression="snappy")
+        return pool(stats)
+
+    def _open(self, path: Path) -> pq.ParquetWriter:
+        import pyarrow.parquet as pq
+
         path.parent.mkdir(parents=True, exist_ok=True)
         return pq.ParquetWriter(path, self._schema(), compression="snappy", use_dictionary=False)
 
@@ -127,15 +184,14 @@ class _Set:
         fields = [(FEATURES[c], vector) for c in self.channels]
         return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
 
-    def _columns(self, sequence: Sequence) -> dict[str, Array]:
+    def _columns(self, sequence: Sequence, episode: Placed) -> dict[str, Array]:
         rows = np.arange(len(sequence))
-        task = self.tasks.setdefault(sequence.meta.motion, len(self.tasks))
         return {FEATURES[c]: getattr(sequence, c) for c in self.channels} | {
             "timestamp": (rows * self.dt).astype(np.float32),
             "frame_index": rows,
-            "episode_index": np.full(len(rows), self.episodes),
-            "index": self.frames + rows,
-            "task_index": np.full(len(rows), task),
+            "episode_index": np.full(len(rows), episode.index),
+            "index": episode.first + rows,
+            "task_index": np.full(len(rows), episode.task),
         }
 
     def _table(self, columns: dict[str, Array]) -> pa.Table:
@@ -149,50 +205,20 @@ class _Set:
         ]  # fmt: skip
         return pa.table(arrays, schema=schema)
 
-    def _note(self, entry: Entry, columns: dict[str, Array]) -> None:
-        """The episode's row in meta/episodes."""
-        meta, stats = asdict(entry.meta), episode_stats(columns)
-        self.rows.append({
-            "episode_index": self.episodes, "tasks": [entry.meta.motion], "length": entry.rows,
-            "dataset_from_index": self.frames, "dataset_to_index": self.frames + entry.rows,
-            "data/chunk_index": self.chunk, "data/file_index": self.file,
-            "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-            **{name: meta[name] for name in STATED},
-            **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
-            "content_hash": entry.hash,
-            **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
-        })  # fmt: skip
-        self.stats = pool([self.stats, stats]) if self.stats else stats
-        self.frames += entry.rows
-        self.episodes += 1
-        if len(self.rows) == ROWS:
-            self._flush()
-
-    def _flush(self) -> None:
-        import pyarrow as pa
+    def write_meta(self, root: Path, stats: list[EpisodeStats]) -> None:
+        """Write what is of the whole set, the statistics pooled from those of its blocks."""
         import pyarrow.parquet as pq
 
-        if self.meta is None:
-            path = self.root / "meta" / "episodes" / PLACE.format(chunk_index=0, file_index=0)
-            path.parent.mkdir(parents=True)
-            self.meta = pq.ParquetWriter(path, pa.Table.from_pylist(self.rows).schema, compression="snappy")
-        if self.rows:
-            self.meta.write_table(pa.Table.from_pylist(self.rows, self.meta.schema))
-        self.rows = []
-
-    def _write_meta(self, entries: list[Entry]) -> None:
-        import pyarrow.parquet as pq
-
-        meta = self.root / "meta"
+        meta = root / "meta"
+        meta.mkdir(parents=True, exist_ok=True)
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
         _write_json(meta / "info.json", self._info())
-        _write_json(meta / "stats.json", {
-            f: {k: v.tolist() for k, v in values.items()} for f, values in self.stats.items()
-        })  # fmt: skip
+        _write_json(meta / "stats.json", plain(pool(stats)))
         header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
         _write_json(meta / OURS, {
             "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
-            "dataset_hash": dataset_hash(entries), "virtual": any(e.meta.virtual for e in entries), "dataset": header,
+            "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
+            "dataset": header,
         })  # fmt: skip
 
     def _info(self) -> dict[str, Any]:
@@ -204,11 +230,26 @@ class _Set:
         features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()}
         return {
             "codebase_version": VERSION, "robot_type": self.dataset.robot_name,
-            "total_episodes": self.episodes, "total_frames": self.frames, "total_tasks": len(self.tasks),
+            "total_episodes": len(self.entries), "total_frames": self.frames, "total_tasks": len(self.tasks),
             "chunks_size": CHUNK_FILES, "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": 200,
-            "fps": _fps(self.dt), "splits": {"train": f"0:{self.episodes}"},
+            "fps": _fps(self.dt), "splits": {"train": f"0:{len(self.entries)}"},
             "data_path": "data/" + PLACE, "video_path": None, "features": features,
         }  # fmt: skip
+
+
+def _row(episode: Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
+    """The episode's row in the file of meta/episodes that has this number."""
+    entry, meta = episode.entry, asdict(episode.entry.meta)
+    return {
+        "episode_index": episode.index, "tasks": [entry.meta.motion], "length": entry.rows,
+        "dataset_from_index": episode.first, "dataset_to_index": episode.first + entry.rows,
+        "data/chunk_index": episode.file // CHUNK_FILES, "data/file_index": episode.file % CHUNK_FILES,
+        "meta/episodes/chunk_index": number // CHUNK_FILES, "meta/episodes/file_index": number % CHUNK_FILES,
+        **{name: meta[name] for name in STATED}, "payload_mass": float(entry.meta.payload_mass),
+        **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
+        "findings": json.dumps(entry.findings, ensure_ascii=False), "content_hash": entry.hash,
+        **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
+    }  # fmt: skip
 
 
 def _task_table(tasks: dict[str, int]) -> pa.Table:

@@ -34,3 +34,16 @@ def pool(episodes: list[EpisodeStats]) -> EpisodeStats:
             "count": parts["count"].sum(axis=0),
         }  # fmt: skip
     return pooled
+
+
+def plain(stats: EpisodeStats) -> dict[str, dict[str, list[float]]]:
+    """The same as lists, for JSON."""
+    return {name: {k: v.tolist() for k, v in values.items()} for name, values in stats.items()}
+
+
+def unplain(lists: dict[str, dict[str, list[float]]]) -> EpisodeStats:
+    """What `plain` was given."""
+    return {
+        name: {k: np.array(v, int if k == "count" else float) for k, v in values.items()}
+        for name, values in lists.items()
+    }

@@ -108,7 +108,7 @@ def test_statistics_are_those_of_all_frames(dataset, tmp_path):
 def test_many_episodes_are_spread_over_files(dataset, arm, tmp_path, monkeypatch):
     monkeypatch.setattr(lerobot_export, "FILE_MB", 0.001)
     monkeypatch.setattr(lerobot_export, "CHUNK_FILES", 2)
-    monkeypatch.setattr(lerobot_export, "ROWS", 2)
+    monkeypatch.setattr(lerobot_export, "BLOCK_EPISODES", 2)
     export_lerobot(dataset, tmp_path / "out")
     files = sorted(f.relative_to(tmp_path / "out").as_posix() for f in (tmp_path / "out" / "data").rglob("*.parquet"))
     assert files == ["data/chunk-000/file-000.parquet", "data/chunk-000/file-001.parquet",
