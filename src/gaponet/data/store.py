@@ -50,13 +50,10 @@ from gaponet.structure import Name, parse_json, read_format
 
 FORMAT = 1
 MEND = "restore the file or import the log again"
+MEND_LINE = "delete the line and import that log again"
 KIND, JOURNAL, SURVEYS = "dataset", "sequences.jsonl", "surveys"
 LIST_S = 1.0  # of many recordings that are appended
 LARGEST_TABLE = 1 << 30  # bytes of what is read of one sequence at once
-BEGIN = re.compile(  # of a line as it is written here: with ranges, so that nothing in it is left to be checked
-    rb'\{"id": "([\w.-]{3,200})", "hash": "([0-9a-f]{8,64})", "dt": (0\.0{0,3}[1-9]\d{0,16}), "rows": ([1-9]\d{0,7}), '
-    rb'"channels": \["(ctrl", "qpos", "qvel(?:", "(?:qacc|tau|tau_eq|temperature))*)"\], "meta": \{'
-)
 
 
 class _Header(TypedDict):
@@ -70,49 +67,49 @@ class _Header(TypedDict):
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One line of the journal; what stands in it from `meta` on is parsed and checked when it is first asked for."""
-
+class _Begin:
     id: Name
     hash: Annotated[str, Len(8, 64)]
     dt: Annotated[float, Interval(ge=1e-4, le=1)]
     rows: Annotated[int, Interval(ge=1, le=10**8)]
     channels: tuple[str, ...]
-    meta: SequenceMeta
-    findings: dict[str, dict[str, float | None]]
-    command: Sketch | None = field(default_factory=lambda: None)  # in journals from before it was kept
 
     def __post_init__(self) -> None:
         if not {"ctrl", "qpos", "qvel"} <= set(self.channels) <= set(ARRAYS):
             raise DatasetError(f"channels: {self.channels!r:.80} lack ctrl, qpos or qvel, or hold an unknown one")
 
+
+@dataclass(frozen=True)
+class Entry(_Begin):
+    """One line of the journal; what stands in it from `meta` on is parsed and checked when it is first asked for."""
+
+    meta: SequenceMeta
+    findings: dict[str, dict[str, float | None]]
+    command: Sketch | None = field(default_factory=lambda: None)  # in journals from before it was kept
+
     @classmethod
     def of(cls, line: bytes, where: str) -> Entry:
-        """The entry that a line holds; one that begins in another way than here is parsed at once."""
-        begin = BEGIN.match(line)
-        if begin is None:
-            return parse_json(cls, line, where, DatasetError, "delete the line and import that log again")
-        entry, (name, digest, dt, rows, channels) = object.__new__(cls), begin.groups()
-        there = {"id": name.decode(), "hash": digest.decode(), "dt": float(dt), "rows": int(rows)}
-        entry.__dict__.update(there, channels=tuple(channels.decode().split('", "')), _line=(line, where))
+        """The entry that a line holds; one that does not begin as `line` has it is parsed at once."""
+        head, _, _ = line.partition(b', "meta": {')
+        try:
+            entry, begin = object.__new__(cls), parse_json(_Begin, head + b"}", where, DatasetError)
+        except DatasetError:
+            entry = begin = parse_json(cls, line, where, DatasetError, MEND_LINE)
+        entry.__dict__.update(vars(begin), _line=(line, where))
         return entry
 
     @property
     def line(self) -> bytes:
-        """As it is written."""
-        if "_line" in self.__dict__:
-            return cast("bytes", self.__dict__["_line"][0])
-        return json.dumps(asdict(self), ensure_ascii=False, allow_nan=False).encode()
+        """As it stands, or will stand, in the journal."""
+        there: tuple[bytes, str] | None = self.__dict__.get("_line")
+        return there[0] if there else json.dumps(asdict(self), ensure_ascii=False, allow_nan=False).encode()
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name not in ("meta", "findings", "command") or "_line" not in self.__dict__:
+            if name not in ("meta", "findings", "command"):
                 raise AttributeError(name)
-            line, where = self._line
-            whole = parse_json(Entry, line, where, DatasetError, "delete the line and import that log again")
-            del self.__dict__["_line"]
-            self.__dict__.update(vars(whole))
+            self.__dict__.update(vars(parse_json(Entry, *self._line, DatasetError, MEND_LINE)))
             return self.__dict__[name]
 
 
@@ -306,9 +303,9 @@ class Dataset:
                 if not any(fnmatchcase(e.id, pattern) for e in self.entries):
                     raise DatasetError(f"{self.path}: no sequence '{pattern}'; {JOURNAL} in it lists the ids")
             gone = {e.id: e for e in self.entries if any(fnmatchcase(e.id, p) for p in patterns)}
-            lines = (self.path / JOURNAL).read_bytes()[: self._end].splitlines(keepends=True)
-            kept = [line for line, e in zip(lines, self.entries, strict=True) if e.id not in gone]
-            write_text(self.path / JOURNAL, b"".join(kept).decode())
+            kept = [e.line + b"\n" for e in self.entries if e.id not in gone]
+            with whole(self.path / JOURNAL) as temporary:
+                temporary.write_bytes(b"".join(kept))
             for entry in gone.values():  # unlisted files are none of the dataset's, should this be cut short
                 for file in (
                     self._file(entry),

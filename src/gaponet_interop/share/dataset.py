@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import shutil
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from gaponet_interop.formats.lerobot_set import FEATURES
 from gaponet_interop.share.readme import dataset_readme
 from gaponet_interop.share.target import Anew, Part, Target, send
 from gaponet_interop.writers.lerobot import LeRobotSet, sets_of
-from gaponet_interop.writers.lerobot_stats import EpisodeStats, plain, pool, unplain
+from gaponet_interop.writers.lerobot_stats import EpisodeStats, plain, pool
 
 BESIDE = "gaponet"  # folder beside the LeRobot set
 BROUGHT = ("collect.json", OFFSETS)  # files in it, as they lie in the dataset
@@ -61,48 +62,39 @@ def lay_out(
         DatasetError: A recording is damaged.
     """
     known, done = _laid(dataset), 0
-    now: dict[str, _Laid] = {}
+    now: list[_Laid] = []
     files: dict[str, Part] = {}
-    sets: dict[LeRobotSet, EpisodeStats] = {}
-
-    def read(entry: Entry) -> Sequence:
-        sequence = dataset.read(entry)
-        if sequence.content_hash() != entry.hash:
-            raise DatasetError(f"{dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first")
-        return sequence
-
-    def tell(motion: str) -> None:
-        nonlocal done
-        done += 1
-        progress(done, len(dataset), motion)
-
+    sets: list[tuple[LeRobotSet, EpisodeStats]] = []
     for part in sets_of(dataset):
-        root, stats = folder / part.name, []
         for block in part.blocks:
-            laid, places = known.get(block.key), {place: (Path(part.name) / place).as_posix() for place in block.places}
-            if laid is None or not all(target.holds(places[at], one, anew) for at, one in laid["files"].items()):
-                pooled = part.write_block(block, root, read, tell)
-                sent = send(target, {place: folder / place for place in places.values()}, anew)
-                parts = {at: sent[there] for at, there in places.items()}
-                laid = {"key": block.key, "files": parts, "stats": plain(pooled)}
+            laid = known.get(block.key)
+            if laid is None or not all(target.holds(place, one, anew) for place, one in laid["files"].items()):
+                stats = part.write_block(block, folder, partial(_read, dataset))
+                sent = send(target, {place: folder / place for place in block.places}, anew)
+                laid = {"key": block.key, "files": sent, "stats": plain(stats)}
                 if block.key not in known and not dataset.read_only:
                     with (dataset.path / LAID).open("a", encoding="utf-8") as file:
                         file.write(_line(laid))
-                for place in places.values() if target.at_once else ():
+                for place in block.places if target.at_once else ():
                     (folder / place).unlink()
-            now[block.key] = laid
-            files |= {there: laid["files"][at] for at, there in places.items()}
-            stats.append(unplain(laid["stats"]))
-        part.write_meta(root, stats)
-        sets[part] = pool(stats)
-    _beside(dataset, robot, folder / BESIDE)
+            now.append(laid)
+            files |= laid["files"]
+            done += len(block.episodes)
+            progress(done, len(dataset), block.episodes[-1].entry.meta.motion)
+        stats = pool([laid["stats"] for laid in now[-len(part.blocks) :]])
+        part.write_meta(folder, stats)
+        sets.append((part, stats))
+    (folder / BESIDE).mkdir()
+    save_robot(robot.nominal or robot, folder / BESIDE / KEPT)
+    (folder / BESIDE / KEPT / ".gaponet").unlink()
+    bring(dataset.path, folder / BESIDE, dataset)
     card = _card(dataset, sets)
-    text = dataset_readme(card, card_text(card), target.address, [part.name for part in sets])
+    text = dataset_readme(card, card_text(card), target.address, [part.name for part, _ in sets])
     write_text(folder / "README.md", text)
     small = {file.relative_to(folder).as_posix(): file for file in folder.rglob("*") if file.is_file()}
     files |= send(target, {place: file for place, file in small.items() if place not in files}, anew)
-    if known.keys() - now.keys() and not dataset.read_only:
-        write_text(dataset.path / LAID, "".join(map(_line, now.values())))
+    if known.keys() - {laid["key"] for laid in now} and not dataset.read_only:
+        write_text(dataset.path / LAID, "".join(map(_line, now)))
     return dict(sorted(files.items()))
 
 
@@ -120,32 +112,25 @@ def _line(laid: _Laid) -> str:
     return "\n" + json.dumps(laid, default=vars)
 
 
-def _beside(dataset: Dataset, robot: RobotSpec, beside: Path) -> None:
-    """What a LeRobot set has no place for."""
-    beside.mkdir()
-    save_robot(robot.nominal or robot, beside / KEPT)
-    (beside / KEPT / ".gaponet").unlink()
-    for split in sorted((dataset.path / "splits").glob("*.json")):
-        read_split(split, dataset)
-        (beside / "splits").mkdir(exist_ok=True)
-        shutil.copyfile(split, beside / "splits" / split.name)
-    for name in BROUGHT:
-        if (dataset.path / name).is_file():
-            shutil.copyfile(dataset.path / name, beside / name)
+def _read(dataset: Dataset, entry: Entry) -> Sequence:
+    sequence = dataset.read(entry)
+    if sequence.content_hash() != entry.hash:
+        raise DatasetError(f"{dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first")
+    return sequence
 
 
-def _card(dataset: Dataset, sets: dict[LeRobotSet, EpisodeStats]) -> dict[str, Any]:
+def _card(dataset: Dataset, sets: list[tuple[LeRobotSet, EpisodeStats]]) -> dict[str, Any]:
     """The card without what only reading all of it says: percentiles and repeatability."""
     signals = {}
     for name, feature in FEATURES.items():
-        having = {part: stats for part, stats in sets.items() if feature in stats}
+        having = [(part, stats) for part, stats in sets if feature in stats]
         if having:
-            pooled = pool([{feature: stats[feature]} for stats in having.values()])[feature]
+            pooled = pool([{feature: stats[feature]} for _, stats in having])[feature]
             joints = {
                 joint: {k: float(f"{pooled[k][j]:.6g}") for k in ("min", "mean", "max", "std")}
                 for j, joint in enumerate(dataset.joint_names)
             }
-            count = sum(len(part.entries) for part in having)
+            count = sum(len(part.entries) for part, _ in having)
             signals[name] = {"unit": UNITS[name], "sequences": count, "joints": joints}
     return counted(dataset) | {"signals": signals}
 
@@ -171,16 +156,15 @@ def take_in(pushed: Dataset, robot: RobotSpec, beside: Path, out: Path, progress
             sequence = pushed.read(entry)
             dataset.append(sequence, entry.findings or findings(sequence), entry.hash)
             progress(done, len(new), entry.meta.motion)
-    bring_beside(beside, dataset)
+    bring(beside, dataset.path, dataset)
 
 
-def bring_beside(beside: Path, dataset: Dataset) -> None:
-    """Take splits, recipe and offsets, where there are none, out of what was downloaded into a dataset."""
-    files = [beside / name for name in BROUGHT] + sorted((beside / "splits").glob("*.json"))
-    for file in files:
-        place = dataset.path / file.relative_to(beside)
+def bring(source: Path, out: Path, dataset: Dataset) -> None:
+    """Copy splits, recipe and offsets of a dataset, checked, where there are none yet."""
+    for file in [source / name for name in BROUGHT] + sorted((source / "splits").glob("*.json")):
+        place = out / file.relative_to(source)
         if file.is_file() and not place.exists():
-            if file.parent != beside:
+            if file.parent != source:
                 read_split(file, dataset)
             place.parent.mkdir(exist_ok=True)
             shutil.copyfile(file, place)

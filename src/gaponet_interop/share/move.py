@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -20,30 +19,26 @@ from typing import Any
 from gaponet.data.store import Dataset, open_dataset
 from gaponet.errors import GAPONetError, UsageError
 from gaponet.files import MARK, writing
-from gaponet.progress import bar, noted
-from gaponet.structure import parse_json
+from gaponet.progress import bar
 from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share import run as runs
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.open import open_target
-from gaponet_interop.share.pushed import LARGE, Pushed
+from gaponet_interop.share.stream import LARGE, Pushed
 from gaponet_interop.share.target import (
-    INDEX,
-    LARGEST_INDEX,
+    FORMAT,
     Anew,
     ChangedError,
     Index,
     Kind,
     Part,
     Pruned,
-    Target,
-    part_of,
+    download,
+    read_content,
+    read_index,
     send,
 )
 
-FORMAT = 1
-AT_ONCE = 8  # downloads
-SPARE = 1 << 28  # bytes of a disk that stay free
 HOURS = 12.0  # that nothing is pruned which was written or replaced in them
 
 
@@ -77,7 +72,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
     kind = _kind(path)
     target = open_target(address)
     content = target.index(kind)
-    there = _read(target, content)
+    there = read_content(target, content)
     with _beside(path, "push") as folder, bar("reading") as update:
         _empty(folder)  # of a push that was killed
         lay_out: Callable[[Anew], dict[str, Part]]
@@ -103,7 +98,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
                 if last:
                     raise
                 content = target.index(kind)
-                there = _read(target, content)
+                there = read_content(target, content)
                 if there is not None and not replace:
                     _require_newer(there, kind, contents, target.address)
     return Moved(kind, address, path, len(files), index.size, {"pruned": pruned})
@@ -188,23 +183,6 @@ def _kind(path: Path) -> Kind:
     raise UsageError(f"{path}: neither a dataset (dataset.json) nor a run of gaponet train (split.json, config.json)")
 
 
-def read_index(target: Target, kind: Kind | None) -> Index | None:
-    """What is there, checked; None where nothing is."""
-    return _read(target, target.index(kind))
-
-
-def _read(target: Target, content: bytes | None) -> Index | None:
-    if content is None:
-        return None
-    where = f"{target.address}: {INDEX}"
-    index = parse_json(Index, content[:LARGEST_INDEX], where, RemoteError, "push it again")
-    if index.format > FORMAT:
-        raise RemoteError(
-            f"{where}: format {index.format} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
-        )
-    return index
-
-
 def _require_newer(there: Index, kind: Kind, contents: tuple[str, ...], address: str) -> None:
     """Refuse to take the place of what holds something that we do not."""
     lost = len(set(there.contents) - set(contents))
@@ -215,41 +193,6 @@ def _require_newer(there: Index, kind: Kind, contents: tuple[str, ...], address:
         raise RemoteError(
             f"{address}: holds {what} that would be lost ('{there.name}'); push to another place, or say --replace"
         )
-
-
-def download(target: Target, files: Mapping[str, Part], folder: Path) -> None:
-    """Files of an index, below the folder; those that are there with the right hash stay."""
-    folder.mkdir(exist_ok=True)
-    missing = [(place, part) for place, part in files.items() if not _is(folder / place, part)]
-    needed, free = sum(part.size for _, part in missing), shutil.disk_usage(folder).free
-    if needed + SPARE > free:
-        raise RemoteError(
-            f"{target.address}: {needed / 1e9:.2f} GB are to come, {free / 1e9:.2f} GB of the disk are free"
-        )
-
-    def fetch(place: str, part: Part) -> str:
-        (folder / place).unlink(missing_ok=True)
-        target.fetch(place, part, folder)
-        if not _is(folder / place, part):
-            (folder / place).unlink(missing_ok=True)
-            raise RemoteError(
-                f"{target.address}: {place} came with another size or hash than {INDEX} says; push it again"
-            )
-        return place
-
-    with bar("downloading") as update, ThreadPoolExecutor(AT_ONCE) as pool:
-        told, jobs = noted(update, ""), [pool.submit(fetch, *one) for one in missing]
-        try:
-            for done, job in enumerate(as_completed(jobs), 1):
-                job.result()
-                told(done, len(jobs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _is(file: Path, part: Part) -> bool:
-    return file.is_file() and not file.is_symlink() and part_of(file) == part
 
 
 @contextmanager

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,15 +14,19 @@ from typing import Annotated, Literal, Protocol
 
 from annotated_types import Interval, Len
 
-from gaponet.structure import Name, Sha256
+from gaponet.progress import bar, noted
+from gaponet.structure import Name, Sha256, parse_json
 from gaponet_interop.share.errors import RemoteError
 
 Kind = Literal["dataset", "run"]
 Anew = Literal["", "damaged", "all"]
+FORMAT = 1
 INDEX = "gaponet.json"  # names every file with its size and hash; a place without one holds nothing of ours
 LARGEST_INDEX = 96 << 20  # bytes; 67 of each sequence
 BLOCK = 1 << 20  # bytes read at once
 DEEPEST = 8  # folders below each other
+AT_ONCE = 8  # downloads
+SPARE = 1 << 28  # bytes of a disk that stay free
 
 
 @dataclass(frozen=True)
@@ -145,6 +151,59 @@ def send(target: Target, files: Mapping[str, Path], anew: Anew) -> dict[str, Par
         if not target.holds(place, part, anew):
             target.send(place, files[place], part)
     return parts
+
+
+def read_index(target: Target, kind: Kind | None) -> Index | None:
+    """What is there, checked; None where nothing is."""
+    return read_content(target, target.index(kind))
+
+
+def read_content(target: Target, content: bytes | None) -> Index | None:
+    """What an index that was read says, checked."""
+    if content is None:
+        return None
+    where = f"{target.address}: {INDEX}"
+    index = parse_json(Index, content[:LARGEST_INDEX], where, RemoteError, "push it again")
+    if index.format > FORMAT:
+        raise RemoteError(
+            f"{where}: format {index.format} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
+        )
+    return index
+
+
+def download(target: Target, files: Mapping[str, Part], folder: Path) -> None:
+    """Files of an index, below the folder; those that are there with the right hash stay."""
+    folder.mkdir(exist_ok=True)
+    missing = [(place, part) for place, part in files.items() if not _is(folder / place, part)]
+    needed, free = sum(part.size for _, part in missing), shutil.disk_usage(folder).free
+    if needed + SPARE > free:
+        raise RemoteError(
+            f"{target.address}: {needed / 1e9:.2f} GB are to come, {free / 1e9:.2f} GB of the disk are free"
+        )
+
+    def fetch(place: str, part: Part) -> str:
+        (folder / place).unlink(missing_ok=True)
+        target.fetch(place, part, folder)
+        if not _is(folder / place, part):
+            (folder / place).unlink(missing_ok=True)
+            raise RemoteError(
+                f"{target.address}: {place} came with another size or hash than {INDEX} says; push it again"
+            )
+        return place
+
+    with bar("downloading") as update, ThreadPoolExecutor(AT_ONCE) as pool:
+        told, jobs = noted(update, ""), [pool.submit(fetch, *one) for one in missing]
+        try:
+            for done, job in enumerate(as_completed(jobs), 1):
+                job.result()
+                told(done, len(jobs))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _is(file: Path, part: Part) -> bool:
+    return file.is_file() and not file.is_symlink() and part_of(file) == part
 
 
 def part_of(file: Path) -> Part:

@@ -50,7 +50,7 @@ PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
 @dataclass(frozen=True)
-class Placed:
+class _Placed:
     """An episode, its number, that of its first frame, of its task and of its data file."""
 
     entry: Entry
@@ -61,7 +61,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Block:
+class _Block:
     """Whole data files and the file of meta/episodes that lists what is in them, one of this number.
 
     The key stands for all that decides their bytes: what is in them, and all that lies before.
@@ -69,21 +69,15 @@ class Block:
 
     key: str
     number: int
-    episodes: list[Placed]
-
-    @property
-    def places(self) -> list[str]:
-        """Its files below the set."""
-        files = dict.fromkeys(episode.file for episode in self.episodes)
-        return [*(_place("data", file) for file in files), _place("meta/episodes", self.number)]
+    episodes: list[_Placed]
+    places: list[str]
 
 
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
     """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate."""
     written = []
     for part in sets_of(dataset):
-        root = folder / part.name
-        part.write_meta(root, [part.write_block(block, root, dataset.read, tell) for block in part.blocks])
+        part.write_meta(folder, pool([part.write_block(block, folder, dataset.read, tell) for block in part.blocks]))
         written.append(Written(Path(part.name), len(part.entries), part.frames, _fps(part.dt)))
     return written
 
@@ -108,10 +102,6 @@ def _fps(dt: float) -> float:
     return round(1 / dt) if abs(round(1 / dt) * dt - 1) < 1e-9 else 1 / dt
 
 
-def _place(what: str, number: int) -> str:
-    return f"{what}/" + PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
-
-
 class LeRobotSet:
     """One LeRobot set: which episodes go where, decided from the journal alone, and the writing of it."""
 
@@ -122,11 +112,11 @@ class LeRobotSet:
         self.frames = 0
         self.blocks = list(self._blocks())
 
-    def _blocks(self) -> Iterator[Block]:
+    def _blocks(self) -> Iterator[_Block]:
         row = 4 * self.n * len(self.channels) + sum(np.dtype(kind).itemsize for kind in INDEX.values())
-        said = [LAYOUT, self.dataset.robot_name, self.dataset.joint_names, self.dt, self.channels]
+        said = [LAYOUT, self.name, self.dataset.robot_name, self.dataset.joint_names, self.dt, self.channels]
         digest = hashlib.sha256(json.dumps(said).encode())
-        block: list[Placed] = []
+        block: list[_Placed] = []
         file = size = total = number = 0
         fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
         for index, entry in enumerate(self.entries):
@@ -134,18 +124,29 @@ class LeRobotSet:
             if ended or (size and size + more > FILE_MB * 1e6):
                 file, size = file + 1, 0
                 if fill >= 1:
-                    yield Block(digest.hexdigest(), number, block)
+                    yield self._block(digest.hexdigest(), number, block)
                     block, number, fill = [], number + 1, 0.0
             digest.update(entry.line + b"\n")
             task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
-            block.append(Placed(entry, index, self.frames, task, file))
+            block.append(_Placed(entry, index, self.frames, task, file))
             size, total, fill = size + more, total + more, fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
             self.frames += entry.rows
             ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
-        yield Block(digest.hexdigest(), number, block)
+        yield self._block(digest.hexdigest(), number, block)
 
-    def write_block(self, block: Block, root: Path, read: Callable[[Entry], Sequence], tell: Tell) -> EpisodeStats:
-        """Write the files of a block below the set's folder; returns the statistics of its frames."""
+    def _block(self, key: str, number: int, episodes: list[_Placed]) -> _Block:
+        files = dict.fromkeys(episode.file for episode in episodes)
+        places = [*(self._place("data", file) for file in files), self._place("meta/episodes", number)]
+        return _Block(key, number, episodes, places)
+
+    def _place(self, what: str, number: int) -> str:
+        file = PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
+        return f"{self.name}/{what}/{file}".lstrip("/")
+
+    def write_block(
+        self, block: _Block, folder: Path, read: Callable[[Entry], Sequence], tell: Tell = lambda motion: None
+    ) -> EpisodeStats:
+        """Write the files of a block; returns the statistics of its frames."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -157,7 +158,7 @@ class LeRobotSet:
                 if episode.file != file:
                     if writer is not None:
                         writer.close()
-                    writer, file = self._open(root / _place("data", episode.file)), episode.file
+                    writer, file = self._open(folder / self._place("data", episode.file)), episode.file
                 assert writer is not None
                 writer.write_table(self._table(columns))
                 stats.append(episode_stats(columns))
@@ -166,7 +167,7 @@ class LeRobotSet:
         finally:
             if writer is not None:
                 writer.close()
-        place = root / _place("meta/episodes", block.number)
+        place = folder / block.places[-1]
         place.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.Table.from_pylist(rows), place, compression="snappy")
         return pool(stats)
@@ -184,7 +185,7 @@ class LeRobotSet:
         fields = [(FEATURES[c], vector) for c in self.channels]
         return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
 
-    def _columns(self, sequence: Sequence, episode: Placed) -> dict[str, Array]:
+    def _columns(self, sequence: Sequence, episode: _Placed) -> dict[str, Array]:
         rows = np.arange(len(sequence))
         return {FEATURES[c]: getattr(sequence, c) for c in self.channels} | {
             "timestamp": (rows * self.dt).astype(np.float32),
@@ -205,15 +206,15 @@ class LeRobotSet:
         ]  # fmt: skip
         return pa.table(arrays, schema=schema)
 
-    def write_meta(self, root: Path, stats: list[EpisodeStats]) -> None:
-        """Write what is of the whole set, the statistics pooled from those of its blocks."""
+    def write_meta(self, folder: Path, stats: EpisodeStats) -> None:
+        """Write what is of the whole set, with the statistics of all frames."""
         import pyarrow.parquet as pq
 
-        meta = root / "meta"
+        meta = folder / self.name / "meta"
         meta.mkdir(parents=True, exist_ok=True)
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
         _write_json(meta / "info.json", self._info())
-        _write_json(meta / "stats.json", plain(pool(stats)))
+        _write_json(meta / "stats.json", plain(stats))
         header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
         _write_json(meta / OURS, {
             "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
@@ -237,7 +238,7 @@ class LeRobotSet:
         }  # fmt: skip
 
 
-def _row(episode: Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
+def _row(episode: _Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
     """The episode's row in the file of meta/episodes that has this number."""
     entry, meta = episode.entry, asdict(episode.entry.meta)
     return {

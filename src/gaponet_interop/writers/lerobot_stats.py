@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from gaponet.arrays import Array
 
-EpisodeStats = dict[str, dict[str, Array]]  # {feature: {min, max, mean, std (n), count (1)}}
+EpisodeStats = dict[str, dict[str, Any]]  # {feature: {min, max, mean, std (n), count (1)}}, arrays or lists
 
 
 def episode_stats(columns: dict[str, Array]) -> EpisodeStats:
@@ -31,7 +33,7 @@ def pool(episodes: list[EpisodeStats]) -> EpisodeStats:
         variance = (weight * (parts["std"] ** 2 + (parts["mean"] - mean) ** 2)).sum(axis=0)
         pooled[name] = {
             "min": parts["min"].min(axis=0), "max": parts["max"].max(axis=0), "mean": mean, "std": np.sqrt(variance),
-            "count": parts["count"].sum(axis=0),
+            "count": parts["count"].sum(axis=0).astype(int),
         }  # fmt: skip
     return pooled
 
@@ -39,11 +41,3 @@ def pool(episodes: list[EpisodeStats]) -> EpisodeStats:
 def plain(stats: EpisodeStats) -> dict[str, dict[str, list[float]]]:
     """The same as lists, for JSON."""
     return {name: {k: v.tolist() for k, v in values.items()} for name, values in stats.items()}
-
-
-def unplain(lists: dict[str, dict[str, list[float]]]) -> EpisodeStats:
-    """What `plain` was given."""
-    return {
-        name: {k: np.array(v, int if k == "count" else float) for k, v in values.items()}
-        for name, values in lists.items()
-    }
