@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gaponet.files import MARK, whole
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.target import (
     BLOCK,
@@ -78,7 +79,7 @@ class Bucket:
             if inside and bucket and self.files.get_file_info(bucket).type == FileType.NotFound:
                 raise RemoteError(f"{self.address}: no bucket '{bucket}' there; make it first, by the provider's tools")
             there = self.files.get_file_info(FileSelector(self.root, allow_not_found=True))
-        strangers = sorted(one.base_name for one in there if one.base_name != OBJECTS)
+        strangers = sorted(name for one in there if (name := one.base_name) != OBJECTS and not name.startswith(MARK))
         if strangers:
             raise RemoteError(f"{self.address}: holds {strangers[0]} and no {INDEX}: gaponet did not push it")
         return None
@@ -108,8 +109,15 @@ class Bucket:
                 raise RemoteError(f"{self.address}: {gone[0]} was removed meanwhile; push again")
             if self.index(kind) != there:
                 raise ChangedError(f"{self.address}: somebody else pushed meanwhile; push again")
-            with self.files.open_output_stream(f"{self.root}/{INDEX}") as out:
-                out.write(written(index))
+            content = written(index)
+            if content == there:
+                return
+            if self.files.type_name == "local":  # where a write can be cut short
+                with whole(Path(self.root) / INDEX) as file:
+                    file.write_bytes(content)
+            else:
+                with self.files.open_output_stream(f"{self.root}/{INDEX}") as out:
+                    out.write(content)
 
     def fetch(self, path: str, part: Part, folder: Path) -> None:
         out = folder / path
@@ -128,9 +136,8 @@ class Bucket:
         before = time.time() - 3600 * hours
         with reaching(self.address, *self._errors):
             left = [info for name, info in self._list().items() if name not in named]
-            gone = [
-                info for info in left if max(_time(info), self._since) < before
-            ]  # somebody may pull what was before
+            # Of a place whose index is young, somebody may still pull what was named before.
+            gone = [info for info in left if max(_time(info), self._since) < before]
             for info in gone if delete else ():
                 if _time(self.files.get_file_info(info.path)) < before:  # not sent again meanwhile
                     self.files.delete_file(info.path)

@@ -7,6 +7,7 @@ its hashes, and only then gives it its name: what is there under that name is wh
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -72,7 +73,7 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
     kind = _kind(path)
     target = open_target(address)
     content = target.index(kind)
-    there = read_content(target, content)
+    there = None if replace else read_content(target, content)
     with _beside(path, "push") as folder, bar("reading") as update:
         _empty(folder)  # of a push that was killed
         lay_out: Callable[[Anew], dict[str, Part]]
@@ -83,12 +84,11 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
         else:
             laid, contents = runs.lay_out(path, folder, target.address)
             lay_out = partial(send, target, laid)
-        if there is not None and not replace:
-            _require_newer(there, kind, contents, target.address)
+        _require_newer(there, kind, contents, target.address)
         # Who pushes what is there already wants it mended.
         files = lay_out("all" if replace else "damaged" if there and there.contents == contents else "")
         index = Index(FORMAT, kind, path.name, contents, files)
-        named = {part.sha256 for one in (there, index) if one for part in one.files.values()}
+        named = {part.sha256 for part in files.values()} | set(re.findall("[0-9a-f]{64}", str(content)))
         pruned = len(target.prune(named, HOURS, True).files) if prune else 0
         for last in (False, False, True):
             try:
@@ -98,9 +98,8 @@ def push(path: str | Path, address: str, private: bool = False, replace: bool = 
                 if last:
                     raise
                 content = target.index(kind)
-                there = read_content(target, content)
-                if there is not None and not replace:
-                    _require_newer(there, kind, contents, target.address)
+                there = None if replace else read_content(target, content)
+                _require_newer(there, kind, contents, target.address)
     return Moved(kind, address, path, len(files), index.size, {"pruned": pruned})
 
 
@@ -183,8 +182,10 @@ def _kind(path: Path) -> Kind:
     raise UsageError(f"{path}: neither a dataset (dataset.json) nor a run of gaponet train (split.json, config.json)")
 
 
-def _require_newer(there: Index, kind: Kind, contents: tuple[str, ...], address: str) -> None:
+def _require_newer(there: Index | None, kind: Kind, contents: tuple[str, ...], address: str) -> None:
     """Refuse to take the place of what holds something that we do not."""
+    if there is None:
+        return
     lost = len(set(there.contents) - set(contents))
     if there.kind != kind or lost:
         what = (

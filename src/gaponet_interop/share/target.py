@@ -163,7 +163,7 @@ def read_content(target: Target, content: bytes | None) -> Index | None:
     if content is None:
         return None
     where = f"{target.address}: {INDEX}"
-    index = parse_json(Index, content[:LARGEST_INDEX], where, RemoteError, "push it again")
+    index = parse_json(Index, content[:LARGEST_INDEX], where, RemoteError, "push it again, with --replace")
     if index.format > FORMAT:
         raise RemoteError(
             f"{where}: format {index.format} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"

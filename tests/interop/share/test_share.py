@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 
+import pyarrow.parquet as pq
 import pytest
 from logs import arm_sequence, late, wave
 from runs import untrained
@@ -22,6 +23,7 @@ from gaponet_interop.share.bucket import Bucket
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.move import pull, push
 from gaponet_interop.share.target import part_of
+from gaponet_interop.writers import lerobot
 
 pytest.importorskip("huggingface_hub", reason="pip install 'gaponet[hub]'")
 from hub_server import LARGE, FakeHub
@@ -215,6 +217,182 @@ def test_what_earlier_pushes_left_is_pruned_once_it_is_a_day_old(dataset, arm, t
     same(dataset, Dataset(tmp_path / "back"))
 
 
+@pytest.fixture
+def blocks(monkeypatch):
+    """A file holds one recording, a block two."""
+    monkeypatch.setattr(lerobot, "USUAL_MB", 1e-9)
+    monkeypatch.setattr(lerobot, "SHARE", 0.0)
+    monkeypatch.setattr(lerobot, "BLOCK_EPISODES", 2)
+
+
+@pytest.fixture
+def was_read(monkeypatch):
+    """The motions that are read of any dataset, as it goes."""
+    motions, channels = [], Dataset.channels
+    monkeypatch.setattr(
+        Dataset, "channels", lambda self, e, names: motions.append(e.meta.motion) or channels(self, e, names)
+    )
+    return motions
+
+
+def test_what_an_earlier_push_laid_out_is_not_read_again_wherever_it_goes(blocks, was_read, dataset, arm, tmp_path):
+    place, objects = f"file://{tmp_path}/bucket", tmp_path / "bucket" / "sha256"
+    push(dataset.path, place)
+    assert len(was_read) == len(dataset)
+    was_read.clear()
+    push(dataset.path, place)
+    assert was_read == []
+    add(dataset, arm, ["new", "newer", "newest"])
+    before = {file: file.stat().st_mtime_ns for file in objects.iterdir()}
+    push(dataset.path, place)
+    assert was_read == ["new", "newer", "newest"]
+    assert before.items() <= {file: file.stat().st_mtime_ns for file in objects.iterdir()}.items()
+    was_read.clear()
+    notes = dataset.path / "pushed.jsonl"
+    notes.write_text(notes.read_text()[:-40])  # cut short by a kill: its block is laid out again, to the same bytes
+    push(dataset.path, place)
+    assert was_read == ["newest"]
+    push(dataset.path, f"file://{tmp_path}/another")
+    assert len(was_read) == 1 + len(dataset)
+    notes.unlink()
+    push(dataset.path, f"file://{tmp_path}/third")
+    assert len({(tmp_path / name / "gaponet.json").read_text() for name in ("another", "third")}) == 2  # their cards
+    assert {file.name for file in (tmp_path / "another/sha256").iterdir()} ^ {
+        file.name for file in (tmp_path / "third/sha256").iterdir()
+    } == {json.loads((tmp_path / name / "gaponet.json").read_text())["files"]["README.md"]["sha256"]
+          for name in ("another", "third")}  # fmt: skip
+    pull(place, tmp_path / "back")
+    same(dataset, Dataset(tmp_path / "back"))
+
+
+def test_of_a_damaged_file_its_block_alone_is_laid_out_again(blocks, was_read, dataset, tmp_path):
+    push(dataset.path, f"file://{tmp_path}/bucket")
+    was_read.clear()
+    files = json.loads((tmp_path / "bucket" / "gaponet.json").read_text())["files"]
+    name = next(name for name in files if name.endswith("data/chunk-000/file-001.parquet"))
+    (tmp_path / "bucket" / "sha256" / files[name]["sha256"]).write_bytes(b"x" * files[name]["size"])
+    push(dataset.path, f"file://{tmp_path}/bucket")
+    assert was_read == ["wave 0", "wave 1"]
+    pull(f"file://{tmp_path}/bucket", tmp_path / "back")
+    same(dataset, Dataset(tmp_path / "back"))
+
+
+def test_a_pull_into_a_dataset_brings_what_it_lacks_and_touches_nothing_else(
+    blocks, dataset, arm, place, tmp_path, capsys
+):
+    push(dataset.path, place("arm"))
+    back, split = tmp_path / "back", tmp_path / "back" / "splits" / "motion.json"
+    pull(place("arm"), back)
+    assert pull(place("arm"), back).files == 0
+    add(Dataset(back), arm, ["mine"], unit_id="mine")
+    split.write_text("mine")
+    add(dataset, arm, ["new", "newer"])
+    push(dataset.path, place("arm"))
+    moved = pull(place("arm"), back)
+    data = [name for name in (tmp_path / "back" / "sequences").iterdir() if name.name.startswith("new")]
+    assert moved.facts == {"sequences": 2}
+    assert len(data) == 2
+    assert split.read_text() == "mine"
+    assert {e.meta.motion for e in Dataset(back).entries} - {e.meta.motion for e in dataset.entries} == {"mine"}
+    assert main(["pull", place("arm"), str(back)]) == 0
+    assert "nothing is there that" in capsys.readouterr().out
+
+
+def test_the_same_recording_under_another_name_is_the_one_that_is_there(dataset, arm, tmp_path):
+    renamed = Dataset.create(tmp_path / "renamed", arm)
+    for entry in dataset.entries:
+        sequence = dataset.read(entry)
+        renamed.append(replace(sequence, meta=replace(sequence.meta, motion=f"my {entry.meta.motion}")))
+    push(dataset.path, place := f"file://{tmp_path}/bucket")
+    pull(place, tmp_path / "theirs")
+    push(renamed.path, place)
+    assert pull(place, tmp_path / "theirs").files == 0
+    pull(place, tmp_path / "mine")
+    same(dataset, Dataset(tmp_path / "theirs"))
+    same(renamed, Dataset(tmp_path / "mine"))
+
+
+def test_what_was_pushed_before_there_were_blocks_is_pulled(dataset, tmp_path):
+    """One file of meta/episodes, without findings; no offsets beside."""
+    push(dataset.path, place := f"file://{tmp_path}/bucket")
+    bucket, index = tmp_path / "bucket", json.loads((tmp_path / "bucket" / "gaponet.json").read_text())
+    for name in [name for name in index["files"] if "meta/episodes/" in name]:
+        table = pq.read_table(bucket / "sha256" / index["files"][name]["sha256"]).drop_columns("findings")
+        pq.write_table(table, tmp_path / "old")
+        index["files"][name] = vars(part_of(tmp_path / "old"))
+        (tmp_path / "old").rename(bucket / "sha256" / index["files"][name]["sha256"])
+    (bucket / "gaponet.json").write_text(json.dumps(index))
+    pull(place, tmp_path / "back")
+    same(dataset, back := Dataset(tmp_path / "back"))
+    assert all(entry.findings["delay_s"].keys() == {"shoulder", "elbow"} for entry in back.entries)
+
+
+def test_prune_lists_first_and_spares_what_may_be_in_use(dataset, arm, tmp_path, capsys):
+    place, bucket = f"file://{tmp_path}/bucket", tmp_path / "bucket"
+    push(dataset.path, place)
+    first = set((bucket / "sha256").iterdir())
+    add(dataset, arm, ["new"])
+    push(dataset.path, place)
+    assert main(["prune", place, "--json"]) == 0
+    young = json.loads(capsys.readouterr().out)
+    assert young["files"] == []
+    assert young["young"] > 0
+    for file in (bucket / "gaponet.json", *first):
+        os.utime(file, (0, 0))
+    assert main(["prune", place]) == 0
+    assert f"gaponet prune {place} --delete" in " ".join(capsys.readouterr().out.split())
+    assert first <= set((bucket / "sha256").iterdir())
+    assert main(["prune", place, "--delete", "--json"]) == 0
+    gone = json.loads(capsys.readouterr().out)["files"]
+    assert len(gone) == young["young"]
+    assert {file.name for file in first - set((bucket / "sha256").iterdir())} == set(gone)
+    pull(place, tmp_path / "back")
+    same(dataset, Dataset(tmp_path / "back"))
+
+
+@pytest.mark.parametrize("index", [None, 300])
+def test_a_place_without_a_whole_index_is_not_pruned(dataset, tmp_path, capsys, index):
+    push(dataset.path, place := f"file://{tmp_path}/bucket")
+    file = tmp_path / "bucket" / "gaponet.json"
+    file.write_bytes(file.read_bytes()[:index]) if index else file.unlink()
+    capsys.readouterr()
+    assert main(["prune", place, "--delete", "--hours", "0"]) == 2
+    assert capsys.readouterr().err.startswith(f"Remote: {place}: ")
+    with pytest.raises(RemoteError, match=r"gaponet\.json" if index else "nothing was pushed"):
+        pull(place, tmp_path / "back")
+    assert len(list((tmp_path / "bucket" / "sha256").iterdir())) > 9
+    push(dataset.path, place, replace=True)
+    pull(place, tmp_path / "back")
+
+
+def test_what_is_pruned_while_a_push_counts_on_it_is_missed_before_it_is_named(dataset, tmp_path, monkeypatch):
+    push(dataset.path, place := f"file://{tmp_path}/bucket")
+    dataset.state(source="another card")
+    store = Bucket.store
+
+    def meanwhile(self, *given):
+        monkeypatch.setattr(Bucket, "store", store)
+        largest(tmp_path).unlink()
+        return store(self, *given)
+
+    monkeypatch.setattr(Bucket, "store", meanwhile)
+    before = (tmp_path / "bucket" / "gaponet.json").read_bytes()
+    with pytest.raises(RemoteError, match="was removed meanwhile; push again"):
+        push(dataset.path, place)
+    assert (tmp_path / "bucket" / "gaponet.json").read_bytes() == before
+    push(dataset.path, place)
+    pull(place, tmp_path / "back")
+
+
+def test_what_has_had_no_name_for_long_is_sent_again_as_it_may_be_pruned_now(dataset, tmp_path):
+    push(dataset.path, place := f"file://{tmp_path}/bucket")
+    (tmp_path / "bucket" / "gaponet.json").unlink()
+    for file in (tmp_path / "bucket" / "sha256").iterdir():
+        os.utime(file, (0, 0))
+    push(dataset.path, place)
+    assert all(file.stat().st_mtime > 0 for file in (tmp_path / "bucket" / "sha256").iterdir())
+
+
 def test_a_damaged_object_is_mended_by_pushing_again_and_by_replace(dataset, arm, tmp_path):
     address, whole = f"file://{tmp_path}/bucket", {}
     push(dataset.path, address)
@@ -329,7 +507,7 @@ def test_an_index_that_names_a_place_outside_or_twice_is_refused_before_anything
 def test_sequences_that_are_not_those_of_the_index_are_refused(hub, dataset, tmp_path):
     push(dataset.path, "me/arm")
     forge(hub, "datasets/me/arm", lambda files, index: index.update(contents=["0" * 64, *index["contents"][1:]]))
-    with pytest.raises(RemoteError, match="sequences listed are not those of gaponet.json"):
+    with pytest.raises(RemoteError, match=r"sequences listed are not those of gaponet\.json"):
         pull("me/arm", tmp_path / "back")
     assert not (tmp_path / "back").exists()
     assert not (tmp_path / ".gaponet-pull-back").exists()
