@@ -147,9 +147,6 @@ def take_in(pushed: Dataset, robot: RobotSpec, beside: Path, out: Path, progress
     """
     model_hash(robot)  # refused, if it is none
     dataset = Dataset.create(out, robot)
-    stated = {k: str(v) for k, v in pushed.header.items() if k in ("licence", "source")}
-    if not dataset.entries and stated:
-        dataset.state(**stated)
     new = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
     with dataset.appending():
         for done, entry in enumerate(new, 1):

@@ -6,6 +6,7 @@ however many there are. Twins are made in a folder that goes with the object; no
 
 from __future__ import annotations
 
+import hashlib
 import re
 import shutil
 import weakref
@@ -29,7 +30,7 @@ from gaponet_interop.formats.lerobot_set import FEATURES, Set, Stated, sets_unde
 from gaponet_interop.share import dataset as datasets
 from gaponet_interop.share.bucket import Bucket
 from gaponet_interop.share.errors import RemoteError
-from gaponet_interop.share.target import INDEX, Index, download, reaching, read_index
+from gaponet_interop.share.target import INDEX, Index, download, reaching, read_index, written
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -56,8 +57,11 @@ class Pushed(Dataset):
         self._where: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
         with self._told():
             self.robot, self._sets = datasets.pushed_robot(self._files), sets_under(self._files)
-            (folder / "dataset").mkdir(exist_ok=True)
-            made = Dataset.create(folder / "dataset" / index.name, self.robot)
+            state = hashlib.sha256(written(index)).hexdigest()[
+                :16
+            ]  # what a pull of another one left is not gone on with
+            (folder / state).mkdir(exist_ok=True)
+            made = Dataset.create(folder / state / index.name, self.robot)
             for part in self._sets:
                 if part.ours is None:
                     raise RemoteError(f"{part.path}: gaponet did not write this set")
