@@ -101,7 +101,7 @@ class Entry(_Begin):
 
     @property
     def line(self) -> bytes:
-        """As it stands, or will stand, in the journal."""
+        """The bytes of it that stand, or will stand, in the journal."""
         there: tuple[bytes, str] | None = self.__dict__.get("_line")
         return there[0] if there else json.dumps(asdict(self), ensure_ascii=False, allow_nan=False).encode()
 
