@@ -44,7 +44,7 @@ def pull(address: Address, out: Folder, json: Json = False) -> None:
 
 @like(move.prune)
 def prune(address: Address, delete: Flag = False, hours: float = move.HOURS, json: Json = False) -> None:
-    """List files in a bucket that nothing names since a later push, or delete them."""
+    """List, or delete, what earlier pushes left in a bucket."""
     screen = Out(json)
     found = move.prune(address, delete, hours)
     for name in found.files[:SHOWN]:
