@@ -156,7 +156,9 @@ class Response:
     def later(self, seconds: float) -> Response:
         """The same as if the state had been read so much later; what is not known stays so."""
         lags = np.arange(self.cross.shape[-1]) * self.step
-        moved = [np.interp(lags - np.nan_to_num(seconds), lags, x) for x in self.cross.reshape(-1, len(lags))]
+        if not (seconds := np.nan_to_num(seconds)):
+            return self
+        moved = [np.interp(lags - seconds, lags, x) for x in self.cross.reshape(-1, len(lags))]
         return replace(self, cross=np.reshape(moved, self.cross.shape).astype(np.float32))
 
     @classmethod

@@ -250,7 +250,7 @@ def _loads(sequence: Sequence) -> Array | None:
         return None
     slow = np.flatnonzero((np.abs(sequence.qvel) < SLOW).all(axis=1))
     rows = slow[:: max(1, len(slow) // LOADS)]
-    return np.stack([sequence.qpos[rows], sequence.tau[rows]]).astype(float)
+    return np.stack([sequence.qpos[rows], sequence.tau[rows]])
 
 
 def _qvel_gain(sequence: Sequence) -> Array:

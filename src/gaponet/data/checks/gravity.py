@@ -85,7 +85,7 @@ def gravity(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator
 def _best(loads: Loads, robot: RobotSpec, model: Gravity, level: bool) -> _Best:
     """The way of being wrong that explains the torques best; with `level`, but for a constant of each joint."""
     step = max(1, sum(len(qpos) for qpos, _ in loads.values()) // ROWS)
-    loads = {key: (qpos[::step], torque[::step]) for key, (qpos, torque) in loads.items() if len(qpos)}
+    loads = {k: (q[::step].astype(float), t[::step].astype(float)) for k, (q, t) in loads.items() if len(q)}
     as_logged = {key: model(qpos, *key) for key, (qpos, _) in loads.items()}
     weight = np.sqrt(np.mean(np.concatenate(list(as_logged.values())) ** 2, axis=0))  # (n) N·m
     loaded = np.flatnonzero(weight > LOADED * robot.effort_limit)

@@ -38,7 +38,7 @@ ODD = 10  # sequences that are told apart
 
 @dataclass(frozen=True)
 class _Rests:
-    """Fresh rests (k): their sequence and joint, error (rad), columns of the four numbers, and G of 1 kg over kp."""
+    """Fresh rests (k), by sequence: it and joint, error (rad), columns of the four numbers, and G of 1 kg over kp."""
 
     sequence: Array
     joint: Array
@@ -46,9 +46,13 @@ class _Rests:
     columns: Array
     per_kg: Array
 
-    def only(self, keep: Array) -> _Rests:
+    def only(self, keep: Array | slice) -> _Rests:
         """The rests of a mask (k)."""
         return _Rests(*(values[keep] for values in vars(self).values()))
+
+    def of(self, number: int) -> slice:
+        """Where the rests of a sequence are."""
+        return slice(*np.searchsorted(self.sequence, [number, number + 1]))
 
 
 @dataclass(frozen=True)
@@ -107,26 +111,24 @@ def _collect(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> _Rests:
         heavier = np.zeros_like(load)
         if robot.payload_mounts:
             heavier = model(holds.qpos, meta.payload_mass + 1.0, meta.payload_side) / kp - load
-        for j in robot.operated_index:
-            use = holds.fresh[:, j] & (holds.approach[:, j] != 0)
-            ctrl, k = holds.ctrl[use, j], int(use.sum())
-            columns = np.column_stack([np.ones(k), ctrl, -load[use, j], -holds.approach[use, j]])
-            error = holds.qpos[use, j] - ctrl
-            parts.append((np.full(k, number), np.full(k, j), error, columns, -heavier[use, j]))
+        nth, hold = np.nonzero((holds.fresh & (holds.approach != 0))[:, robot.operated_index].T)
+        at = hold, (j := robot.operated_index[nth])
+        columns = np.column_stack([np.ones(len(j)), holds.ctrl[at], -load[at], -holds.approach[at]])
+        parts.append((np.full(len(j), number), j, holds.qpos[at] - holds.ctrl[at], columns, -heavier[at]))
     return _Rests(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _fit(mine: _Rests) -> _Fit:
     """The four numbers of the one joint of these rests."""
     x, formal, scatter = _solve(mine.columns, mine.error)
-    numbers = sorted(set(mine.sequence.tolist()))
-    fold = np.array([numbers.index(s) % FOLDS for s in mine.sequence.tolist()])
+    numbers, place = np.unique(mine.sequence, return_inverse=True)
+    fold = place % FOLDS
     folds = range(min(len(numbers), FOLDS))
     without = {g: _solve(mine.columns[fold != g], mine.error[fold != g])[0] for g in folds}
     every = np.array(list(without.values()))
     jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
     deviation = np.maximum(formal, jackknife) if len(every) > 2 else 3 * formal
-    return _Fit(x, deviation, scatter, {s: without[i % FOLDS] for i, s in enumerate(numbers)})
+    return _Fit(x, deviation, scatter, {s: without[i % FOLDS] for i, s in enumerate(numbers.tolist())})
 
 
 def _solve(columns: Array, error: Array) -> tuple[Array, Array, float]:
@@ -197,19 +199,22 @@ def _two_units(
         mine = found.only(found.joint == j)
         left = mine.error - mine.columns @ _solve(mine.columns, mine.error)[0]
         for number in set(mine.sequence.tolist()):
-            if (mine.sequence == number).sum() > 1:
-                middle[number, column] = np.median(left[mine.sequence == number])
+            if len(own := left[mine.of(number)]) > 1:
+                middle[number, column] = np.median(own)
     told = np.flatnonzero(np.isfinite(middle).all(axis=1))
     best: tuple[int, float, list[str], Array] = (joints - 1, 0.0, [], told[:0])
-    for column in range(len(judged)):
+    for column in range(len(judged)) if len(told) > 2 else ():
         order = told[np.argsort(middle[told, column])]
-        for cut in range(least, len(order) + 1 - least) if len(order) > 2 else ():
-            a, b = middle[order[:cut]], middle[order[cut:]]
-            gap = np.abs(a.mean(axis=0) - b.mean(axis=0))
-            within = np.sqrt((a.var(axis=0) * len(a) + b.var(axis=0) * len(b)) / (len(order) - 2))
-            apart = (gap > UNITS) & (gap > CLEAR * np.maximum(within, 5e-4))
-            names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
-            best = max(best, (len(names), float(gap.max()), names, order[:cut]), key=lambda x: x[:2])
+        cuts = np.arange(least, len(order) + 1 - least)
+        rest = middle[order] - middle[order].mean(axis=0)  # their sum is zero, (N, judged)
+        sums, per = rest.cumsum(axis=0)[cuts - 1], (1 / cuts + 1 / (len(order) - cuts))[:, None]
+        within = np.sqrt(np.maximum((rest**2).sum(axis=0) - sums**2 * per, 0) / (len(order) - 2))
+        gaps = np.abs(sums) * per
+        far = (gaps > UNITS) & (gaps > CLEAR * np.maximum(within, 5e-4))
+        for cut, gap, apart in zip(cuts.tolist(), gaps.max(axis=1).tolist(), far, strict=True):
+            if (int(apart.sum()), gap) > best[:2]:
+                names = [robot.joint_names[j] for j, yes in zip(judged, apart, strict=True) if yes]
+                best = (len(names), gap, names, order[:cut])
     if best[0] < joints:
         return []
     motions = [[surveys[i].motion for i in told if (i in best[3]) == side] for side in (True, False)]
@@ -229,7 +234,7 @@ def _odd_one(surveys: list[Survey], robot: RobotSpec, found: _Rests, judged: lis
     for number in sorted(set(found.sequence.tolist())):
         left, per_kg, apart = [], [], {}
         for j, fit in fits.items():
-            own = by_joint[j].only(by_joint[j].sequence == number)
+            own = by_joint[j].only(by_joint[j].of(number))
             if len(own.error) < 3 or len(by_joint[j].error) - len(own.error) < FEW:
                 continue
             x = fit.without[number]

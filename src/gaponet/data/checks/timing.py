@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -34,9 +35,10 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands and states of one time, and is their clock one clock?"""
     step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
     every = [s for s in surveys if s.response.step == step]
+    found = [*_late(every, each := _operated(every, robot))]
     # Across a hole states are interpolated: they begin to move before anything was measured.
-    same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
-    found, own = [*_late(every, _operated(every, robot))], _operated(same, robot)
+    whole = [s.longest_gap_ms * s.rate_hz / 1e3 <= GAP for s in every]
+    same, own = (list(compress(every, whole)), list(compress(each, whole))) if any(whole) else (every, each)
     odd = {f.values["motion"] for f in found}
     told = Response.following(own, [s.motion not in odd for s in same])
     known = np.isfinite(told.onset)
@@ -90,7 +92,9 @@ def _shifts(own: list[Response]) -> Array:
     found = np.where(np.isfinite(more), 0.0, np.nan)
     for _ in range(ROUNDS if np.isfinite(found).sum() >= FEW else 0):
         away = np.nan_to_num(more - np.nanmedian(more))
-        found = found + np.where(np.abs(away) > LATE / 2, away, 0.0)
+        if not (far := np.abs(away) > LATE / 2).any():
+            break
+        found = found + np.where(far, away, 0.0)
         more = Response.following([r.later(-s) for r, s in zip(own, found, strict=True)]).whole
     return found + np.nan_to_num(more)
 
