@@ -51,3 +51,13 @@ def test_horizons_longer_than_the_motion_are_left_out(robot):
     result = summary(runs([sequence(robot, np.zeros((5, 2)))], [np.ones((5, 2))], robot), robot)
     assert "5" not in result["by_horizon"]
     assert result["by_horizon"]["whole"]["mpjae"] == pytest.approx(1.0)
+
+
+def test_a_summary_looks_at_each_run_once(robot):
+    reals = [sequence(robot, np.eye(4, 2) * k, f"m{k % 2}", k % 2) for k in range(4)]
+    part = runs(reals, [0.9 * s.qpos for s in reals], robot)
+    found = summary(iter(part), robot)
+    assert found == summary(part, robot)
+    assert found["mpjae"] == metrics(part)["mpjae"]
+    assert found["by_motion"] == {m: metrics([r for r in part if r.meta.motion == m]) for m in ("m0", "m1")}
+    assert found["by_joint"] == {j: metrics(part, [i]) for i, j in enumerate(robot.operated)}

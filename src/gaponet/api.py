@@ -166,7 +166,7 @@ def gap(
     entries, simulator = data.select(motions), model_hash(spec)
     pairs = (data.pair(e, simulator) for e in entries)
     return {
-        "methods": {"nominal": summary([Run.of(p.real, p.sim.qpos, spec) for p in pairs], spec)},
+        "methods": {"nominal": summary((Run.of(p.real, p.sim.qpos, spec) for p in pairs), spec)},
         "dataset": data.path.name,
         "sequences": len(entries),
         "hours": sum(e.rows * e.dt for e in entries) / 3600,

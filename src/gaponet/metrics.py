@@ -6,6 +6,8 @@ number is the mean over its sequences.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterable
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +20,7 @@ from gaponet.robot import RobotSpec
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
+Row = dict[str, float]  # metrics of a sequence, or their means
 
 
 def standard_error(values: Array) -> float:
@@ -63,19 +66,25 @@ def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec
     return [Run.of(s, q, robot) for s, q in zip(sequences, simulated, strict=True)]
 
 
-def summary(part: ListOf[Run], robot: RobotSpec) -> dict[str, Any]:
-    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon."""
-    columns = {j: [i] for i, j in enumerate(robot.operated)}
-    by = lambda key: {str(k): metrics([r for r in part if key(r) == k]) for k in sorted({key(r) for r in part})}  # noqa: E731
+def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
+    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time."""
+    joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
     no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
-    total = metrics(part) | {"mpjae_no_wrist": metrics(part, no_wrist)["mpjae"] if no_wrist else float("nan")}
-    return total | {
-        "by_joint": {j: metrics(part, c) for j, c in columns.items()},
-        "by_motion": by(lambda r: r.meta.motion),
-        "by_payload": by(lambda r: f"{r.meta.payload_mass:g}"),
-        "by_unit": by(lambda r: r.meta.unit_id),
-        "by_horizon": _horizon(part),
-    }
+    rows: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for run in part:
+        meta, whole = run.meta, _rows([run])
+        names = {"": "", "motion": meta.motion, "payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
+        for group, name in names.items():
+            rows[group][name] += whole
+        rows["no_wrist"][""] += _rows([run], no_wrist)
+        for j, column in joints.items():
+            rows["joint"][j] += _rows([run], column)
+        for horizon, error in _horizons(run).items():
+            rows["horizon"][horizon].append({"mpjae": error})
+    order = {"joint": joints, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
+    order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
+    total = _mean(rows[""][""]) | {"mpjae_no_wrist": _mean(rows["no_wrist"][""]).get("mpjae", float("nan"))}
+    return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}
 
 
 def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, float]:
@@ -86,13 +95,15 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
         iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
         SAGE and the paper report, tables show the first few).
     """
-    mine = [(r, c) for r in part if (c := r.holds(columns)) is None or c]
-    rows = [_sequence_metrics(r, c) for r, c in mine]
+    return _mean(_rows(part, columns))
+
+
+def _rows(part: ListOf[Run], columns: list[int] | None = None) -> list[Row]:
+    return [_sequence_metrics(r, c) for r in part if (c := r.holds(columns)) is None or c]
+
+
+def _mean(rows: list[Row]) -> Row:
     return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
-
-
-def _slice(run: Run) -> list[int] | slice:
-    return slice(None) if run.recorded is None else list(run.recorded)
 
 
 def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
@@ -126,19 +137,11 @@ def _mean_correlation(real: Array, sim: Array) -> float:
     return float(np.mean(values)) if values else 1.0
 
 
-def _horizon(part: ListOf[Run]) -> dict[str, dict[str, float]]:
-    """mpjae at a time after the common start, averaged over sequences that last so long; and over the whole motion.
+def _horizons(run: Run) -> Row:
+    """mpjae at times after the common start, as far as the motion lasts; and over the whole motion.
 
     The error at a horizon is that of the steps in its last half, so that one frame does not decide.
     """
-    out = {}
-    for seconds in HORIZONS_S:
-        values = []
-        for run in part:
-            last = max(round(seconds / run.dt), 1)
-            if len(run.error) >= last:
-                values.append(np.abs(run.error[last // 2 : last][:, _slice(run)]).mean())
-        if values:
-            out[f"{seconds:g}"] = {"mpjae": float(np.mean(values))}
-    out["whole"] = {"mpjae": float(np.mean([np.abs(r.error[:, _slice(r)]).mean() for r in part]))}
-    return out
+    error = np.abs(run.error if run.recorded is None else run.error[:, list(run.recorded)])
+    lasts = {f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)}
+    return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {"whole": error.mean()}

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from gaponet.data.signals import differentiate, estimate_delay, fast_speed, lowpass, resample_linear, resample_zoh
+from gaponet.data.signals import (
+    Response,
+    differentiate,
+    estimate_delay,
+    fast_speed,
+    lowpass,
+    resample_linear,
+    resample_zoh,
+)
 
 TIME = np.array([0.0, 0.1, 0.4])
 VALUES = np.array([[0.0], [1.0], [4.0]])
@@ -86,3 +94,10 @@ def test_fast_speed_is_what_a_joint_does_in_its_fastest_twentieth():
     ctrl = np.zeros((101, 1))
     ctrl[90:, 0] = 2.0 * DT * np.arange(11)
     assert fast_speed(ctrl, DT)[0] == pytest.approx(2.0)
+
+
+def test_a_response_that_is_not_late_stays_as_it_is():
+    found = Response.of(*np.random.default_rng(0).normal(size=(2, 400, 2)).cumsum(axis=1), 0.02)
+    assert found.later(0.0) is found
+    assert found.later(float("nan")) is found
+    assert not np.array_equal(found.later(0.02).cross, found.cross)
