@@ -20,7 +20,7 @@ from gaponet.robot import RobotSpec
 
 THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
 HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
-Row = dict[str, float]  # metrics of a sequence, or their means
+_Row = dict[str, float]  # metrics of a sequence, or their means
 
 
 def standard_error(values: Array) -> float:
@@ -70,15 +70,15 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
     """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time."""
     joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
     no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
-    rows: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
     for run in part:
-        meta, whole = run.meta, _rows([run])
+        meta, whole = run.meta, _row(run)
         names = {"": "", "motion": meta.motion, "payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
         for group, name in names.items():
             rows[group][name] += whole
-        rows["no_wrist"][""] += _rows([run], no_wrist)
+        rows["no_wrist"][""] += _row(run, no_wrist)
         for j, column in joints.items():
-            rows["joint"][j] += _rows([run], column)
+            rows["joint"][j] += _row(run, column)
         for horizon, error in _horizons(run).items():
             rows["horizon"][horizon].append({"mpjae": error})
     order = {"joint": joints, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
@@ -95,19 +95,18 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
         iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
         SAGE and the paper report, tables show the first few).
     """
-    return _mean(_rows(part, columns))
+    return _mean([row for run in part for row in _row(run, columns)])
 
 
-def _rows(part: ListOf[Run], columns: list[int] | None = None) -> list[Row]:
-    return [_sequence_metrics(r, c) for r in part if (c := r.holds(columns)) is None or c]
-
-
-def _mean(rows: list[Row]) -> Row:
+def _mean(rows: list[_Row]) -> _Row:
     return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
 
 
-def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
-    c = slice(None) if columns is None else columns
+def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
+    """One sequence's metrics over these columns; none where it holds none of them."""
+    if (held := run.holds(columns)) == []:
+        return []
+    c = slice(None) if held is None else held
     error = run.error[:, c].astype(float)
     size = np.abs(error)
     real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
@@ -127,7 +126,7 @@ def _sequence_metrics(run: Run, columns: list[int] | None) -> dict[str, float]:
         ).mean(),
         "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
     }
-    return out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}
+    return [out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}]
 
 
 def _mean_correlation(real: Array, sim: Array) -> float:
@@ -137,7 +136,7 @@ def _mean_correlation(real: Array, sim: Array) -> float:
     return float(np.mean(values)) if values else 1.0
 
 
-def _horizons(run: Run) -> Row:
+def _horizons(run: Run) -> _Row:
     """mpjae at times after the common start, as far as the motion lasts; and over the whole motion.
 
     The error at a horizon is that of the steps in its last half, so that one frame does not decide.

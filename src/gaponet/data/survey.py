@@ -69,7 +69,7 @@ class Survey:
         step: Steps in which positions are told, (n) rad; 0 where they are fine, or too few to tell.
         torque: None where no torque was recorded.
         holds: Rests.
-        response: When joints move after their commands (data.signals). spectra: Of command and state, (2, H).
+        response: When operated joints move after their commands (data.signals). spectra: Of command and state, (2, H).
         beside: How far the nearest state is from the command of up to MAX_LAG_S ago, over that state's spread, (n); NaN
             where the joint does not move.
         as_velocity, as_torque: Correlation of the command with the measured velocity and torque, (n).
@@ -156,7 +156,7 @@ class Survey:
             step=_step(qpos),
             torque=_torque(sequence, robot),
             holds=Holds.of(sequence, robot.operated_index),
-            response=Response.of(ctrl, qpos, dt),
+            response=Response.of(ctrl[:, robot.operated_index], qpos[:, robot.operated_index], dt),
             spectra=np.stack([_spectrum(ctrl, dt), _spectrum(qpos, dt)]).astype(np.float32),
             **_kind(sequence),
             halted_s=_halted(ctrl, qpos, dt),
@@ -279,8 +279,7 @@ def _frozen(sequence: Sequence) -> float:
     same = np.all([(np.diff(x, axis=0) == 0).all(axis=1) for x in state if x is not None], axis=0)
     late = round(MAX_LAG_S / 2 / sequence.dt)
     asked = lambda r: np.ptp(sequence.ctrl[r.start : max(r.stop - late, r.start) + 1], axis=0).max()  # noqa: E731
-    told = [r for r in _runs(same) if asked(r) > FROZEN_CHANGE]
-    return max((r.stop - r.start for r in told), default=0) * sequence.dt
+    return max((r.stop - r.start for r in _runs(same) if asked(r) > FROZEN_CHANGE), default=0) * sequence.dt
 
 
 def _stopped(ctrl: Array, qpos: Array, dt: float) -> Array:

@@ -58,8 +58,7 @@ class Looked:
         self._every = 1 + int(RATE * 3600 * dataset.hours() / SAMPLE)
         code = [p.read_bytes() for p in sorted(Path(__file__).parents[1].rglob("*.py"))]
         code += [(Path(__file__).parents[2] / "sim" / "dynamics.py").read_bytes(), np.__version__.encode()]
-        names = (f.name for f in fields(robot) if f.name not in PLACES)
-        known = [np.asarray(getattr(robot, name)).tolist() for name in names]
+        known = [np.asarray(getattr(robot, f.name)).tolist() for f in fields(robot) if f.name not in PLACES]
         self._from = hashlib.sha256(b"\0".join([*code, repr((known, simulator, self.stands)).encode()]))
         self.sample: list[Standing] = []
 
@@ -167,8 +166,7 @@ def _leaves(found: object, within: str = "") -> Iterator[tuple[str, Any]]:
 
 def _unpacked(content: bytes) -> dict[str, Any]:
     """Arrays by name, views of the bytes."""
-    head, found = json.loads(content[: (at := content.index(b"\n"))]), {}
-    at += 1
+    head, found = json.loads(content[: (at := content.index(b"\n") + 1)]), {}
     for name, (kind, shape) in head.items():
         values = np.frombuffer(content, kind, int(np.prod(shape)), at).reshape(shape)
         found[name], at = values if shape else values.item(), at + values.nbytes

@@ -39,7 +39,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         f"{every.min() / period:.0f} to {every.max() / period:.0f} control periods; the operator's history must span it"
     )
     own, sharp = _servo_lag(robot), Response.sharp([s.response for s in surveys])
-    jumps = dict(zip(robot.joint_names, sharp, strict=True))
+    jumps = dict(zip(robot.operated, sharp, strict=True))
     asked = [name for name in found if name in robot.operated and not jumps[name]]  # of others `timing` sees more
     extra = {name: float(np.median(found[name])) - own[name] for name in asked}
     usual = float(np.median(list(extra.values()))) if extra else 0.0

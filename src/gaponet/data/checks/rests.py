@@ -51,7 +51,6 @@ class _Rests:
         return _Rests(*(values[keep] for values in vars(self).values()))
 
     def of(self, number: int) -> slice:
-        """Where the rests of a sequence are."""
         return slice(*np.searchsorted(self.sequence, [number, number + 1]))
 
 
@@ -123,8 +122,7 @@ def _fit(mine: _Rests) -> _Fit:
     x, formal, scatter = _solve(mine.columns, mine.error)
     numbers, place = np.unique(mine.sequence, return_inverse=True)
     fold = place % FOLDS
-    folds = range(min(len(numbers), FOLDS))
-    without = {g: _solve(mine.columns[fold != g], mine.error[fold != g])[0] for g in folds}
+    without = {g: _solve(mine.columns[fold != g], mine.error[fold != g])[0] for g in range(min(len(numbers), FOLDS))}
     every = np.array(list(without.values()))
     jackknife = np.sqrt((len(every) - 1) / len(every) * ((every - every.mean(axis=0)) ** 2).sum(axis=0))
     deviation = np.maximum(formal, jackknife) if len(every) > 2 else 3 * formal

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
@@ -35,12 +33,11 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are commands and states of one time, and is their clock one clock?"""
     step = Counter(s.response.step for s in surveys).most_common(1)[0][0]
     every = [s for s in surveys if s.response.step == step]
-    found = [*_late(every, each := _operated(every, robot))]
     # Across a hole states are interpolated: they begin to move before anything was measured.
-    whole = [s.longest_gap_ms * s.rate_hz / 1e3 <= GAP for s in every]
-    same, own = (list(compress(every, whole)), list(compress(each, whole))) if any(whole) else (every, each)
+    same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
+    found = [*_late(every)]
     odd = {f.values["motion"] for f in found}
-    told = Response.following(own, [s.motion not in odd for s in same])
+    told = Response.following([s.response for s in same], [s.motion not in odd for s in same])
     known = np.isfinite(told.onset)
     onset = float(np.median(told.onset[known])) if known.any() else np.nan
     onset = max(onset, 0.0) if known.any() and np.median(told.early[known]) < EARLY else onset
@@ -74,11 +71,6 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield from found or [Finding("ok", "timing", "commands and states keep one time")]
 
 
-def _operated(surveys: list[Survey], robot: RobotSpec) -> list[Response]:
-    op, fields = robot.operated_index, ("own", "cross", "power")
-    return [replace(s.response, **{f: getattr(s.response, f)[:, op] for f in fields}) for s in surveys]
-
-
 def _scatter(away: Array) -> float:
     """Standard error of a median from which values are so far away; those unknown do not count."""
     known = np.abs(away[np.isfinite(away)])
@@ -99,8 +91,8 @@ def _shifts(own: list[Response]) -> Array:
     return found + np.nan_to_num(more)
 
 
-def _late(surveys: list[Survey], own: list[Response]) -> Iterator[Finding]:
-    away = _shifts(own)
+def _late(surveys: list[Survey]) -> Iterator[Finding]:
+    away = _shifts([s.response for s in surveys])
     if np.isfinite(away).sum() < FEW:
         return
     away = away - np.nanmedian(away)
