@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -87,6 +88,7 @@ else:
         MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
+EACH = 16  # simulations a thread: with fewer, threads wait for each other longer than they step
 UNDER_WAY = (0.05, 0.1)  # rad, s: a joint stays behind its ramp by no more
 
 
@@ -137,7 +139,8 @@ class BatchSim:
         locked: tuple[str, ...] = (),
         law: bool = False,
     ) -> None:
-        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
+        """Make a simulation for each of `conditions`; nthread 0 uses all cores, where there are EACH for every one of
+        them; n counts joints that are not locked.
 
         With `law` the servo's law is there to be written to, though the robot has none.
         """
@@ -150,7 +153,8 @@ class BatchSim:
         stiffer = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._stiffer = np.array([stiffer[c] for c in conditions])
         self._kd = np.array([robots[c].kd for c in conditions])
-        self.batch = Batch(first, nsim=len(conditions), nthread=nthread)
+        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // EACH))
+        self.batch = Batch(first, nsim=len(conditions), nthread=threads)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])
         self.num_envs = len(conditions)

@@ -29,7 +29,7 @@ from gaponet.sim.servo import friction_limit, present, servo_torque
 try:
     jitable = import_module("numba.extending").register_jitable  # an extra, eight times as fast as numpy
     jitable(servo.passing_friction), jitable(servo.resting_friction)
-    advance: Any = import_module("numba").njit(cache=True, nogil=True)(servo.advance)  # anew when servo.py changes
+    advance: Any = import_module("numba").njit(cache=True, nogil=True, error_model="numpy")(servo.advance)  # anew when servo.py changes
 except ImportError:
     advance = None
 
@@ -269,8 +269,8 @@ def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
     own = {"effort_limit": runs.robot.effort_limit[runs.op]}
     packed = np.stack([np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL], axis=-1)
     law = any(values[f].any() for f in LAW if f in values)
-    out = np.zeros((k * n * windows, runs.counted.shape[1]), np.float32)
-    cuts = np.linspace(0, len(out), runs.nthread + 1).astype(int)
+    out = np.zeros((k, n * windows, runs.counted.shape[1]), np.float32)
+    cuts = np.linspace(0, n * windows, runs.nthread + 1).astype(int)
     rest = (packed, law, runs.tables, runs.ctrl, runs.qpos, runs.qvel, runs.touch, runs.lengths, runs.stiffer, runs.kd,
             runs.stops, runs.dt, runs.count, runs.thin, out)  # fmt: skip
     with ThreadPoolExecutor(runs.nthread) as pool:

@@ -66,56 +66,57 @@ def advance(
     first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
     lengths: Any, stiffer: Any, kd: Any, stops: Any, dt: float, count: int, thin: int, out: Any,
 ) -> None:  # fmt: skip
-    """Fill rows `first` to `last` of out (k·n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them.
+    """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them.
 
-    numba compiles this; it stands here since a compiled function is made anew when its own file changes, and no other.
+    Candidates take each step side by side: none waits for its own last one. numba compiles this; it stands here since a
+    compiled function is made anew when its own file changes, and no other.
     """
-    n, windows = qpos.shape[:2]
-    h = dt / count
+    k, windows, h = len(values), qpos.shape[1], dt / count
+    row, share = np.empty((count, k), np.int64), np.empty((count, k))
     for item in range(first, last):
-        c, j, p = item // (n * windows), item // windows % n, item % windows
-        kp, own, dry, mass = values[c, j, 0] * stiffer[p, j], values[c, j, 1], values[c, j, 2], values[c, j, 3]
-        offset, delay, limit = values[c, j, 4], values[c, j, 5] / dt, values[c, j, 6]
-        rest, speed = values[c, j, 7], max(values[c, j, 8], SLOWEST)
-        by_motor, by_load = values[c, j, 9], values[c, j, 10]
-        least, step = values[c, j, 11], values[c, j, 12]
-        brake = max(kd[p, j] + min(own, 0.0), 0.0)
-        own = max(own, 0.0)
-        q, w = float(qpos[j, p, 0]), float(qvel[j, p, 0])
-        rows = lengths[p]
+        j, p = item // windows, item % windows
+        v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
+        kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
+        rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
+        brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
+        for part in range(count):  # the command in force; a part of each where it changes on the way
+            late = part / count - v[5] / dt
+            row[part] = np.floor(late).astype(np.int64)
+            share[part] = np.maximum((late - row[part] - 1) * count + 1, 0.0)
+        q, w = np.full(k, float(qpos[j, p, 0])), np.full(k, float(qvel[j, p, 0]))
         for t in range(rows - 1):
-            inertia, weight, pull = tables[0, j, p, t] + mass, tables[1, j, p, t], tables[2, j, p, t]
-            slope = tables[3, j, p, t]
-            turn = h / (inertia + h * (own + brake))
+            inertia, weight = tables[0, j, p, t], tables[1, j, p, t]
+            pull, slope = tables[2, j, p, t], tables[3, j, p, t]
             for part in range(count):
-                at = t + part / count - delay  # the command in force; a part of each where it changes on the way
-                row = int(np.floor(at))
-                share = max((at - row - 1) * count + 1, 0.0)
-                aim = (1 - share) * ctrl[j, p, min(max(row, 0), rows - 1)]
-                aim += share * ctrl[j, p, min(max(row + 1, 0), rows - 1)]
-                load = slope * q + weight
-                if law:
-                    read = np.round(q / step) * step if step > 0 else q
-                    torque = kp * (aim + offset - read)
-                    if least > 0:
-                        torque = np.copysign(max(abs(torque), least), torque) if abs(torque) > 0.5 * step * kp else 0.0
-                    torque = min(max(torque - brake * w, -limit), limit)
-                    most = dry + passing_friction(by_motor, by_load, torque, load)
-                    if rest > 0:
-                        most += resting_friction(np.exp, rest, speed, w)
-                else:
-                    torque, most = min(max(kp * (aim + offset - q) - brake * w, -limit), limit), dry
-                net = torque - load - pull - own * w
-                w += turn * (net + min(max(-inertia / h * w - net, -most), most))
-                q += h * w
-                if q < stops[j, 0]:
-                    q, w = stops[j, 0], max(w, 0.0)
-                elif q > stops[j, 1]:
-                    q, w = stops[j, 1], min(w, 0.0)
+                for c in range(k):
+                    heavy, at = inertia + mass[c], t + row[part, c]
+                    aim = (1 - share[part, c]) * ctrl[j, p, min(max(at, 0), rows - 1)] + offset[c]
+                    aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
+                    load = slope * q[c] + weight
+                    if law:
+                        read = np.round(q[c] / step[c]) * step[c] if step[c] > 0 else q[c]
+                        torque = kp[c] * (aim - read)
+                        if least[c] > 0:
+                            turns = abs(torque) > 0.5 * step[c] * kp[c]
+                            torque = np.copysign(max(abs(torque), least[c]), torque) if turns else 0.0
+                        torque = min(max(torque - brake[c] * w[c], -limit[c]), limit[c])
+                        most = dry[c] + passing_friction(by_motor[c], by_load[c], torque, load)
+                        if rest[c] > 0:
+                            most += resting_friction(np.exp, rest[c], speed[c], w[c])
+                    else:
+                        torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], -limit[c]), limit[c]), dry[c]
+                    net = torque - load - pull - own[c] * w[c]
+                    net += min(max(-heavy / h * w[c] - net, -most), most)
+                    w[c] += h / (heavy + h * (own[c] + brake[c])) * net
+                    q[c] += h * w[c]
+                    if q[c] < stops[j, 0]:
+                        q[c], w[c] = stops[j, 0], max(w[c], 0.0)
+                    elif q[c] > stops[j, 1]:
+                        q[c], w[c] = stops[j, 1], min(w[c], 0.0)
             if touch[p, t + 1]:  # goes on from the recording
-                q, w = float(qpos[j, p, t + 1]), float(qvel[j, p, t + 1])
+                q[:], w[:] = qpos[j, p, t + 1], qvel[j, p, t + 1]
             if (t + 1) % thin == 0:
-                out[item, (t + 1) // thin] = q - qpos[j, p, t + 1]
+                out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
 
 
 class ServoLaw:
