@@ -12,7 +12,7 @@ Array = np.ndarray
 
 def library(x: Any) -> Any:
     """The module, numpy or torch, that an array is of."""
-    return import_module(type(x).__module__.partition(".")[0])
+    return np if isinstance(x, np.ndarray) else import_module(type(x).__module__.partition(".")[0])
 
 
 def like(x: Any, values: Any) -> Any:

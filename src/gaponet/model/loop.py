@@ -49,8 +49,10 @@ class DeltaLoop:
         self.bound = network.bind(num_envs) if network else nothing
         x = self.x = self.bound.x
         self.history = History(config, n, x)
-        self._now, self._mass = [x[:, part] for part in (at.q, at.v, at.action)], x[:, at.payload.start]
+        self._q, self._v, self._action = (x[:, part] for part in (at.q, at.v, at.action))
+        self._mass, self._most = x[:, at.payload.start], config.payload_max if config.payload_input else None
         self._host, self._xp = isinstance(x, np.ndarray), library(x)
+        self._shapes = [(num_envs, n), *([(n,)] if num_envs == 1 else [])]
         self.low, self.high = (
             np.array(side[None], float) if self._host else x.new_tensor(side) for side in np.transpose(qpos_range)
         )
@@ -87,13 +89,11 @@ class DeltaLoop:
             payload_mass: kg, one number or (num_envs,).
         """
         if self.any_fresh:
-            new = self.fresh.copy()
-            self.begin(new, *(values[new][:, None] for values in (qpos, qvel, ctrl)))
-        for place, values in zip(self._now, (qpos, qvel, ctrl), strict=True):
-            place[...] = values
+            self.begin(self.fresh.copy(), *(x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl)))
+        self._q[...], self._v[...], self._action[...] = qpos, qvel, ctrl
         self.history.write()
-        if self.config.payload_input:
-            self._mass[...] = payload_mass / self.config.payload_max
+        if self._most is not None:
+            self._mass[...] = payload_mass / self._most
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
@@ -115,9 +115,8 @@ class DeltaLoop:
         q, v, a = self._rows(qpos, qvel, ctrl)
         self.observe(q, v, a, payload_mass)
         self.bound.run()
-        free = a + self.bound.delta
-        self.applied = self._xp.minimum(self._xp.maximum(free, self.low), self.high)
-        self.push(q, v, self.applied)
+        self.applied = self._xp.minimum(self._xp.maximum(a + self.bound.delta, self.low), self.high)
+        self.history.push(None, None, self.applied)
         return (self.applied - a).reshape(ctrl.shape if hasattr(ctrl, "shape") else np.shape(ctrl))
 
     def solve(
@@ -144,9 +143,7 @@ class DeltaLoop:
 
     def _rows(self, *given: Any) -> tuple[Any, ...]:
         rows = tuple(map(np.asarray, given)) if self._host else given
-        if self.num_envs == 1 and rows[0].ndim == 1:
-            rows = tuple([values[None] for values in rows])
-        if not rows[0].shape == rows[1].shape == rows[2].shape == self.applied.shape:
+        if not rows[0].shape == rows[1].shape == rows[2].shape or rows[0].shape not in self._shapes:
             q, v, a = (tuple(np.shape(values)) for values in given)
             raise UsageError(
                 f"delta: qpos {q}, qvel {v}, ctrl {a}; give the {self.n} operated joints of {self.num_envs} robots "

@@ -50,12 +50,12 @@ class History:
         self.n = n
         self.depth = (config.history - 1) * config.stride + 1
         self.picked = slice(0, self.depth, config.stride)  # newest first
-        self.place = x[:, layout.past]
+        self.place, self.present = x[:, layout.past], x[:, layout.state]
         self.inside = config.stride == 1
         held = self.place if self.inside else zeros_like(x, len(x), 3 * n * self.depth)
         self.frames = held.reshape(len(x), self.depth, 3 * n)  # a view, of a slice of columns too
-        self.newest = tuple(self.frames[:, 0, part : part + n] for part in (0, n, 2 * n))
-        self.older, self.younger = self.frames[:, 1:], self.frames[:, :-1]
+        self.state, self.target = held[:, : 2 * n], held[:, 2 * n : 3 * n]  # of the newest
+        self.older, self.younger, self.host = held[:, 3 * n :], held[:, : -3 * n], isinstance(x, np.ndarray)
 
     def reset(self, ids: Any, qpos: Any, qvel: Any, u: Any) -> None:
         """Fill histories from real frames before the start, never with zeros.
@@ -70,11 +70,14 @@ class History:
         self.frames[ids, :, 2 * n :] = u
 
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
-        """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each."""
-        if self.depth > 1:
-            self.older[...] = copy_of(self.younger)  # torch would overwrite what it has yet to read
-        for place, values in zip(self.newest, (qpos, qvel, u), strict=True):
-            place[...] = values
+        """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each; None,
+        None is the state that x shows."""
+        self.older[...] = self.younger if self.host else copy_of(self.younger)  # torch would overwrite what it reads
+        if qpos is None:
+            self.state[...] = self.present
+        else:
+            self.state[:, : self.n], self.state[:, self.n :] = qpos, qvel
+        self.target[...] = u
 
     def write(self) -> None:
         """Bring x up to date."""

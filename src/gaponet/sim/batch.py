@@ -88,7 +88,6 @@ else:
         MODEL_FIELDS = {n for n in dir(mujoco.MjModel) if n[0] != "_"} | {f"opt.{n}" for n in dir(mujoco.MjOption)}
 
 
-EACH = 16  # simulations a thread: with fewer, threads wait for each other longer than they step
 UNDER_WAY = (0.05, 0.1)  # rad, s: a joint stays behind its ramp by no more
 
 
@@ -139,8 +138,7 @@ class BatchSim:
         locked: tuple[str, ...] = (),
         law: bool = False,
     ) -> None:
-        """Make a simulation for each of `conditions`; nthread 0 uses all cores, where there are EACH for every one of
-        them; n counts joints that are not locked.
+        """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
 
         With `law` the servo's law is there to be written to, though the robot has none.
         """
@@ -153,7 +151,7 @@ class BatchSim:
         stiffer = {c: r.kp / np.where(robot.kp > 0, robot.kp, 1.0) for c, r in robots.items()}
         self._stiffer = np.array([stiffer[c] for c in conditions])
         self._kd = np.array([robots[c].kd for c in conditions])
-        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // EACH))
+        threads = nthread or max(1, min(os.cpu_count() or 1, len(conditions) // 16))  # of fewer each most is waiting
         self.batch = Batch(first, nsim=len(conditions), nthread=threads)
         # Model fields that differ between conditions, each (num_envs, …): a row may be copied over another's.
         self.fields = expand_differences(self.batch, [self.models[c] for c in conditions])

@@ -29,7 +29,7 @@ from gaponet.sim.servo import friction_limit, present, servo_torque
 try:
     jitable = import_module("numba.extending").register_jitable  # an extra, eight times as fast as numpy
     jitable(servo.passing_friction), jitable(servo.resting_friction)
-    advance: Any = import_module("numba").njit(cache=True, nogil=True, error_model="numpy")(servo.advance)  # anew when servo.py changes
+    advance: Any = import_module("numba").njit(cache=True, nogil=True, error_model="numpy")(servo.advance)
 except ImportError:
     advance = None
 
@@ -264,8 +264,7 @@ class _Along:
 
 def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
     """The runs of candidates, shared by threads."""
-    assert advance is not None
-    k, (n, windows), run = len(values["kp"]), runs.qpos.shape[:2], advance
+    k, (n, windows) = len(values["kp"]), runs.qpos.shape[:2]
     own = {"effort_limit": runs.robot.effort_limit[runs.op]}
     packed = np.stack([np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL], axis=-1)
     law = any(values[f].any() for f in LAW if f in values)
@@ -274,7 +273,7 @@ def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
     rest = (packed, law, runs.tables, runs.ctrl, runs.qpos, runs.qvel, runs.touch, runs.lengths, runs.stiffer, runs.kd,
             runs.stops, runs.dt, runs.count, runs.thin, out)  # fmt: skip
     with ThreadPoolExecutor(runs.nthread) as pool:
-        list(pool.map(lambda a, b: run(a, b, *rest), cuts[:-1].tolist(), cuts[1:].tolist()))
+        list(pool.map(lambda a, b: advance(a, b, *rest), cuts[:-1].tolist(), cuts[1:].tolist()))
     return out.reshape(k, n, windows, -1)
 
 

@@ -72,27 +72,24 @@ def advance(
     compiled function is made anew when its own file changes, and no other.
     """
     k, windows, h = len(values), qpos.shape[1], dt / count
-    row, share = np.empty((count, k), np.int64), np.empty((count, k))
     for item in range(first, last):
         j, p = item // windows, item % windows
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
         kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
         rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
         brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
-        for part in range(count):  # the command in force; a part of each where it changes on the way
-            late = part / count - v[5] / dt
-            row[part] = np.floor(late).astype(np.int64)
-            share[part] = np.maximum((late - row[part] - 1) * count + 1, 0.0)
+        late = np.arange(count).reshape(-1, 1) / count - v[5] / dt  # a part of each command where it changes on the way
+        row = np.floor(late).astype(np.int64)
+        share = np.maximum((late - row - 1) * count + 1, 0.0)
         q, w = np.full(k, float(qpos[j, p, 0])), np.full(k, float(qvel[j, p, 0]))
         for t in range(rows - 1):
-            inertia, weight = tables[0, j, p, t], tables[1, j, p, t]
-            pull, slope = tables[2, j, p, t], tables[3, j, p, t]
+            here = tables[:, j, p, t]  # inertia, weight, pull, slope
             for part in range(count):
                 for c in range(k):
-                    heavy, at = inertia + mass[c], t + row[part, c]
+                    heavy, at = here[0] + mass[c], t + row[part, c]
                     aim = (1 - share[part, c]) * ctrl[j, p, min(max(at, 0), rows - 1)] + offset[c]
                     aim += share[part, c] * ctrl[j, p, min(max(at + 1, 0), rows - 1)]
-                    load = slope * q[c] + weight
+                    load = here[3] * q[c] + here[1]
                     if law:
                         read = np.round(q[c] / step[c]) * step[c] if step[c] > 0 else q[c]
                         torque = kp[c] * (aim - read)
@@ -105,7 +102,7 @@ def advance(
                             most += resting_friction(np.exp, rest[c], speed[c], w[c])
                     else:
                         torque, most = min(max(kp[c] * (aim - q[c]) - brake[c] * w[c], -limit[c]), limit[c]), dry[c]
-                    net = torque - load - pull - own[c] * w[c]
+                    net = torque - load - here[2] - own[c] * w[c]
                     net += min(max(-heavy / h * w[c] - net, -most), most)
                     w[c] += h / (heavy + h * (own[c] + brake[c])) * net
                     q[c] += h * w[c]
