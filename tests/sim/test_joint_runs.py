@@ -46,6 +46,15 @@ def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
         np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
 
 
+def test_candidates_side_by_side_are_those_one_by_one(tmp_path):
+    robot = write_arm(tmp_path)
+    runs = JointRuns(recordings(robot, 2, rows=60, kp=0.7), robot)
+    law = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "min_torque": 0.1}
+    values = {f: v * np.linspace(0.5, 1.5, 6).reshape(3, 2) for f, v in (FIRST | {"delay": 0.013} | law).items()}
+    alone = [runs.errors({f: v[i : i + 1] for f, v in values.items()})[0] for i in range(3)]
+    np.testing.assert_array_equal(runs.errors(values), alone)
+
+
 def test_recordings_at_several_gains_have_one_servo(tmp_path):
     robot = write_arm(tmp_path)
     told = []
