@@ -128,7 +128,7 @@ def test_velocities_where_position_targets_should_be_are_an_error(arm, tmp_path)
 @pytest.mark.parametrize(("odd", "check", "words"), [
     (lambda i, q: np.stack([np.interp(np.arange(len(q)) * 1.003, np.arange(len(q)), c) for c in q.T], axis=1),
      "clock", "each recording follows its commands sooner"),
-    (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 follows its commands"),
+    (lambda i, q: late(q, 3) if i == 2 else q, "lag", "m2 (a, 0 kg) follows its commands"),
 ], ids=["clocks that drift", "one late recording"])  # fmt: skip
 def test_times_that_do_not_belong_together_are_found_and_others_are_left_alone(arm, tmp_path, odd, check, words):
     logs = [(f"m{i}", *lively(i)) for i in range(5)]

@@ -51,6 +51,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 Law = dict[str, Any]  # name of a term → values that broadcast to the joints
 """
 SERVOS = re.compile(r"\s*<actuator>.*?</actuator>", re.DOTALL)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding
+from gaponet.data.checks.finding import Finding, some
 from gaponet.data.signals import Response
 from gaponet.data.survey import HERTZ, Survey
 from gaponet.robot import RobotSpec
@@ -36,8 +36,8 @@ def _timing(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     # Across a hole states are interpolated: they begin to move before anything was measured.
     same = [s for s in every if s.longest_gap_ms * s.rate_hz / 1e3 <= GAP] or every
     found = [*_late(every)]
-    odd = {f.values["motion"] for f in found}
-    told = Response.following([s.response for s in same], [s.motion not in odd for s in same])
+    odd = {recording for f in found for recording in f.values["recordings"]}
+    told = Response.following([s.response for s in same], [s.entry.id not in odd for s in same])
     known = np.isfinite(told.onset)
     onset = float(np.median(told.onset[known])) if known.any() else np.nan
     onset = max(onset, 0.0) if known.any() and np.median(told.early[known]) < EARLY else onset
@@ -97,13 +97,20 @@ def _late(surveys: list[Survey]) -> Iterator[Finding]:
         return
     away = away - np.nanmedian(away)
     usual = max(1.48 * float(np.nanmedian(np.abs(away))), 1e-3)
-    for s, late in zip(surveys, away.tolist(), strict=True):
-        if abs(late) > max(LATE, FAR * usual):
+    far = [(s, late) for s, late in zip(surveys, away.tolist(), strict=True) if abs(late) > max(LATE, FAR * usual)]
+    for word, these in (("later", [f for f in far if f[1] > 0]), ("sooner", [f for f in far if f[1] < 0])):
+        alone = len(these) < FEW
+        for part in [[one] for one in these] if alone else [these]:
+            which = [f"{s.motion} ({s.entry.meta.unit_id}, {s.entry.meta.payload_mass:g} kg)" for s, _ in part]
+            ms = sorted(abs(late) * 1e3 for _, late in part)
+            by = f"{ms[0]:.0f} ms" if alone else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
-                f"{s.motion} follows its commands {abs(late) * 1e3:.0f} ms {'later' if late > 0 else 'sooner'} than "
-                "the other recordings: clocks of command and state that are apart, or another servo; leave it out"
+                f"{some(which)} {'follows its' if alone else 'follow their'} commands {by} {word} than the other "
+                "recordings: clocks of command and state that are apart, another servo, or friction in slow motions; "
+                "leave them out if it is the clocks"
             )
-            yield Finding("warning", "lag", text, (), {"motion": s.motion, "late_s": late})
+            values = {"recordings": [s.entry.id for s, _ in part], "late_s": [late for _, late in part]}
+            yield Finding("warning", "lag", text, (), values)
 
 
 def _drift(surveys: list[Survey], shifts: np.ndarray) -> Iterator[Finding]:
