@@ -73,8 +73,8 @@ class Repetitions:
         ctrl = sequence.ctrl
         rows = len(ctrl)
         for period in range(max(1, round(SHORTEST / sequence.dt)), rows // 3 + 1):
-            later, sparse = np.arange(rows - period), slice(None, None, 97)  # most are ruled out by a few rows
-            if all(np.abs(ctrl[period:][k] - ctrl[later][k]).max() <= SAME_COMMAND for k in (sparse, slice(None))):
+            before, after = ctrl[:-period], ctrl[period:]  # most are ruled out by a few rows
+            if all(np.abs(after[::every] - before[::every]).max() <= SAME_COMMAND for every in (97, 1)):
                 break
         else:
             return []
