@@ -12,7 +12,7 @@ from gaponet.methods import title
 from gaponet.spread import Spread
 from gaponet_lab.plot.colours import colour
 
-LEFT_OUT = ("identified feedforward",)  # of figures; it stands in the tables
+LEFT_OUT = ("identified feedforward",)  # of pictures of single motions; it stands in bars and tables
 RIVALS = ("mlp", "shared_mlp")  # of the operator
 
 
@@ -60,9 +60,8 @@ def over_seeds(found: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, 
 
 
 def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], Spread]) -> dict[str, Any]:
-    """Bars of every method that is drawn, one for each group."""
-    shown = [m for m in methods(found) if m not in LEFT_OUT]
-    return {title(m): (colour(m), [value(m, group) for group in groups]) for m in shown}
+    """Bars of every method, one for each group."""
+    return {title(m): (colour(m), [value(m, group) for group in groups]) for m in methods(found)}
 
 
 def cut(value: float, base: float) -> float:
