@@ -62,7 +62,7 @@ class RobotSpec:
         offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
         zero: The encoder's: the MJCF's angle is reading + zero, (n), rad.
         target_speed: Speed of the ramp that the servo's own generator makes of targets, (n), rad/s; 0 if it makes none.
-        stop_low, stop_high: Joint stops that replace the MJCF's range, (n), rad; NaN where the MJCF's stands.
+        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN where the MJCF's stands.
         stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
             is left, rad/s.
         friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
@@ -213,9 +213,8 @@ class RobotSpec:
         return self.stopped(np.where(limited, [j.range for j in joints], [-np.inf, np.inf]))
 
     def stopped(self, ranges: Array) -> Array:
-        """Joint ranges (n, 2) of the MJCF, rad, with the identified stops instead where there are such."""
-        stops = np.stack([self.stop_low, self.stop_high], axis=1)
-        return np.where(np.isnan(stops), ranges, stops)
+        """Joint ranges (n, 2) of the MJCF, rad, narrowed by identified stops; these never widen a range."""
+        return np.stack([np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1)
 
     @property
     def operated_index(self) -> Array:

@@ -6,6 +6,7 @@ What it offers to gaponet (gaponet.parts); nothing is imported here.
 COMMANDS = {name: f"gaponet_robots.cli.{name}:{name}" for name in ("excite", "collect", "run", "record", "virtual")}
 PROVIDES = {
     "listening to a robot": "gaponet_robots.cli.link:listen",
+    "collision shapes": "gaponet_robots.motion.collision:Collision",
     "motions": "gaponet_robots.motion.library:Library",
 }
 NAMES = {

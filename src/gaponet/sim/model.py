@@ -177,7 +177,8 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
         joint.ref -= robot.zero[i]
         stops = robot.stop_low[i], robot.stop_high[i]
         if np.isfinite(stops).any():
-            joint.range = [a if np.isnan(b) else b for a, b in zip(joint.range, stops, strict=True)]
+            low, high = joint.range if joint.range[0] < joint.range[1] else (-np.inf, np.inf)
+            joint.range = [np.fmax(low, stops[0]), np.fmin(high, stops[1])]  # a stop only narrows the range
             joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from gaponet import parts
 from gaponet.data.checks.finding import LEVELS, Finding, some
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
@@ -51,6 +52,8 @@ def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures
     """
     models = {mass: build_model(replace(robot, delay=np.zeros(len(robot.kp))), mass) for mass in payloads}
     model = models[payloads[0]]
+    if (robot.folder / "collision.toml").is_file():
+        parts.take("PROVIDES", "collision shapes", "reading collision.toml")(robot, model)  # raises where it is wrong
     places = _random_postures(robot) if postures is None else postures
     found = [
         *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),

@@ -66,6 +66,9 @@ class Asked:
     robot: str | None = None
     """Name or folder, identified ones too; default the one that the model's run keeps; without a model h1_2, or so101
     with so101."""
+    limits_from: str | None = None
+    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
+    package's robot. Read its values before you name it. Identified values come from --robot or --model."""
     payload_side: str = "both"
     """both, or one hand."""
     max_payload: float | None = None
@@ -157,12 +160,15 @@ def perform(
     """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
     from gaponet_robots.control.clock import MonotonicClock, SimulatedClock
     from gaponet_robots.control.controller import Controller
+    from gaponet_robots.control.hardware import for_hardware, known_robot, require_plausible, robot_hash
     from gaponet_robots.control.plan import Planner
     from gaponet_robots.drivers.dry import DryRun
 
     if (motion_name is None) == (asked.targets is None):
         raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
-    spec = asked_robot(asked)
+    spec = identified = asked_robot(asked)
+    if asked.driver != "virtual":
+        spec = for_hardware(identified, known_robot(asked.driver, asked.limits_from))
     fast = asked.reach.fast and asked.driver == "virtual"
     if fast and asked.targets:
         raise UsageError("live targets come in real time; leave out --fast")
@@ -179,7 +185,9 @@ def perform(
     planner = Planner(spec, driver.commanded, asked.control, asked.safety, limits)
     if asked.dry_run:
         driver = DryRun(driver)
-    compensator, calibrated = _compensator(screen, asked, spec, asked.unit_id or facts.get("unit_id", ""))
+    compensator, calibrated = _compensator(screen, asked, identified, asked.unit_id or facts.get("unit_id", ""))
+    if compensator and asked.driver != "virtual":
+        require_plausible(compensator.robot)
     live = None if motion else listen(screen, asked, spec, driver, clock)
 
     def met(robot: Driver) -> None:
@@ -187,7 +195,12 @@ def perform(
         if compensator:
             compensator.require_gains(robot.joint_names, robot.kp, robot.kd)
         if motion:
-            controller.plan = planner.plan(motion, robot.read().qpos)
+            plan = planner.plan(motion, robot.read().qpos)
+            if compensator:
+                told = asked.payload_mass
+                masses = compensator.masses[[0, -1]].tolist() if told is None else [told]
+                plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
+            controller.plan = plan
             _show(screen, controller.plan, spec, robot, limits.max_payload)
         if asks:
             _ask(screen, robot, f"as {asked.targets} says" if motion is None else "as planned")
@@ -198,6 +211,7 @@ def perform(
         payload_side=asked.payload_side, model=str(asked.model) if asked.model else None,
         compensated_by=str(compensator.robot.folder) if compensator else None, calibrated=calibrated,
         on_connect=met, planner=None if asked.unchecked else planner, unchecked=asked.unchecked,
+        limits_from=str(spec.folder), robot_hash=robot_hash(spec),
         **facts | ({"targets": live.counts} if live else {}),
     )  # fmt: skip
     try:
@@ -395,6 +409,9 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
         f"it goes around what is in between ({around} stops)" if around else "",
         "nobody looks whether it meets itself or what it stands on" if not np.isfinite(plan.clearance)
         else f"nearest to each other: {plan.nearest}, {100 * plan.clearance:.1f} cm",
+        f"commands lead their targets by at most {plan.correction:.2f} rad ({plan.corrected_joint}); nearest to each "
+        f"other: {100 * plan.command_clearance:.1f} cm" if plan.corrected_joint else "",
+        f"limits and collision shapes: {robot.folder}",
         f"most torque, {load}: {plan.joint}, {plan.torque:.2f} of what may be used",
         f"at the end it {back}{how[driver.at_end]}; a stop {driver.at_stop} it",
     ):  # fmt: skip

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from gaponet_robots.control.clock import Clock, MonotonicClock, uncollected
 from gaponet_robots.control.driver import Driver, DriverError, Fault, State
 from gaponet_robots.control.following import Following
 from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
-from gaponet_robots.control.plan import MOVED, SLOW, Fence, Plan, Planner
+from gaponet_robots.control.plan import MOVED, SLOW, Compensates, Fence, Plan, Planner
 from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Event, Recording
 from gaponet_robots.control.rows import Row
@@ -39,16 +39,6 @@ from gaponet_robots.motion.way import Search, Way
 from gaponet_robots.targets.policy import NotYet, Policy, play
 
 _T = TypeVar("_T")
-
-
-class Compensates(Protocol):
-    """Changes a target so that the robot ends up where the target says (deploy.compensator). All joints, (n)."""
-
-    def reset(self, target: Array, payload_mass: float | None = None) -> None:
-        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take a while."""
-
-    def step(self, target: Array, qpos: Array, qvel: Array) -> Array:
-        """What to command so that the robot gets to `target`, (n) rad."""
 
 
 HANG = 5.0  # control periods without a sign of life after which the watchdog damps the robot

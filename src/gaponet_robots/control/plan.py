@@ -1,7 +1,8 @@
 """What a robot will do, as one trajectory from where it was found and back, checked before the first command.
 
 `Planner.plan` takes a motion, `Planner.begin` the first of targets that are not known in advance; these `Fence` keeps
-clear while the robot moves. Checked are free space between the robot's own limbs and above floor or table
+clear while the robot moves. With a compensator, `Planner.judge_commands` runs it over the whole motion, because its
+commands differ from the targets. Checked are free space between the robot's own limbs and above floor or table
 (motion.collision), range, speed, acceleration and torque (motion.feasible). A robot found nearer to something than the
 clearance may go away from it, but no nearer.
 """
@@ -9,6 +10,7 @@ clearance may go away from it, but no nearer.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import static_torque
 from gaponet_robots.control.phases import ControlConfig
-from gaponet_robots.control.safety import SafetyConfig
+from gaponet_robots.control.safety import Limits, SafetyConfig, limit_delta
 from gaponet_robots.motion.feasible import STILL_SHARE, Feasibility, stretch
 from gaponet_robots.motion.motion import GRID, Motion
 from gaponet_robots.motion.way import Search, Way, ended, find_points
@@ -30,6 +32,17 @@ CALM = 0.1  # s in which a live target may use up what is left of the free space
 MOST_SAG = 0.05  # m that it counts
 SHARES = (1.0, 0.5, 0.2)  # of a step towards a live target that are tried
 SLOW = 0.005  # s: shorter control periods have no time for going around
+COMMAND_SHARE = 0.5  # of the clearance that commands keep: they lead the joints by what these sag
+
+
+class Compensates(Protocol):
+    """Changes a target so that the robot ends up where the target says (deploy.compensator). All joints, (n)."""
+
+    def reset(self, target: Array, payload_mass: float | None = None) -> None:
+        """Begin at rest at `target` (n) rad, with a payload in kg or an unknown one; may take a while."""
+
+    def step(self, target: Array, qpos: Array | None, qvel: Array | None = None) -> Array:
+        """What to command so that the robot gets to `target`, (n) rad; qpos None: no state was measured."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,8 @@ class Plan:
         torque: Largest share of the usable torque.
         joint: The joint that needs it.
         changed: How the motion was changed so that it fits, in words; empty if it was not.
+        correction: Largest |command − target| of a compensator, rad, at corrected_joint; 0 without one.
+        command_clearance: Least free space of the commands, m.
     """
 
     found: Array
@@ -58,13 +73,20 @@ class Plan:
     torque: float = 0.0
     joint: str = ""
     changed: str = ""
+    correction: float = 0.0
+    corrected_joint: str = ""
+    command_clearance: float = np.inf
 
     @property
     def rows(self) -> Array:
         """All of it, (T, n) rad at GRID s."""
-        parts = [self.into.rows(GRID)]
-        parts += [self.motion.sample(GRID)] if self.motion else []
-        return np.concatenate([*parts, self.back.rows(GRID)] if self.back else parts)
+        return self.sample(GRID)
+
+    def sample(self, dt: float) -> Array:
+        """All of it at a period of dt s, (T, n) rad."""
+        parts = [self.into.rows(dt)]
+        parts += [self.motion.sample(dt)] if self.motion else []
+        return np.concatenate([*parts, self.back.rows(dt)] if self.back else parts)
 
     @property
     def duration(self) -> float:
@@ -136,6 +158,43 @@ class Planner:
         goal = found + float(shares[int(clear.argmax()), 0]) * (goal - found)
         into = yield from self._way(found, goal, moved, near, "to the first target")
         return self._judged(Plan(found, into), near)
+
+    def judge_commands(self, plan: Plan, compensator: Compensates, masses: tuple[float, ...]) -> Plan:
+        """The plan with what a compensator makes of it, for each payload (kg) that the compensator may assume.
+
+        The compensator is causal and is run without measured states. Its feedback is not included: that adds at most
+        CompensatorConfig.feedback_limit.
+
+        Raises:
+            UsageError: A command is not a number or brings shells too near to each other.
+        """
+        config, at = self.safety, self.robot.index(self.commanded)
+        limits, dt = Limits.of(self.robot, self.commanded, config), 1.0 / self.config.rate
+        targets = plan.sample(dt)
+        floor = self._near(plan.found) - COMMAND_SHARE * self.collision.clearance
+        correction, joint, least = 0.0, "", np.inf
+        for mass in masses:
+            compensator.reset(plan.found, mass)
+            delta, commands = np.zeros(len(at)), targets.copy()
+            for k, target in enumerate(targets):
+                wanted = compensator.step(target, None)[at]
+                if not np.isfinite(wanted).all():
+                    joint = self.commanded[int(np.argmax(~np.isfinite(wanted)))]
+                    raise UsageError(f"compensation commands no number to {joint}; check the identified values")
+                delta = limit_delta(wanted - target[at], delta, dt, limits)
+                commands[k, at] = np.clip(target[at] + delta, limits.low, limits.high)
+            free = self.collision.along(commands)
+            if (free < floor).any():
+                raise UsageError(
+                    f"compensation with {mass:g} kg brings {self._said(np.where(free < floor, free, np.inf))}. The "
+                    "targets keep clear. State the payload (--payload-mass), check the identified values, or "
+                    "leave out --compensate and --model"
+                )
+            far = np.abs(commands - targets).max(axis=0)
+            if far.max() > correction:
+                correction, joint = float(far.max()), self.robot.joint_names[int(far.argmax())]
+            least = min(least, float(free.min(initial=np.inf)))
+        return replace(plan, correction=correction, corrected_joint=joint, command_clearance=least)
 
     def _calm(self, motion: Motion) -> Motion:
         """The motion, slowed where it accelerates more than joints can."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import mujoco
@@ -26,7 +27,8 @@ CLEARANCE = 0.03  # m kept between shells: a loaded arm sags by centimetres belo
 FINE = 0.03  # rad between postures that are looked at: a hand 0.7 m away moves by less than the clearance
 
 
-Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Metres})
+Radius = Annotated[float, Interval(ge=0, le=100)]
+Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Radius})
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,8 @@ class Collision:
         """
         self.model = model
         self.data = mujoco.MjData(model)
-        shapes = Shapes() if unchecked else _read(robot, model)
+        shapes = Shapes() if unchecked else read_shapes(robot.folder)
+        _require_bodies(robot, model, shapes)
         groups = [group.split() for group in shapes.same_limb]
         self.checked, self.clearance = bool(shapes.capsule), shapes.clearance
         self.names = [c["body"] for c in shapes.capsule]
@@ -150,16 +153,22 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     return np.sqrt(np.einsum("...i,...i", gap, gap))
 
 
-def _read(robot: RobotSpec, model: mujoco.MjModel) -> Shapes:
-    path = robot.folder / "collision.toml"
-    if not path.is_file():
-        return Shapes()
-    table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
+def read_shapes(folder: Path) -> Shapes:
+    """collision.toml of a robot folder; without the file, no shapes.
+
+    Raises:
+        RobotError: With the file and the field.
+    """
+    path = folder / "collision.toml"
+    return read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields") if path.is_file() else Shapes()
+
+
+def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> None:
     bodies = [model.body(b).name for b in range(model.nbody)]
-    for capsule in table.capsule:
+    for capsule in shapes.capsule:
         if capsule["body"] not in bodies:
-            raise RobotError(f"{path}: capsule names body '{capsule['body']}', the MJCF has: {', '.join(bodies)}")
-    return table
+            path, there = robot.folder / "collision.toml", ", ".join(bodies)
+            raise RobotError(f"{path}: capsule names body '{capsule['body']}', the MJCF has: {there}")
 
 
 def _grouped(a: str, b: str, groups: list[list[str]]) -> bool:

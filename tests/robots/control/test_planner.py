@@ -188,7 +188,7 @@ def test_an_arm_without_shapes_and_a_robot_that_may_fall_are_asked_for(so101, tm
     save_robot(so101, tmp_path / "mine")
     (tmp_path / "mine" / "collision.toml").unlink()
     words = ["run", "--driver", "so101", "--port", "/dev/none", "--motion", str(tmp_path / "pan.txt"), "--yes"]
-    assert main([*words, "--robot", str(tmp_path / "mine")]) == 2
+    assert main([*words, "--robot", str(tmp_path / "mine"), "--limits-from", str(tmp_path / "mine")]) == 2
     assert "so101 has no collision.toml" in " ".join(capsys.readouterr().err.split())
     assert main(["run", "--driver", "unitree", "--topic", "lowcmd", "--motion", "sweep-left_elbow", "--yes"]) == 2
     assert "legs and torso go off, and a robot that stands falls; say --hangs" in " ".join(

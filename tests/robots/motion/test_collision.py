@@ -5,7 +5,8 @@ from contacts import Contacts
 from gaponet.errors import RobotError
 from gaponet.robot import load_robot
 from gaponet.sim.model import build_model
-from gaponet_robots.motion.collision import CLEARANCE, Collision, segment_distance
+from gaponet_interop.setup.check import check_robot
+from gaponet_robots.motion.collision import CLEARANCE, Collision, read_shapes, segment_distance
 
 
 def distance(a, b):
@@ -59,6 +60,15 @@ def test_left_and_right_are_mirrored(h1):
 
 def test_a_robot_without_shapes_is_not_checked(arm):
     assert Collision(arm, build_model(arm)).distance(np.zeros((3, 2))).tolist() == [np.inf] * 3
+
+
+def test_a_shape_without_thickness_is_an_error(arm):
+    file = arm.folder / "collision.toml"
+    file.write_text('capsule = [{ body = "upper", from = [0, 0, 0], to = [0, 0, 1], radius = -50.0 }]')
+    with pytest.raises(RobotError, match=r"collision.toml.*radius"):
+        read_shapes(arm.folder)
+    with pytest.raises(RobotError, match=r"collision.toml.*radius"):
+        check_robot(arm)
 
 
 def test_a_shape_on_a_body_that_does_not_exist_is_an_error(arm):
