@@ -88,7 +88,7 @@ class SO101Driver:
         """
         if set(robot.joint_names) != set(SPEAK):
             raise UsageError(f"the so101 driver is for the joints {', '.join(SPEAK)}; {robot.name} has others")
-        self._bounds = CommandBounds(robot, "so101")
+        CommandBounds(robot, "so101")  # goals are clipped to the calibrated range below
         self.robot, self.port, self.calibration = robot, port, calibration
         self.timeout, self.silent = timeout, silent
         self.address = port
@@ -304,8 +304,6 @@ class SO101Driver:
 
         From then on no other program can open the port.
         """
-        if problem := self._bounds.problem(np.asarray(ctrl), np.arange(len(self.joint_names))):
-            raise DriverError(f"{problem}; it was not sent")
         if self._goal is None:
             self._say_exclusive(ALONE)
         goal = dict(zip(self.steps.servos, self.steps.steps(np.asarray(ctrl)).tolist(), strict=True))
