@@ -20,6 +20,9 @@ class Clock(Protocol):
     def wait_until(self, deadline: float) -> float:
         """Return at an absolute time, or at once if it has passed; gives the time of return."""
 
+    def suspended(self) -> float:
+        """s for which the computer was suspended, since some fixed moment; `now` stood still meanwhile."""
+
 
 class MonotonicClock:
     """The machine's monotonic clock, shared by all processes of one machine."""
@@ -36,6 +39,13 @@ class MonotonicClock:
         while (now := time.monotonic()) < deadline:
             pass
         return now
+
+    def suspended(self) -> float:
+        """s since boot, on Linux; 0 where the operating system has no CLOCK_BOOTTIME."""
+        if not hasattr(time, "CLOCK_BOOTTIME"):
+            return 0.0
+        # A process that is preempted between the two readings reads too little, never too much.
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic() for _ in range(3))
 
 
 @contextmanager
@@ -57,6 +67,7 @@ class SimulatedClock:
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
+        self.suspended_s = 0.0
 
     def now(self) -> float:
         """s."""
@@ -65,3 +76,7 @@ class SimulatedClock:
     def wait_until(self, deadline: float) -> float:
         self._now = max(self._now, deadline)
         return self._now
+
+    def suspended(self) -> float:
+        """What `suspended_s` was set to."""
+        return self.suspended_s

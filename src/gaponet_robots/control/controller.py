@@ -50,6 +50,7 @@ PAST = 0.05  # rad beyond its range in which a joint may be found, where only th
 WEIGHED = 2.0  # s of the run after which what the hands hold is compared with what was told
 LOOK = 0.3  # share of a period in which it looks for the way back
 PROMPT = 0.001  # s between the last look at the clock and a command's leaving that its limits allow for
+MAX_SUSPENDED_S = 0.05  # less than any suspend, more than two clocks that are read in turn differ by
 
 
 class Controller:
@@ -182,14 +183,14 @@ class Controller:
         start, k, due = self.clock.now(), 0, 0  # due: the period that should follow the last one; k, the one that can
         for text in ("waiting for fresh states", *self.driver.facts.get("remarks", ())):
             self._note(start, "", text)
-        self._began = start
+        self._began, self._suspended_before = start, self.clock.suspended()
         while self.phase is not Phase.STOPPED:
             now = self.clock.wait_until(start + k * self.dt)
             self._due = start + due * self.dt
             if keys:
                 keys.poll()
-            if self._watchdog and not self._watchdog.alive() and not self._ended:
-                self.stop("the watchdog ended")
+            if self._watchdog and not self._ended and (trouble := self._watchdog.trouble()):
+                self.stop(trouble)
             self.recording.late.append(now - self._due)
             self._period(k, now, policy)
             lost = int((self.clock.now() - start) / self.dt) - k  # whole periods that this one ran over
@@ -264,7 +265,16 @@ class Controller:
     def _latched(self, fault: Fault | None) -> Fault | None:
         if self._ended:
             return None
-        return Fault("stop", f"asked to stop: {self.stop.reason}") if self.stop.reason else fault
+        if self.stop.reason:
+            return Fault("stop", f"asked to stop: {self.stop.reason}")
+        return self._suspended() or fault
+
+    def _suspended(self) -> Fault | None:
+        """Fault if the computer was suspended: time stood still for this process, not for the robot."""
+        passed = self.clock.suspended() - self._suspended_before
+        if passed <= MAX_SUSPENDED_S:
+            return None
+        return Fault("suspend", f"the computer was suspended for {passed:.1f} s; keep it awake while a robot moves")
 
     def _fail(self, k: int, now: float, fault: Fault) -> None:
         """Damp; but send nothing if nothing was commanded, or if the watchdog has damped the robot already."""
@@ -447,7 +457,7 @@ class Controller:
         looked = -np.inf
         while (now := self.clock.now()) - looked > PROMPT:
             looked = now
-            fault = self.watch.overrun(now - self._due)
+            fault = self.watch.overrun(now - self._due) or self._suspended()
             if fault or (self._watchdog and self._watchdog.fired()):
                 return fault or Fault("overrun", "this process stood still")
             out = limit_command(ctrl, before, q, v, self.dt, self.limits, now + PROMPT - state.time)

@@ -192,6 +192,7 @@ FAULTS = {
     "jump": "a joint moved faster than it can",
     "temperature": "a motor is too hot",
     "overrun": "the loop itself was late",
+    "suspend": "the computer was suspended, while the robot was not",
     "tracking": "a joint does not follow",
     "checksum": "too many messages with a wrong checksum",
     "torque": "no position command is within range, rate and torque",
@@ -208,7 +209,7 @@ FAULTS = {
 
 
 # What is no fault of the robot itself: a robot that cannot brake is lowered then, instead of let fall at once.
-SOFT = ("stale", "overrun", "checksum", "target", "silence", "driver", "obedience", "error", "stop")
+SOFT = ("stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop")
 
 # A joint did not do what it was told: what was recorded up to then is no data.
 ASTRAY = ("obedience", "frozen", "jump", "tracking")

@@ -3,8 +3,9 @@
 It damps as after a fault that is not the robot's own, and goes on until the robot confirms it, for RETRY at most.
 The controller sends it a byte every period through a pipe, from just before its first command on: the weight of that
 command. The pipe closes when the controller's process ends, however it ends (kill -9 too), and no byte comes when it
-hangs. If no byte ever came, nothing was commanded, and nothing is sent. It holds the controller's lock as long as it
-lives, so no other controller starts while it damps.
+hangs. If no byte ever came, nothing was commanded, and nothing is sent. It answers each byte with one of its own, so
+that the controller notices a watchdog that hangs. It holds the controller's lock as long as it lives, so no other
+controller starts while it damps.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from typing import Any
 from gaponet.process import child
 from gaponet_robots.control.driver import Driver, DriverError
 
-RELEASE, READY, FIRED = b"\xff", b"ready\n", b"fired\n"
+RELEASE = b"\xff"
+READY, ANSWER, FIRED = b"\x01", b"\x02", b"\x03"  # what the watchdog says, one byte each
 STEPS = 200  # a beat is a weight in these parts of 1
 RETRY = 600.0  # s for which it tries to damp a robot that does not confirm it
 EVERY, AGAIN = 0.01, 0.1  # s between two messages, and after one that failed
@@ -36,7 +38,7 @@ class Watchdog:
         Args:
             spec: What the driver says of itself (Driver.watchdog).
             lock: Descriptor of the controller's lock.
-            hang: s without a sign of life after which it damps.
+            hang: s without a sign of life after which it damps, and without an answer after which it counts as hanging.
             damp: s for which it damps.
         """
         text = json.dumps(spec | {"hang": hang, "damp": damp})
@@ -47,8 +49,10 @@ class Watchdog:
         assert self._process.stdin
         assert self._process.stdout
         self._in, self._out = self._process.stdin, self._process.stdout
-        os.set_blocking(self._in.fileno(), False)
-        self._fired = False
+        for pipe in (self._in, self._out):
+            os.set_blocking(pipe.fileno(), False)
+        self._fired, self._hang = False, hang
+        self._answered: float | None = None  # monotonic s of the last answer, or of the first beat; None before it
 
     def wait_ready(self, timeout: float = 20.0) -> None:
         """Return when it could damp.
@@ -57,22 +61,29 @@ class Watchdog:
             DriverError: It could not reach the robot.
         """
         ready, _, _ = select.select([self._out], [], [], timeout)
-        if not ready or self._out.readline() != READY:
+        if not ready or self._out.read(1) != READY:
             self._process.kill()
             raise DriverError("the watchdog could not reach the robot; see its message above")
 
-    def alive(self) -> bool:
-        """Whether the watchdog runs and has not taken this process for dead or hanging."""
-        return self._process.poll() is None and not self.fired()
+    def trouble(self) -> str:
+        """Why this watchdog is of no use any more: it ended, or does not answer; empty if it is well."""
+        if self.fired() or self._process.poll() is not None:
+            return "the watchdog ended"
+        silent = self._answered is not None and time.monotonic() - self._answered > self._hang
+        return "the watchdog does not answer" if silent else ""
 
     def fired(self) -> bool:
         """Whether the watchdog damps the robot or has damped it: nothing more may be sent."""
-        if not self._fired and select.select([self._out], [], [], 0)[0]:
-            self._fired = self._out.readline() == FIRED
+        said = self._out.read(4096) or b""  # None: nothing new; does not wait
+        if ANSWER in said:
+            self._answered = time.monotonic()
+        self._fired = self._fired or FIRED in said
         return self._fired
 
     def beat(self, weight: float) -> bool:
         """Say that the controller lives and has commanded the robot with this weight; False if the watchdog is gone."""
+        if self._answered is None:
+            self._answered = time.monotonic()
         try:
             self._in.write(bytes([round(STEPS * weight)]))
         except BlockingIOError:
@@ -122,6 +133,7 @@ def main(spec: dict[str, Any]) -> None:
         if not data or RELEASE in data:
             break
         weight = data[-1] / STEPS
+        _say(ANSWER)
     if weight is None or RELEASE in data:
         driver.close(hold=True)
         return
@@ -133,8 +145,7 @@ def main(spec: dict[str, Any]) -> None:
 
 def _say(word: bytes) -> None:
     with contextlib.suppress(BrokenPipeError):  # a controller that was killed does not listen
-        sys.stdout.buffer.write(word)
-        sys.stdout.buffer.flush()
+        os.write(1, word)
 
 
 def _damp(driver: Driver, seconds: float, weight: float, connected: bool) -> None:

@@ -7,6 +7,7 @@ import gc
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from gaponet.data.importer import import_logs
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.errors import LogError, UsageError
 from gaponet.robot import RobotSpec
-from gaponet_robots.control.clock import SimulatedClock
+from gaponet_robots.control.clock import MonotonicClock, SimulatedClock
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import DriverError, Fault
 from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
@@ -330,6 +331,69 @@ def test_the_wall_clock_may_be_set_while_it_runs(arm, monkeypatch):
     assert run(arm, Tampered(arm, SimulatedClock())).fault is None
 
 
+@pytest.mark.parametrize("during", ["read", "policy"])
+@pytest.mark.parametrize("at", [0.06, 0.9])
+def test_a_computer_that_was_suspended_sends_no_command_afterwards(arm, at, during):
+    clock = SimulatedClock()
+    suspended: list[float] = []
+
+    def suspend(here):
+        if here == during and clock.now() >= at and not suspended:
+            suspended.append(clock.now())
+            clock.suspended_s = 600.0
+
+    class Suspended(Tampered):
+        def read(self):
+            suspend("read")
+            return super().read()
+
+    motion = play(MOTION, 0.02)
+
+    def policy(k, state):
+        suspend("policy")
+        return motion(k, state)
+
+    driver = Suspended(arm, clock)
+    recording = Controller(driver, arm, QUICK, clock=clock).run(policy)
+    assert recording.fault.kind == "suspend"
+    assert "the computer was suspended for 600.0 s" in recording.fault.text
+    after = [ctrl for t, ctrl in driver.sent if t >= suspended[0]]
+    assert all(ctrl is None for ctrl in after)
+    commanded = any(ctrl is not None for _, ctrl in driver.sent)
+    assert bool(after) == commanded, "damped, or nothing was ever commanded"
+    assert ("nothing was commanded" in recording.fault.text) == (not commanded)
+    assert commanded or at < 0.5
+
+
+def test_suspends_before_a_run_are_none_of_it(arm):
+    driver = Tampered(arm, SimulatedClock())
+    driver.clock.suspended_s = 3600.0
+    assert run(arm, driver).fault is None
+
+
+def test_time_that_the_computer_was_suspended_is_what_boottime_went_on_by(monkeypatch):
+    clock, slept = MonotonicClock(), 12.5
+    if not hasattr(time, "CLOCK_BOOTTIME"):
+        assert clock.suspended() == 0.0
+        return
+    before, read = clock.suspended(), time.clock_gettime
+    monkeypatch.setattr(time, "clock_gettime", lambda which: read(which) + slept * (which == time.CLOCK_BOOTTIME))
+    assert clock.suspended() - before == pytest.approx(slept, abs=0.01)
+
+
+@pytest.mark.parametrize("trouble", ["the watchdog ended", "the watchdog does not answer"])
+def test_a_watchdog_that_is_of_no_use_any_more_ends_the_run_damped(arm, trouble):
+    driver = Tampered(arm, SimulatedClock())
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller._watchdog = SimpleNamespace(
+        trouble=lambda: trouble if driver.clock.now() >= 0.9 else "", fired=lambda: False, beat=lambda weight: True
+    )
+    recording = controller.run(play(MOTION, 0.02))
+    assert recording.fault.text == f"asked to stop: {trouble}"
+    damped = next(t for t, ctrl in driver.sent if ctrl is None)
+    assert 0.9 <= damped <= 0.92
+
+
 def test_two_controllers_cannot_command_one_robot(arm):
     driver = Tampered(arm, SimulatedClock())
     with sole_publisher(driver.address), pytest.raises(UsageError, match="another process commands this robot"):
@@ -359,8 +423,8 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
     class Watchdog:
         beats = 0
 
-        def alive(self):
-            return True
+        def trouble(self):
+            return ""
 
         def fired(self):
             return False

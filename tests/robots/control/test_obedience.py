@@ -224,7 +224,7 @@ def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on
     recording = play(
         so101,
         clock,
-        watched=SimpleNamespace(alive=lambda: True, fired=lambda: False, beat=lambda weight: True, release=ends.append),
+        watched=SimpleNamespace(trouble=lambda: "", fired=lambda: False, beat=lambda weight: True, release=ends.append),
     )
     assert recording.fault.kind == "driver"
     last = recording.events[-1]
