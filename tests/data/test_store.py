@@ -1,6 +1,8 @@
 """The dataset folder: what is listed is complete, what is not listed does not exist."""
 
+import errno
 import json
+import os
 import pickle
 import sys
 from contextlib import suppress
@@ -40,6 +42,34 @@ def test_what_was_appended_is_read_back_bit_by_bit(dataset, sequence):
     assert read.meta == sequence.meta
     assert read.content_hash() == sequence.content_hash() == back.entries[0].hash
     assert back.entries[0].findings == {"delay_s": {"shoulder": 0.04}}
+
+
+def test_what_was_appended_is_on_the_disk_before_append_returns(dataset, sequence, monkeypatch):
+    synced: dict[int, int] = {}  # size of a file when it was last synced, by inode
+    fsync = os.fsync
+
+    def noted(descriptor):
+        fsync(descriptor)
+        synced[os.fstat(descriptor).st_ino] = os.fstat(descriptor).st_size
+
+    monkeypatch.setattr(os, "fsync", noted)
+    entry = dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    for file in (dataset.path / "sequences.jsonl", dataset.path / "sequences" / f"{entry.id}.parquet"):
+        assert synced.get(file.stat().st_ino) == file.stat().st_size, file
+    assert (dataset.path / "sequences").stat().st_ino in synced, "its name too"
+
+
+def test_a_removal_that_is_cut_short_leaves_the_dataset_as_it_was(dataset, sequence, monkeypatch):
+    dataset.append(replace(sequence, meta=replace(sequence.meta, payload_mass=1.0)))
+    before = {file: file.read_bytes() for file in dataset.path.rglob("*") if file.is_file()}
+    monkeypatch.setattr(os, "replace", no_space)
+    with pytest.raises(OSError, match="No space"):
+        dataset.remove(("*-1kg-*",))
+    assert {file: file.read_bytes() for file in dataset.path.rglob("*") if file.is_file()} == before
+
+
+def no_space(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_the_same_recording_is_refused_by_name(dataset, sequence):

@@ -112,6 +112,16 @@ def test_the_robot_does_what_the_nominal_simulator_does(robot, model):
     assert error(q, expected) < 0.1 * error(raw, expected)
 
 
+@pytest.mark.parametrize("given", [{}, {"limit": 0.05}])
+def test_a_command_is_no_further_from_its_target_than_the_limit(robot, given):
+    soft = robot.with_servos({name: {"kp": 1.0} for name in robot.joint_names})  # gravity asks for more than 0.5 rad
+    compensate = Compensator(soft, config=CompensatorConfig(blend=0.0, **given))
+    target = np.zeros(2)
+    compensate.reset(target)
+    sent = [compensate.step(target, target) for _ in range(20)]
+    assert np.abs(sent).max() == pytest.approx(given.get("limit", 0.5))
+
+
 def test_the_robot_reaches_its_target_under_a_payload(robot, model):
     targets = np.repeat(commands(200, 1)[:1], 200, axis=0)
     raw, _ = play(WeakArm(robot, 0.4), targets)

@@ -21,11 +21,13 @@ from gaponet_robots.control.clock import MonotonicClock, SimulatedClock
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import DriverError, Fault
 from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
+from gaponet_robots.control.plan import Plan
 from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Recording
 from gaponet_robots.control.safety import Limits, SafetyConfig
 from gaponet_robots.drivers.virtual import VirtualDriver
 from gaponet_robots.motion.motion import Motion
+from gaponet_robots.motion.way import Way
 from gaponet_robots.targets.policy import play
 from gaponet_robots.virtual.fleet import load_fleet
 
@@ -195,6 +197,34 @@ def test_a_stop_takes_effect_in_the_next_period(arm, how):
     assert sum(r.phase == "run" for r in recording.rows) == 21
 
 
+def test_a_robot_is_damped_for_two_seconds_and_no_longer(arm):
+    driver = Tampered(arm, SimulatedClock(), at=0.801, kind="hot")
+    recording = run(arm, driver, config=ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1))
+    damping = [t for t, ctrl in driver.sent if ctrl is None]
+    assert 2.0 <= damping[-1] - damping[0] <= 2.02
+    assert recording.events[-1].phase == "stopped"
+    assert recording.events[-1].time == pytest.approx(damping[-1])
+
+
+def test_a_joint_that_is_far_from_its_command_for_a_quarter_of_a_second_stops_the_robot(arm):
+    class Blocked(Tampered):
+        def read(self):
+            state = super().read()
+            if self.clock.now() < 0.8:
+                self.held = state.qpos
+                return state
+            noise = 1e-5 * np.sin(1e3 * self.clock.now() * np.ones(2))
+            return dataclasses.replace(state, qpos=self.held + noise, qvel=np.zeros(2))
+
+    driver, safety = Blocked(arm, SimulatedClock()), SafetyConfig(tracking=0.1)
+    away = Motion("away", "whole_body", 0.02, np.clip(0.01 * np.arange(100)[:, None] - [0.2, 0.2], -0.2, 0.5))
+    recording = run(arm, driver, away, safety=safety)
+    assert recording.fault.kind == "tracking"
+    near = [r.time for r in recording.rows if r.ctrl is not None and np.abs(r.ctrl - r.state.qpos).max() <= 0.1]
+    damped = next(t for t, ctrl in driver.sent if ctrl is None)
+    assert 0.25 < damped - near[-1] <= 0.25 + 3 * 0.02, "the first command beyond it is a period later"
+
+
 def test_a_stop_is_latched(arm):
     driver = Tampered(arm, SimulatedClock())
     controller = Controller(driver, arm, QUICK, clock=driver.clock)
@@ -218,6 +248,7 @@ def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
     controller = Controller(driver, arm, QUICK, clock=driver.clock)
     recording = controller.run(lambda k, state: np.full(2, np.nan if k == 10 else 0.0))
     assert recording.fault.kind == "target"
+    assert sum(r.phase == "run" for r in recording.rows) == 10, "damped in the period in which it is seen"
 
     driver = Tampered(arm, SimulatedClock())
     with pytest.raises(ZeroDivisionError):
@@ -449,6 +480,67 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
     recording = controller.run(play(MOTION, controller.dt))
     assert recording.fault is None
     assert watchdog.beats > 40
+
+
+def test_a_watchdog_damps_after_five_periods_for_as_long_as_the_controller_would(arm, monkeypatch):
+    given: list[tuple[float, float]] = []
+
+    class Watchdog:
+        def __init__(self, spec, lock, hang, damp):
+            given.append((hang, damp))
+
+        def wait_ready(self): ...
+
+        def trouble(self):
+            return ""
+
+        def fired(self):
+            return False
+
+        def beat(self, weight):
+            return True
+
+        def release(self, loose): ...
+
+    class Watched(Tampered):
+        def watchdog(self):
+            return {}
+
+    monkeypatch.setattr("gaponet_robots.control.controller.Watchdog", Watchdog)
+    assert run(arm, Watched(arm, SimulatedClock())).fault is None
+    assert given == [(pytest.approx(5 * 0.02), QUICK.damp)]
+
+
+def test_no_command_leaves_once_the_watchdog_has_damped_the_robot(arm):
+    fired: list[float] = []
+    driver, motion = Tampered(arm, SimulatedClock()), play(MOTION, 0.02)
+
+    def policy(k, state):
+        if k == 20:
+            fired.append(driver.clock.now())
+        return motion(k, state)
+
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller._watchdog = SimpleNamespace(
+        trouble=lambda: "", fired=lambda: bool(fired), beat=lambda weight: True, release=lambda loose: None
+    )
+    recording = controller.run(policy)
+    assert recording.fault.text.endswith("the watchdog has damped the robot")
+    assert driver.sent[-1][0] < fired[0], "neither a command nor a message that damps with another weight"
+
+
+@pytest.mark.parametrize(("moved", "kind"), [(0.015, None), (0.025, "plan"), (1.0, "plan")])
+def test_a_plan_counts_only_where_the_robot_still_is_where_it_was_found(arm, moved, kind):
+    driver = Tampered(arm, SimulatedClock())
+    driver.connect()
+    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    found = driver.read().qpos + np.array([0.0, moved])
+    controller.plan = Plan(found, Way.along(np.stack([found, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION)
+    recording = controller.run()
+    assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
+    if kind:
+        assert "elbow moved by" in recording.fault.text
+        assert driver.sent == []
 
 
 def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):

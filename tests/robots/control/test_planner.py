@@ -18,6 +18,7 @@ from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import State
 from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.plan import Fence, Planner
+from gaponet_robots.control.safety import SafetyConfig
 from gaponet_robots.drivers.virtual import VirtualDriver
 from gaponet_robots.motion.files import read_motion
 from gaponet_robots.motion.motion import Motion
@@ -116,6 +117,19 @@ def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
     assert not fence.near
 
 
+def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
+    down, sag = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0]), np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
+    fence, least = Fence(planner, so101.qpos_home), np.inf
+    for k in range(200):
+        asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
+        at = fence.step(asked, fence.at + sag, 0.02)
+        least = min(least, planner.collision.along((at + sag)[None]).min())
+    told = planner.collision.along(at[None]).min()
+    assert "the plane at 0 m" in fence.near
+    assert least > planner.collision.clearance - 0.002
+    assert told > planner.collision.clearance + 0.005, "the sag matters here"
+
+
 def test_a_controller_cuts_them_and_says_what_for(so101, judge):
     controller, sent = virtual(so101, so101.qpos_home)
     down = np.array([0.0, 1.7, 0.3, 0.5, 0.0, 0.0])
@@ -128,6 +142,24 @@ def test_a_controller_cuts_them_and_says_what_for(so101, judge):
 
 ACROSS = np.array([-1.34, 0.86, 2.96, 2.27, -0.21, -1.15, -0.1, -2.5, 1.97, 1.78])  # straight from there to HERE …
 HERE = np.array([0.36, 2.83, -1.86, 1.95, 1.71, 1.47, -0.22, -0.6, 3.08, 2.84])  # … its arms go 14 cm into each other
+
+
+def straight(free, start, goal, *_):
+    """A search that looks at nothing."""
+    yield
+    return np.stack([start, goal])
+
+
+def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkeypatch):
+    monkeypatch.setattr("gaponet_robots.control.plan.find_points", straight)
+    robot = load_robot("h1_2")
+    found, far = robot.qpos_home.copy(), robot.qpos_home.copy()
+    found[robot.index(robot.operated)], far[robot.index(robot.operated)] = HERE, ACROSS
+    with pytest.raises(UsageError, match=r"the plan brings .* cm into each other; 3 cm are kept"):
+        ended(Planner(robot, robot.operated).begin(far, found))
+    hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
+    with pytest.raises(UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"):
+        ended(Planner(so101, so101.joint_names, *hasty).begin(OVER, so101.qpos_home))
 
 
 @pytest.mark.parametrize("way", ["by way of home", "none"])

@@ -148,7 +148,12 @@ def keep(name):
         ({"temperature": np.full(2, np.nan)}, "none", 40),
         ({"qpos": lambda k, f, _: f["qpos"] - 0.051 * np.minimum(k - 9, 16)}, "tracking", 33),
         ({"refused": lambda k, *_: 3 * (k - 9)}, "checksum", 16),
-        ({"late": 0.05}, "overrun", 10),
+        ({"refused": lambda k, *_: (k - 9) // 3}, "none", 40),  # 17 within a second
+        ({"late": 0.041}, "overrun", 10),
+        ({"late": 0.039}, "none", 40),
+        ({"tilt": 0.71}, "tilt", 10),
+        ({"tilt": 0.69}, "none", 40),
+        ({"tilt": np.nan}, "tilt", 10),  # an IMU that gives no attitude
     ],
 )
 def test_each_watchdog_speaks_in_time(change, kind, period):

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,6 +78,17 @@ def test_only_the_stop_keys_of_the_remote_stop(robot):
     for keys, stops in ((0x0008, True), (0x0220, True), (0x0020, False), (0x0200, False), (0x0104, False)):
         hg.LowState.view(pressed, "wireless_remote")[2:4] = keys & 0xFF, keys >> 8
         assert (told(pressed) is not None and told(pressed).kind == "stop") == stops, hex(keys)
+
+
+def test_what_one_of_several_messages_says_stops_for_good(robot):
+    pressed, well = message(), message()
+    hg.LowState.view(pressed, "wireless_remote")[2] = 0x08  # select
+    for data in (pressed, well):
+        hg.LowState.seal(data)
+    _, driver = decoded(robot, message())
+    queue = [[pressed, well], [well]]
+    driver._reader, driver._dds = None, SimpleNamespace(receive=lambda reader: queue.pop(0))
+    assert [driver.read().fault.kind, driver.read().fault.kind] == ["stop", "stop"]
 
 
 def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
