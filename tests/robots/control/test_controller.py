@@ -177,6 +177,20 @@ def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
     assert driver.sent == []
 
 
+def test_a_robot_is_commanded_after_five_good_states_in_a_row(arm):
+    class Once(Tampered):
+        reads = 0
+
+        def read(self):
+            self.reads += 1
+            state = super().read()
+            return dataclasses.replace(state, tilt=0.8) if self.reads == 4 else state
+
+    recording = run(arm, Once(arm, SimulatedClock()))
+    assert recording.fault is None
+    assert sum(r.phase == "idle" for r in recording.rows) == 4 + 5 - 1, "the fifth one is commanded already"
+
+
 @pytest.mark.parametrize("how", ["call", "signal"])
 def test_a_stop_takes_effect_in_the_next_period(arm, how):
     driver = Tampered(arm, SimulatedClock())
@@ -320,6 +334,7 @@ def test_handing_over_holds_the_arms_while_the_weight_goes_to_zero(arm):
     driver = Shared(arm, SimulatedClock())
     recording = run(arm, driver)
     assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "release", "stopped"]
+    assert QUICK.damp <= recording.events[-1].time - recording.events[-2].time <= QUICK.damp + 2 * 0.02
     released = [w for t, w in weights if t >= recording.events[-2].time]
     assert released[0] == 1.0
     assert released[-1] == 0.0

@@ -157,6 +157,9 @@ def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(so101, cl
     assert recording.fault is not None
     assert recording.fault.kind == "obedience", recording.fault
     assert re.search(WAYS[way], recording.fault.text)
+    if at == 1.0:  # every state says goal and torque: three in a row count; settings are all read once a second
+        noticed = recording.fault.time - bus.first - at
+        assert noticed <= (5 * 0.02 if way in ("ignores", "resets", "brown-out", "crossed") else 1.0 + 2 * 0.02)
     if recording.fault.phase == "damp":  # else it was noticed at the very end, where the arm is held
         off = bus.get(reg.TORQUE_ENABLE) == [0] * 6
         assert off != recording.events[-1].text.startswith("could NOT be damped: switch the supply off")

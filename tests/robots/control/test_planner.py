@@ -159,7 +159,7 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
         ended(Planner(robot, robot.operated).begin(far, found))
     hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
     with pytest.raises(UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"):
-        ended(Planner(so101, so101.joint_names, *hasty).begin(OVER, so101.qpos_home))
+        Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 
 
 @pytest.mark.parametrize("way", ["by way of home", "none"])

@@ -21,7 +21,7 @@ from gaponet_robots.targets.policy import play
 from gaponet_robots.virtual.fleet import load_fleet
 
 QUICK = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
-DT, FAULT, HOLD = 0.02, 1.5, 0.5  # s; from FAULT on a sender goes wrong
+DT, FAULT, HOLD = 0.02, 1.5, 0.5  # s; from FAULT on a sender goes wrong; HOLD is the default
 NAN = float("nan")
 
 
@@ -66,7 +66,7 @@ def good(t, sender="a"):
     return Heard(sender, 100.0 + t, wave(t))
 
 
-def live(arm, say, seconds=2.6, config=LiveConfig(hold=HOLD, wait=3.0), **how):  # noqa: B008
+def live(arm, say, seconds=2.6, config=LiveConfig(wait=3.0), **how):  # noqa: B008
     """Controller, wire and driver after a run; the sender ends after `seconds`."""
     clock = SimulatedClock()
     driver = Noted(arm, clock)
@@ -151,7 +151,7 @@ WRONG = {  # from FAULT on, every message is of this kind
     "too fast": (lambda t: [Heard("a", 100 + t, {"shoulder": 1.4 * (-1) ** int(t / DT), "elbow": 0.0})], "speed"),
     "the same again": (lambda t: [good(FAULT - DT)], "order"),
     "backwards": (lambda t: [good(2 * FAULT - t - DT)], "order"),
-    "late": (lambda t: [Heard("a", 100 + t - 0.3, wave(t))] if t > FAULT + 0.3 else [], "late"),
+    "late": (lambda t: [Heard("a", 100 + t - 0.11, wave(t))] if t > FAULT + 0.11 else [], "late"),
     "another sender": (lambda t: [good(t, "b")], "stranger"),
     "malformed": (lambda t: [decode("a", b'{"time": 3, "target": {"shoulder": "0.1"}}')], "malformed"),
 }
@@ -182,6 +182,12 @@ def test_a_burst_of_it_shorter_than_the_hold_is_survived(arm, what):
     assert recording.fault is None
     assert targets.counts["held"] >= 8 or what == "too fast"
     judge(arm, recording)
+
+
+def test_a_target_that_is_less_than_a_tenth_of_a_second_late_is_taken(arm):
+    recording, _, _, targets = live(arm, lambda t: [Heard("a", 100 + t - 0.09 * (t > FAULT), wave(t))])
+    assert recording.fault is None
+    assert set(targets.counts["refused"]) <= {"order"}, "as far as newer ones came before"
 
 
 def test_a_flood_is_read_to_its_newest_and_can_move_no_faster(arm):
