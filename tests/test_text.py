@@ -1,6 +1,7 @@
 import pytest
 
-from gaponet.text import measured
+from gaponet.errors import GAPONetError
+from gaponet.text import markdown, measured
 
 
 @pytest.mark.parametrize(
@@ -10,3 +11,20 @@ from gaponet.text import measured
 )  # fmt: skip
 def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, text):
     assert measured(value, error) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("s3://KEY:se/cret@bucket/x: no", "s3://bucket/x: no"),
+        ("'ftp://u:secret@h/x' and gs://me@b/y", "'ftp://h/x' and gs://b/y"),
+        ("s3:/KEY:se/c@ret@bucket/x", "s3://bucket/x"),
+        ("file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x", "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x"),
+    ],
+)
+def test_no_error_shows_the_keys_of_an_address(text, shown):
+    assert str(GAPONetError(text)) == shown
+
+
+def test_a_name_in_markdown_fetches_no_picture():
+    assert markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"

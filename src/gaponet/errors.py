@@ -3,13 +3,17 @@
 Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line and exits with 2.
 """
 
+from gaponet.text import without_credentials
+
 LONGEST = 1000  # characters of an error; the middle of a longer one is left out: where and what to do stand at its ends
 
 
 class GAPONetError(Exception):
-    """Base of all errors caused by input, never by a bug in gaponet. Its text is one line of printable characters."""
+    """Base of all errors caused by input, never by a bug in gaponet. Its text is one line of printable characters,
+    without the keys of an address."""
 
     def __init__(self, text: str) -> None:
+        text = without_credentials(text)
         if len(text) > LONGEST:
             text = f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text))

@@ -67,7 +67,10 @@ def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec
 
 
 def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
-    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time."""
+    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time.
+
+    Joints that no recording holds are left out of by_joint.
+    """
     joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
     no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
     rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
@@ -81,7 +84,7 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
             rows["joint"][j] += _row(run, column)
         for horizon, error in _horizons(run).items():
             rows["horizon"][horizon].append({"mpjae": error})
-    order = {"joint": joints, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
+    order = {"joint": [j for j in joints if rows["joint"][j]], **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
     order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
     total = _mean(rows[""][""]) | {"mpjae_no_wrist": _mean(rows["no_wrist"][""]).get("mpjae", float("nan"))}
     return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}

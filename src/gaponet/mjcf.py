@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 ELEMENTS = 20_000  # after <replicate> and the like: the largest public humanoids have some hundreds
 CELLS = 1 << 24  # pixels of a texture, samples of a height field
 BYTES = 256 << 20  # of one file, or of a simulation's memory
+MAX_VALUE = 1e10  # kg, kg·m², m: MuJoCo's own mjMAXVAL
 PACKAGED = Path(__file__).resolve().with_name("robots")
 # What costs no more than it says. Anything else (meshes, textures, attached models, …) is tried in the sandbox.
 PLAIN = {
@@ -64,10 +65,15 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     """The model of a specification that was read from `path`.
 
     Raises:
-        RobotError: It does not compile.
+        RobotError: It does not compile, or a mass, inertia or position in it is above MAX_VALUE.
     """
     with said(path, "does not compile"):
-        return spec.compile()
+        model = spec.compile()
+    for name in ("body_mass", "body_inertia", "body_pos", "body_ipos", "geom_pos", "jnt_pos"):
+        values = getattr(model, name)
+        if values.size and not -MAX_VALUE <= values.min() <= values.max() <= MAX_VALUE:
+            raise RobotError(f"{path}: {name.replace('_', ' ')} is above {MAX_VALUE:g} in SI units; correct it")
+    return model
 
 
 @contextmanager

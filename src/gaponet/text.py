@@ -20,3 +20,9 @@ def plain(text: str) -> str:
 def markdown(text: str) -> str:
     """The same letters in Markdown: no markup, no HTML, no end of a table's cell."""
     return re.sub(r"([\\`*\[\]<>|&$~])", r"\\\1", plain(text))
+
+
+def without_credentials(text: str) -> str:
+    """The text without user names and keys in addresses: s3://KEY:SECRET@bucket/x becomes s3://bucket/x."""
+    # A secret may hold a slash. As a path, an address has one slash after its colon.
+    return re.sub(r"(?<=:/)(/?\S*:\S*|/[^\s/@]*)@", "/", text)

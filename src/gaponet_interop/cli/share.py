@@ -8,6 +8,7 @@ import tyro
 
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
+from gaponet.text import without_credentials
 from gaponet_interop.share import move
 
 SHOWN = 20  # files of a list
@@ -21,12 +22,12 @@ def push(
 ) -> None:  # fmt: skip
     """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
     screen = Out(json)
-    moved = move.push(path, address, private, replace, prune)
-    screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {address}", moved.kind)
+    moved, shown = move.push(path, address, private, replace, prune), without_credentials(address)
+    screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {shown}", moved.kind)
     if moved.facts["pruned"]:
         screen.say(f"{moved.facts['pruned']} files of earlier pushes were removed")
-    screen.say(f"Back: gaponet pull {address} {path.name}")
-    screen.result({"kind": moved.kind, "address": address, "files": moved.files, "bytes": moved.size}
+    screen.say(f"Back: gaponet pull {shown} {path.name}")
+    screen.result({"kind": moved.kind, "address": shown, "files": moved.files, "bytes": moved.size}
                   | moved.facts)  # fmt: skip
 
 
@@ -54,5 +55,5 @@ def prune(address: Address, delete: Flag = False, hours: float = move.HOURS, jso
     if found.young:
         screen.say(f"{found.young} more may be in use: they, or the last push, are less than {hours:g} hours old")
     if found.files and not delete:
-        screen.say(f"Delete them: gaponet prune {address} --delete")
+        screen.say(f"Delete them: gaponet prune {without_credentials(address)} --delete")
     screen.result({"files": found.files, "bytes": found.size, "young": found.young, "deleted": delete})

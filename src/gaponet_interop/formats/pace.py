@@ -49,7 +49,10 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         gains: LogsFile = {}
         for name in GAINS:
             stated = arrays.pop(name, None)
-            if stated is not None and qpos is not None and stated.size in (1, *qpos.shape[1:]):
+            if stated is not None and qpos is not None and qpos.ndim in (1, 2):
+                joints = int(np.prod(qpos.shape[1:]))
+                if stated.size not in (1, joints):
+                    raise LogError(f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints")
                 arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
                 gains[name] = name  # type: ignore[literal-required]
         yield Recording.of_arrays(file, arrays, default=gains)

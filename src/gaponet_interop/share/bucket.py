@@ -9,13 +9,13 @@ No object is renamed or appended to. What an earlier push left and no index name
 from __future__ import annotations
 
 import hashlib
-import re
 import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaponet.files import MARK, whole
+from gaponet.text import without_credentials
 from gaponet_interop.share.errors import RemoteError
 from gaponet_interop.share.target import (
     BLOCK,
@@ -53,7 +53,7 @@ class Bucket:
         from pyarrow import ArrowException
         from pyarrow.fs import FileSystem
 
-        self.address = re.sub("//[^/@]*@", "//", address.partition("?")[0])  # without keys, if there are any
+        self.address = without_credentials(address.partition("?")[0])
         self._errors = (ArrowException, ValueError)
         if address.startswith(("gs:", "gcs:")) and "retry_limit_seconds=" not in address:
             address += f"{'&' if '?' in address else '?'}retry_limit_seconds={PATIENCE}"

@@ -16,6 +16,7 @@ from annotated_types import Interval, Len
 
 from gaponet.progress import bar, noted
 from gaponet.structure import Name, Sha256, parse_json
+from gaponet.text import without_credentials
 from gaponet_interop.share.errors import RemoteError
 
 Kind = Literal["dataset", "run"]
@@ -224,5 +225,5 @@ def reaching(address: str, *errors: type[Exception], but: tuple[type[Exception],
         if isinstance(error, (RemoteError, *but)) or not isinstance(error, (*errors, OSError)):
             raise
         cause = error.__cause__ or error
-        text = " ".join(str(cause).split()) or type(cause).__name__
+        text = without_credentials(" ".join(str(cause).split())) or type(cause).__name__
         raise RemoteError(f"{address}: {text[:300]}") from None

@@ -11,6 +11,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import UsageError
+from gaponet.text import markdown
 from gaponet_lab.view.film import Clip
 from gaponet_lab.view.scene import Scene
 
@@ -40,8 +41,8 @@ class WebScene:
         meta, gui = scene.shown.real.meta, self.server.gui
         gui.main_panel.dock_right()  # beside the robots, not in front of them
         head = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
-        head += f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg"
-        gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
+        head += markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
+        self.title = gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
         self.playing = gui.add_checkbox("play", True)
         self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, scene.shown.real.dt, clip.start)
         self.speed = gui.add_slider("speed", 0.05, 2.0, 0.05, min(max(clip.speed, 0.05), 2.0))

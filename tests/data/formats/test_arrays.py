@@ -85,6 +85,17 @@ def test_half_a_file_is_one_clear_error(tmp_path, arm, fmt):
 
 
 @whole
+def test_gains_of_another_number_of_joints_are_one_clear_error(tmp_path, arm):
+    import torch
+
+    WRITERS["pace"](tmp_path)
+    file = tmp_path / "a.pt"
+    torch.save(torch.load(file, weights_only=False) | {"kp": np.array([20.0, 30.0, 40.0])}, file)
+    with pytest.raises(LogError, match=r"a\.pt: kp has 3 values; give 1 or one for each of 2 joints"):
+        list(read_logs(tmp_path, arm))
+
+
+@whole
 @pytest.mark.parametrize("fmt", ["pace", "hdf5", "mat"])
 def test_an_array_without_names_asks_for_them(tmp_path, arm, fmt):
     WRITERS[fmt](tmp_path)

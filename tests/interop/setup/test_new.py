@@ -243,6 +243,7 @@ def test_a_folder_that_holds_a_robot_is_left_alone(tmp_path):
         ("arm.urdf.xacro", URDF, "expand it first: xacro"),
         ("arm.urdf", URDF.replace('<mass value="0.7"/>', ""), "arm.urdf"),
         ("arm.urdf", "<robot", "not valid"),
+        ("arm.urdf", URDF.replace('iyy="0.006"', 'iyy="1e308"'), r"arm.urdf: body inertia is above 1e\+10"),
         (
             "arm.xml",
             MJCF.replace('"hinge"', "").replace('type="slide"', 'type="ball"').replace("range", "user"),

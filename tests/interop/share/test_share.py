@@ -183,6 +183,8 @@ def test_a_pull_that_was_killed_left_nothing_under_its_name_and_goes_on(hub, dat
 def test_keys_in_an_address_stand_in_no_error_and_no_card():
     assert Bucket("s3://KEY:SECRET@robots/arm?region=us-east-1").address == "s3://robots/arm"
     assert Bucket("gs://anonymous@robots/arm?scheme=http").address == "gs://robots/arm"
+    with pytest.raises(RemoteError, match=r"^s3://robots/arm: Cannot parse URI: 's3://robots/arm'"):
+        Bucket("s3://KEY:SEC/RET@robots/arm")
 
 
 def test_a_push_to_a_disk_that_was_cut_short_is_mended(dataset, tmp_path):

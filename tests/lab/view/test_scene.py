@@ -209,8 +209,10 @@ def test_the_browser_gets_a_mesh_for_every_body_where_it_is(four):
     from gaponet_lab.view.web import WebScene
 
     scene = Scene(four)
+    object.__setattr__(four.real.meta, "motion", "![x](https:evil.example)")
     web = WebScene(scene, Clip.of(four, 0.0, 0.6), port=0)
     try:
+        assert r"!\[x\](https:evil.example)" in web.title.content
         web.playing.value = True
         web.speed.value = 1.0
         web.advance(0.2)
