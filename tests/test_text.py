@@ -19,7 +19,10 @@ def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, te
         ("s3://KEY:se/cret@bucket/x: no", "s3://bucket/x: no"),
         ("'ftp://u:secret@h/x' and gs://me@b/y", "'ftp://h/x' and gs://b/y"),
         ("s3:/KEY:se/c@ret@bucket/x", "s3://bucket/x"),
-        ("file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x", "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x"),
+        (
+            "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x",
+            "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x",
+        ),
     ],
 )
 def test_no_error_shows_the_keys_of_an_address(text, shown):

@@ -84,7 +84,8 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
             rows["joint"][j] += _row(run, column)
         for horizon, error in _horizons(run).items():
             rows["horizon"][horizon].append({"mpjae": error})
-    order = {"joint": [j for j in joints if rows["joint"][j]], **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
+    held = [j for j in joints if rows["joint"][j]]
+    order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
     order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
     total = _mean(rows[""][""]) | {"mpjae_no_wrist": _mean(rows["no_wrist"][""]).get("mpjae", float("nan"))}
     return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}

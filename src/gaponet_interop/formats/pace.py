@@ -52,7 +52,9 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             if stated is not None and qpos is not None and qpos.ndim in (1, 2):
                 joints = int(np.prod(qpos.shape[1:]))
                 if stated.size not in (1, joints):
-                    raise LogError(f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints")
+                    raise LogError(
+                        f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints"
+                    )
                 arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
                 gains[name] = name  # type: ignore[literal-required]
         yield Recording.of_arrays(file, arrays, default=gains)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
@@ -54,9 +55,15 @@ def _opened(path: Path) -> int:
     of the computer may do with this user's file."""
     for _ in range(3):
         try:
-            return os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+            # Any user of the computer may have put something there. Opening a pipe for reading would wait for a writer.
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         except FileNotFoundError:
             pass
+        else:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                os.close(descriptor)
+                raise OSError(errno.EINVAL, "it is not a regular file")
+            return descriptor
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_CREAT | os.O_EXCL, 0o644)
         except FileExistsError:  # another process was faster

@@ -52,6 +52,13 @@ def test_a_link_in_place_of_the_lock_is_not_followed(tmp_path, monkeypatch):
     assert not (tmp_path / "elsewhere").exists()
 
 
+def test_a_pipe_in_place_of_the_lock_is_refused_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(publisher, "LOCKS", tmp_path)
+    os.mkfifo(tmp_path / "gaponet-arm.lock")
+    with pytest.raises(UsageError, match="not a regular file"), sole_publisher("arm"):
+        pass
+
+
 def test_a_port_has_one_lock_whatever_name_leads_to_it(tmp_path):
     ours, theirs = os.openpty()
     port, link = os.ttyname(theirs), tmp_path / "so101"
