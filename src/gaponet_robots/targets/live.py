@@ -1,8 +1,9 @@
 """Targets that come while the robot moves, from teleoperation or from a policy in another process.
 
 A `Wire` brings what was said; `LiveTargets` judges it and is the controller's policy. A target that cannot be taken
-changes nothing: the last good one holds. Where none could be taken for a while the robot damps. What is taken goes
-through compensator, limits and watchdog as a motion's row does; docs/deploy-safety.md says what each fault ends in.
+changes nothing: the last good one holds. Where none could be taken for a while the robot damps. What is taken is
+followed within a limit of acceleration. That goes through compensator, limits and watchdog as a motion's row does;
+docs/deploy-safety.md says what each fault ends in.
 """
 
 from __future__ import annotations
@@ -38,11 +39,13 @@ class LiveConfig:
     """A target is too old that took this much longer than the fastest one, s."""
     wait: float = 60.0
     """How long to wait for the first target, s; nothing is commanded meanwhile."""
+    acceleration: float = 50.0
+    """Fastest acceleration with which targets are followed, rad/s²."""
 
     def __post_init__(self) -> None:
-        for name in ("hold", "late", "wait"):
+        for name in ("hold", "late", "wait", "acceleration"):
             if not 0 < getattr(self, name) < np.inf:
-                raise UsageError(f"live: {name} is {getattr(self, name)} s; give a positive number")
+                raise UsageError(f"live: {name} is {getattr(self, name)}; give a positive number")
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,22 @@ class Wire(Protocol):
         """Tell why the run ended, and leave."""
 
 
+def follow(step: Array, distance: Array, fastest: float, change: float) -> Array:
+    """The next step (n) rad towards a target, which it reaches as soon as it can and never overshoots.
+
+    Args:
+        step: The last one, rad per control period.
+        distance: To the target, (n) rad.
+        fastest: Largest step, rad.
+        change: Largest change of the step from one control period to the next, rad.
+    """
+    # A step of u changes, u from m to m + 1, and the m smaller ones that end it go (m + 1) u - m (m + 1) / 2 changes.
+    far = np.abs(distance)
+    m = np.floor((np.sqrt(1 + 8 * far / change) - 1) / 2)
+    largest = np.where(far <= change, far, change * (far / change + m * (m + 1) / 2) / (m + 1))
+    return np.clip(np.copysign(np.minimum(largest, fastest), distance), step - change, step + change)
+
+
 class LiveTargets:
     """The policy of a controller whose targets come over a wire.
 
@@ -131,6 +150,7 @@ class LiveTargets:
         self._sender: Hashable | None = None
         self._names: tuple[str, ...] = ()
         self._target: Array | None = None  # all joints, rad
+        self._at, self._step = np.zeros(0), np.zeros(0)  # where it is followed to, rad; the last step, rad
         self._offset = self._heard = np.inf  # least arrival − time, s; when that was
         self._time = -np.inf  # of the last target taken, sender's clock
         self._began: float | None = None
@@ -139,24 +159,40 @@ class LiveTargets:
         self._wrong = ""
 
     def __call__(self, k: int, state: State) -> Array | Fault | None:
-        """The target in force (n) rad; None where the sender has ended; a fault where none could be taken for long."""
+        """Where to be on the way to the target in force (n) rad, from the first one on, where it begins at rest.
+
+        None where the sender has ended and its last target is reached; a fault where none could be taken for long.
+        """
         now = self.clock.now()
         self._began = now if self._began is None else self._began
         names = {"joint_names": self.robot.joint_names, "commanded": self.commanded}
         readings = {name: getattr(state, name).tolist() for name in ("qpos", "qvel", "tau")}
         self.wire.publish(self._sender, {"time": state.time, **names, **readings})
-        self._listen(now, state)
-        if self._ended and (k > 0 or self._target is None):  # row 0 is also the goal of the blend
-            return None
+        if not (self._ended and k > 0):
+            self._listen(now, state)
+        ending = self._ended and (k > 0 or self._target is None)  # row 0 is also the goal of the blend
         if self._target is None:
+            if ending:
+                return None
             waited = now - self._began
             kind = NotYet if waited < self.config.wait else Fault
             return kind("silence", f"no target came on {self.wire.address} in {waited:.0f} s{self._wrong}")
         silent = now - self._taken
-        if silent > self.config.hold:
+        if silent > self.config.hold and not ending:
             return Fault("silence", f"no target that could be taken for {silent * 1e3:.0f} ms{self._wrong}")
-        self.counts["held"] += int(silent > 0)
-        return self._target
+        self._advance(self._target)
+        if ending and not self._step.any():
+            return None
+        self.counts["held"] += int(silent > 0 and not ending)
+        return self._at
+
+    def _advance(self, target: Array) -> None:
+        """Go on by one control period towards a target (n) rad."""
+        if not self._at.size:
+            self._at, self._step = target, np.zeros_like(target)
+        distance = target - self._at
+        self._step = follow(self._step, distance, self.speed * self.dt, self.config.acceleration * self.dt**2)
+        self._at = np.where(self._step == distance, target, self._at + self._step)
 
     def close(self, why: str) -> None:
         """Tell the sender that the run is over, and leave the wire."""

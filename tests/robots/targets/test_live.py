@@ -16,7 +16,7 @@ from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.safety import Limits, SafetyConfig
 from gaponet_robots.drivers.virtual import VirtualDriver
 from gaponet_robots.motion.motion import Motion
-from gaponet_robots.targets.live import LARGEST, Heard, LiveConfig, LiveTargets, decode
+from gaponet_robots.targets.live import LARGEST, Heard, LiveConfig, LiveTargets, decode, follow
 from gaponet_robots.targets.policy import play
 from gaponet_robots.virtual.fleet import load_fleet
 
@@ -98,7 +98,7 @@ def test_a_stream_is_played_as_the_same_motion_from_a_file(arm):
             before, self.last = self.last, target
             return target + 0.3 * (target - qpos) + 2.0 * (target - before)
 
-    rows = commands(60, seed=1)
+    rows = 0.5 * commands(60, seed=1)  # slow enough to be followed at once
     told = {"k": -1}
 
     def say(t):
@@ -213,6 +213,53 @@ def test_a_target_a_little_out_of_range_is_brought_into_it(arm):
     judge(arm, recording)
 
 
+@pytest.mark.parametrize("most", [50.0, 10.0])
+@pytest.mark.parametrize(
+    "shoulder",
+    [lambda t: 0.09 * (-1) ** round(t / DT), lambda t: 0.5 * np.sin(3.5 * t), lambda t: 0.05 * min(int(t / DT), 14)],
+    ids=["buzz", "swing", "a ramp that stops"],
+)
+def test_no_sender_makes_a_command_accelerate_beyond_the_limit(arm, shoulder, most):
+    config = LiveConfig(hold=HOLD, wait=3.0, acceleration=most)
+    recording, *_ = live(arm, lambda t: [Heard("a", 100 + t, {"shoulder": shoulder(t), "elbow": 0.0})], config=config)
+    assert recording.fault is None
+    at = np.array([r.ctrl[0] for r in recording.rows if r.phase == "run"])
+    assert np.abs(np.diff(at, 2)).max() <= most * DT**2 * (1 + 1e-9)
+    assert np.abs(np.diff(at)).max() <= SafetyConfig().speed * DT + 1e-12
+    judge(arm, recording)
+
+
+@pytest.mark.parametrize("rate", [0.2, 1.0, 3.0, 5.0])
+def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as_it_can_be_stopped(rate):
+    change, fastest = 50.0 * DT**2, 5.0 * DT
+    at = step = np.zeros(1)
+    for k in range(200):
+        target = np.array([rate * DT * min(k, 100)])
+        before, step = step, follow(step, target - at, fastest, change)
+        at = at + step
+        assert at <= target + 1e-12
+        assert np.abs(step - before) <= change + 1e-12
+        if k == 100:
+            assert target - at == pytest.approx(max(rate**2 / 100 - rate * DT / 2, 0), abs=1e-9)  # v²/2a, v dt/2 is done
+    assert at == pytest.approx(target)
+    assert step == pytest.approx(0, abs=1e-12)
+
+
+def test_after_its_end_a_sender_moves_the_robot_no_more(arm):
+    clock = SimulatedClock()
+    wire = Scripted(clock, lambda t: [Heard("a", 100 + t, {"shoulder": 2 * t}, end=t > 0.2)])
+    targets = LiveTargets(wire, arm, arm.joint_names, clock, DT, SafetyConfig().speed)
+    state, out = SimpleNamespace(time=0.0, qpos=np.zeros(2), qvel=np.zeros(2), tau=np.zeros(2)), []
+    for k in range(100):
+        out.append(targets(k if k > 1 else 0, state))
+        if out[-1] is None:
+            break
+        clock.wait_until(clock.now() + DT)
+    last = np.array([x[0] for x in out[2:-1]])
+    assert last[-1] == pytest.approx(2 * 0.22, abs=0.05)  # the target that came with the end
+    assert last[-1] - last[-2] <= 50 * DT**2 + 1e-12  # at rest, as far as one period can tell
+
+
 def test_joints_that_are_not_named_stay_where_they_were_found(arm):
     recording, *_ = live(arm, lambda t: [Heard("a", 100 + t, {"elbow": wave(t)["elbow"]})])
     assert recording.fault is None
@@ -285,8 +332,8 @@ def test_what_is_no_message_says_so(data):
     assert not heard.end
 
 
-def test_times_must_be_positive():
-    for name in ("hold", "late", "wait"):
+def test_times_and_acceleration_must_be_positive():
+    for name in ("hold", "late", "wait", "acceleration"):
         with pytest.raises(UsageError, match=f"live: {name} is -1"):
             LiveConfig(**{name: -1})
 
