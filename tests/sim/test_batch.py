@@ -5,9 +5,10 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from arm import write_arm
+from arm import XML, write_arm
 
 from gaponet.errors import UsageError
+from gaponet.robot import LAW, SERVO, STOPS
 from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 
@@ -156,3 +157,39 @@ def test_ramps_of_simulations_left_out_of_a_step_stand_still(tmp_path):
     sim.reset(slice(None), np.zeros(2), 0.0)
     sim.step(np.ones((2, 2)), np.array([1]))
     np.testing.assert_allclose(sim.ctrl, [[0, 0], [0.01, 0.01]])
+
+
+OTHER = {
+    "kp": 11.0, "kd": 0.7, "effort_limit": 0.4, "damping": 0.9, "armature": 0.05, "frictionloss": 0.3, "delay": 0.013,
+    "offset": 0.1, "zero": 0.2, "target_speed": 0.4, "stribeck": 0.2, "stribeck_speed": 0.3, "friction_motor": 0.4,
+    "friction_external": 0.4, "min_torque": 0.5, "encoder_step": 0.05,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("field", sorted(set(SERVO) - set(STOPS)))
+def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
+    """One joint's value changes; the other joint keeps the robot's own."""
+    robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
+    base = {"damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "kd": 0.3}
+    base |= {"delay": 0.02} if field == "delay" else dict.fromkeys(LAW, 0.02) if field in LAW else {}
+    robot = robot.with_servos(dict.fromkeys(robot.joint_names, base))
+    other, one = robot.with_servos({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
+    sims = {name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))}
+    given = {f: getattr(other, f)[1:][None] for f in (*base, "kp", "offset", field)}
+    sims["set"].set_servos(("elbow",), given)
+    targets = np.repeat(np.random.default_rng(5).uniform(-1, 1, (4, 1, 2)), 15, axis=0)
+    path = {}
+    for name, sim in sims.items():
+        sim.reset(slice(None), np.zeros((1, 2)), 0.0, past=targets[0][:, None])
+        path[name] = np.array([sim.step(target) or sim.qpos.copy() for target in targets])
+    assert np.abs(path["own"] - path["made"]).max() > 1e-3
+    # Friction holds a little less firmly where MuJoCo computed a joint's mobility with another armature.
+    np.testing.assert_allclose(path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12)
+
+
+@pytest.mark.parametrize("field", [*STOPS, "delay", *LAW])
+def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
+    robot = write_arm(tmp_path)
+    values = {f: np.full((1, 1), 0.1) for f in ("kp", "damping", "frictionloss", "armature", "offset", field)}
+    with pytest.raises(UsageError, match=f"{field} cannot differ between simulations of arm"):
+        BatchSim(robot, [(0.0, "both", 0.02)]).set_servos(("elbow",), values)

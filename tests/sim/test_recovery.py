@@ -47,6 +47,18 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
             assert std[joint][field] < value
 
 
+def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
+    robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
+    jumps = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2)).repeat(20, axis=1)
+    asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
+    weak = robot.with_servos(dict.fromkeys(robot.joint_names, {"effort_limit": 2.5}))
+    parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
+    found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False)
+    assert [t.name for t in found.tried if t.kept] == ["limit"]
+    np.testing.assert_allclose(found.robot.effort_limit, 2.5, rtol=0.05)
+    assert found.after < 0.1 * found.before
+
+
 def test_a_joint_that_stands_while_another_swings_gives_way_as_it_did(tmp_path):
     """The file's damping of the shoulder, which no command moves, is ten times too much."""
     robot = write_arm(tmp_path / "arm")

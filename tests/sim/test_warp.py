@@ -148,6 +148,7 @@ def test_the_law_of_a_physics_step_is_c_mujocos_but_for_rounding(tmp_path, parts
     ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)
     for x in ours.law.values.values():
         x[:, 0] *= [0.0, 1.0, 2.0]
+    ours.batch.expand("actuator_forcerange")[:] *= np.array([1.0, 0.5, 0.1])[:, None, None]
     theirs, rng = WarpSim(ours, "warp-cpu"), np.random.default_rng(0)
     model = theirs._worlds[0].model
     for ids in (np.arange(3), np.array([0, 2])):

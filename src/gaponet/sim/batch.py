@@ -13,7 +13,7 @@ import numpy as np
 from gaponet.arrays import like
 from gaponet.data.sequence import Sequence
 from gaponet.errors import UsageError
-from gaponet.robot import LAW, RobotSpec
+from gaponet.robot import LAW, STOPS, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoLaw, present
 
@@ -171,8 +171,7 @@ class BatchSim:
         self.timestep = np.array([self.models[c].opt.timestep for c in conditions])
         self.range = qpos_range(first)
         speed = robot.target_speed[robot.index(self.joint_names)]
-        # Most that targets move in a period, (num_envs, n); None where servos take them as they come.
-        self.most = (self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf) if speed.any() else None
+        self.most = self._farthest(speed) if speed.any() else None  # None where servos take targets as they come
 
     def array(self, values: Any) -> Array:
         """Values as this simulator's arrays are: numpy's here, tensors in sim/warp.py."""
@@ -233,28 +232,48 @@ class BatchSim:
 
         Args:
             joints: k names.
-            values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of zero, delay (up to
-                the robot's) and LAW, each (num_envs, k). A damping below zero takes from the servo's own kd.
+            values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of kd, effort_limit,
+                zero, target_speed, delay (up to the robot's) and LAW, each (num_envs, k). A damping below zero takes
+                from the servo's own kd.
+
+        Raises:
+            UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
         """
         model, batch = next(iter(self.models.values())), self.batch
+        fixed = STOPS + ("delay",) * (not model.nhistory) + LAW * (self.law is None)
+        if refused := [f for f in fixed if f in values and np.any(values[f])]:
+            raise UsageError(f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them "
+                             "to the robot (with_servos) that BatchSim is made with")  # fmt: skip
         at = np.array([model.actuator(j).id for j in joints])  # of the joint and of its degree of freedom too
+        own = self.robot.index(joints)
         gain, bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
-        kp = values["kp"] * self._stiffer[:, self.robot.index(joints)]
+        kp = values["kp"] * self._stiffer[:, own]
         gain[:, at, 0], bias[:, at, 1] = kp, -kp
         bias[:, at, 0] = kp * values["offset"]
-        kd = self._kd[:, self.robot.index(joints)]
+        kd = values.get("kd", self._kd[:, own])
         bias[:, at, 2] = -np.maximum(kd + np.minimum(values["damping"], 0.0), 0.0)
         batch.expand("dof_damping")[:, at] = np.maximum(values["damping"], 0.0)
         for name in ("frictionloss", "armature"):
             batch.expand(f"dof_{name}")[:, at] = values[name]
+        if "effort_limit" in values:
+            limit = values["effort_limit"]
+            batch.expand("actuator_forcerange")[:, at] = np.stack([-limit, limit], axis=-1)
         if "delay" in values and model.nhistory:
             batch.expand("actuator_delay")[:, at] = values["delay"]
         if "zero" in values:
-            batch.expand("qpos0")[:, at] = -values["zero"]
+            batch.expand("qpos0")[:, at] = model.qpos0[at] + self.robot.zero[own] - values["zero"]
+        if "target_speed" in values:
+            speed = np.tile(self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1))
+            speed[:, at] = values["target_speed"]
+            self.most = self._farthest(speed)
         if self.law is not None:
             self.law.bias[:, at], self.law.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
             for name in LAW:
                 self.law.values[name][:, at] = values.get(name, 0.0)
+
+    def _farthest(self, speed: Array) -> Array:
+        """Most that targets move in a period at `speed`, (…, n) rad/s, 0 for no ramp: (num_envs, n) rad."""
+        return np.asarray((self.nstep * self.timestep)[:, None] * np.where(speed > 0, speed, np.inf))
 
     def state(self) -> dict[str, Array]:
         """Copies of all that the next step follows from."""

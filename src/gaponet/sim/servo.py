@@ -143,9 +143,15 @@ class ServoLaw:
     def reset(self, ids: Array, target: Array) -> None:
         """Simulations `ids` were put into a state, under position targets (k, nu) rad."""
         asked = self._gain[ids][..., 0] * (target - self._qpos[ids]) + self.bias[ids]
-        self.torque[ids] = asked.clip(*self.model.actuator_forcerange.T)
+        self.torque[ids] = asked.clip(*np.moveaxis(self.force_range[ids], -1, 0))
         self.batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         self.load[ids] = self._passing[ids]
+
+    @property
+    def force_range(self) -> Array:
+        """Least and most torque of every simulation's actuators, (nsim, nu, 2) N·m."""
+        own = self.batch.expanded("actuator_forcerange")
+        return np.broadcast_to(self.model.actuator_forcerange, (*self._force.shape, 2)) if own is None else own
 
     def before(self) -> None:
         """Set bias and friction for the next physics step."""

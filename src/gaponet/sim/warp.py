@@ -165,7 +165,8 @@ class WarpSim:
         self._low, self._high = self.array(self.range.T)
         self._most = None if sim.most is None else self.array(sim.most)
         if sim.law:
-            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.law.bias, *sim.law.model.actuator_forcerange.T
+            limits = np.moveaxis(np.array(sim.law.force_range), -1, 0)
+            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.law.bias, *limits
             self._gain, self._bias, *self._limits = map(self.array, told)
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._late:
@@ -193,7 +194,7 @@ class WarpSim:
             self._commands.fill(ids, self.array(past), self.nstep[ids], self.timestep[ids])
         if SERVO.keys() <= self._kept.keys():
             ahead = 0.0 if past is None else self.array(past)[:, 0] - self.qpos[ids]
-            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], *self._limits)
+            self.torque[ids] = torch.clamp(self._gain[ids] * ahead + self._bias[ids], *(x[ids] for x in self._limits))
             load, before = self._all["qfrc_bias"], self._all["qfrc_bias"].clone()
             for worlds in self._in_turn():
                 worlds.launch(worlds.bias_forces)
