@@ -58,4 +58,4 @@ def __dir__() -> list[str]:
 def _of_parts() -> dict[str, str]:
     from gaponet.parts import offered
 
-    return offered("NAMES")
+    return {name: where for name, where in offered("NAMES", _HOMES).items() if name not in _HOMES}

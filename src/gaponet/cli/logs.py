@@ -15,7 +15,7 @@ from gaponet.data.checks.finding import some
 from gaponet.data.signals import FAST
 from gaponet.errors import UsageError
 from gaponet.files import writing
-from gaponet.parts import take
+from gaponet.parts import attempt, take
 from gaponet.robot import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -135,7 +135,8 @@ def formats(json: Json = False) -> None:
     from gaponet.data.formats import formats as known
 
     out = Out(json)
-    rows = {fmt: (about(fmt), module(fmt).EXTRA) for fmt in known()}
+    extras = {fmt: attempt(where, lambda fmt=fmt: str(module(fmt).EXTRA), None) for fmt, where in known().items()}  # type: ignore[misc]
+    rows = {fmt: (about(fmt), extra) for fmt, extra in extras.items() if extra is not None}
     out.table("Formats that gaponet import reads", ["format", "what it is", "needs"], [
         [fmt, what, f"gaponet[{extra}]" if extra else ""] for fmt, (what, extra) in rows.items()
     ])  # fmt: skip

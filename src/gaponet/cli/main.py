@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import ast
-import functools
 import io
 import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
+from functools import partial, wraps
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from gaponet.errors import GAPONetError, MissingPartError, UsageError, missing_extra
-from gaponet.parts import installed, named, offered
+from gaponet.parts import attempt, installed, named, offered
 from gaponet.text import plain
 
 # Task → commands; those of parts that are not installed are left out, and what somebody else's part brings comes last.
@@ -41,7 +41,7 @@ ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 def commands() -> dict[str, str]:
     """Every command of this installation → module:function."""
-    return CORE | offered("COMMANDS")
+    return offered("COMMANDS", CORE)
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
@@ -94,15 +94,19 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
     import tyro
 
     def begun(command: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(command)
+        @wraps(command)
         def run(*args: Any, **kwargs: Any) -> Any:
             begin()
             return command(*args, **kwargs)
 
         return run
 
+    wanted = known if completing else {name: known[name]}
+    found = {name: attempt(where, partial(named, where), None) for name, where in wanted.items()}
+    if not completing and found[name] is None:
+        raise MissingPartError(f"gaponet {name} is broken in the package that brings it; update that package")
     tyro.extras.subcommand_cli_from_dict(
-        {name: begun(named(known[name])) for name in (known if completing else (name,))},
+        {name: begun(command) for name, command in found.items() if command},
         prog="gaponet",
         description=ABOUT,
         args=argv,
@@ -118,12 +122,13 @@ def _overview() -> str:
     for task, names in (TASKS | {"Of other packages": others}).items():
         present = [name for name in names if name in known]
         lines += ["", task] * bool(present)
-        lines += [f"  {name:<11}{_purpose(*known[name].split(':'))}" for name in present]
+        lines += [f"  {name:<11}{attempt(known[name], partial(_purpose, known[name]), '')}" for name in present]
     return "\n".join(lines)
 
 
-def _purpose(module: str, function: str) -> str:
-    """The first sentence of a command's docstring."""
+def _purpose(where: str) -> str:
+    """Return the first sentence of a command's docstring."""
+    module, function = where.split(":")
     spec = find_spec(module)
     assert spec
     assert spec.origin

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
@@ -35,7 +34,7 @@ from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.recording import COMMAND, Recording
 from gaponet.data.log import Channel, Log, skipped
 from gaponet.errors import LogError, UsageError
-from gaponet.parts import offered
+from gaponet.parts import attempt, named, offered
 from gaponet.robot import RobotSpec
 
 CORE = {name: f"gaponet.data.formats.{name}" for name in ("sage", "table", "npz")}  # parts bring others
@@ -47,7 +46,7 @@ DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
 
 def formats() -> dict[str, str]:
     """Every format that this installation reads → its reader's module."""
-    return CORE | offered("FORMATS")
+    return offered("FORMATS", CORE)
 
 
 def module(fmt: str) -> ModuleType:
@@ -55,12 +54,14 @@ def module(fmt: str) -> ModuleType:
     known = formats()
     if fmt not in known:
         raise LogError(f"unknown format '{fmt}'; use one of {', '.join(known)}")
-    return import_module(known[fmt])
+    reader: ModuleType = named(known[fmt])
+    return reader
 
 
 def about(fmt: str) -> str:
     """What a format is, in a line."""
-    return (module(fmt).__doc__ or "").split("\n")[0].rstrip(".")
+    doc = attempt(formats()[fmt], lambda: module(fmt).__doc__, None)
+    return (doc or "").split("\n")[0].rstrip(".")
 
 
 def files_under(path: Path, suffixes: Iterable[str]) -> list[Path]:
@@ -75,7 +76,8 @@ def detect(path: Path) -> str:
     """The format of a file or folder; refuses one that could be several."""
     if not path.exists():
         raise LogError(f"{path}: does not exist")
-    found = [fmt for fmt in formats() if module(fmt).detects(path)]
+    detects = lambda fmt: bool(module(fmt).detects(path))  # noqa: E731
+    found = [fmt for fmt, where in formats().items() if attempt(where, partial(detects, fmt), False)]
     if len(found) > 1:
         ways = " or ".join(f"--format {fmt}" for fmt in found)
         raise LogError(f"{path}: could be {' and '.join(f'{f} ({about(f)})' for f in found)}; say {ways}")

@@ -39,7 +39,7 @@ class Written:
 
 def writers() -> dict[str, str]:
     """Every format that this installation writes → its writer's module."""
-    return CORE | offered("WRITERS")
+    return offered("WRITERS", CORE)
 
 
 def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = silent) -> list[Written]:
