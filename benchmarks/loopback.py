@@ -51,8 +51,8 @@ def main(
         print(served.stdout.readline().strip(), flush=True)
         time.sleep(0.5)
         recording = Controller(
-            UnitreeDriver(robot, domain=domain), robot, ControlConfig(rate=rate),
-            replace(SafetyConfig(), stale=1e6, overrun=1e6) if no_stop else SafetyConfig(),
+            UnitreeDriver(robot, domain=domain), robot, config=ControlConfig(rate=rate),
+            safety=replace(SafetyConfig(), stale=1e6, overrun=1e6) if no_stop else SafetyConfig(),
         ).run(swing(robot.qpos_home, minutes * 60, rate))  # fmt: skip
     finally:
         served.terminate()

@@ -206,13 +206,15 @@ def perform(
             _ask(screen, robot, f"as {asked.targets} says" if motion is None else "as planned")
 
     controller = Controller(
-        driver, spec, asked.control, asked.safety, compensator, clock, payload_mass=asked.payload_mass, folder=folder,
-        on_event=lambda event: _tell(screen, event), motion=motion.name if motion else "live",
-        payload_side=asked.payload_side, model=str(asked.model) if asked.model else None,
-        compensated_by=str(compensator.robot.folder) if compensator else None, calibrated=calibrated,
-        on_connect=met, planner=None if asked.unchecked else planner, unchecked=asked.unchecked,
-        limits_from=str(spec.folder), robot_hash=robot_hash(spec),
-        **facts | ({"targets": live.counts} if live else {}),
+        driver, spec, config=asked.control, safety=asked.safety, compensator=compensator, clock=clock,
+        payload_mass=asked.payload_mass, folder=folder, on_event=lambda event: _tell(screen, event), on_connect=met,
+        planner=None if asked.unchecked else planner, unchecked=asked.unchecked,
+        metadata={
+            "motion": motion.name if motion else "live", "payload_side": asked.payload_side,
+            "model": str(asked.model) if asked.model else None,
+            "compensated_by": str(compensator.robot.folder) if compensator else None, "calibrated": calibrated,
+            "limits_from": str(spec.folder), "robot_hash": robot_hash(spec),
+        } | facts | ({"targets": live.counts} if live else {}),
     )  # fmt: skip
     try:
         recording = controller.run(live, keys=True)

@@ -60,6 +60,7 @@ class Controller:
         self,
         driver: Driver,
         robot: RobotSpec,
+        *,
         config: ControlConfig | None = None,
         safety: SafetyConfig | None = None,
         compensator: Compensates | None = None,
@@ -71,7 +72,7 @@ class Controller:
         on_event: Callable[[Event], None] = lambda event: None,
         on_connect: Callable[[Driver], None] = lambda driver: None,
         folder: Path | None = None,
-        **meta: Any,
+        metadata: dict[str, Any] | None = None,
     ) -> None:
         """
         Args:
@@ -89,7 +90,7 @@ class Controller:
             on_event: Called with every change of phase.
             on_connect: Called with the driver once the robot has answered and nothing was commanded; may refuse it.
             folder: Where the recording is written as it grows, to be saved there; default a temporary file.
-            meta: Kept with the recording (unit, model…).
+            metadata: Saved with the recording (unit, model…).
         """
         self.driver, self.robot, self.compensator = driver, robot, compensator
         self.config, self.safety = config or ControlConfig(), safety or SafetyConfig()
@@ -104,7 +105,7 @@ class Controller:
         self.phase = Phase.IDLE
         self.recording = Recording(
             robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
-            meta=meta | {"payload_mass": payload_mass},
+            meta=(metadata or {}) | {"payload_mass": payload_mass},
         )  # fmt: skip
         self._folder, self._full_told = folder, False
         self._use_watchdog, self._on_event, self._on_connect = watchdog, on_event, on_connect
@@ -444,8 +445,7 @@ class Controller:
         if self._fence.near and self._fence.near != self._cut:
             self._note(now, "", f"targets are cut: {self._fence.near} would come too near")
         self._cut = self._fence.near or self._cut
-        if self.phase is not Phase.BLEND_IN:
-            self._last = out
+        self._last = out
         return out
 
     def _leave(self, ctrl: Array, weight: float, state: State) -> Fault | None:
@@ -499,7 +499,8 @@ class Controller:
             lags = self.driver.at_end == "hand_over" and way.max() >= FAR and self._handed < 1.0 - 1e-9
             if waiting or not lags:  # while it is handed over joints lag, each in its own way: it stands meanwhile
                 self._passed += self.dt
-            return self._along(at, self._found, goal), self._handed
+            self._last = self._along(at, self._found, goal)
+            return self._last, self._handed
         passed = (k - self._since) * self.dt
         if self.phase is Phase.RUN:
             if not self._weighed and passed >= WEIGHED:

@@ -43,9 +43,9 @@ class LiveConfig:
     """Fastest acceleration with which targets are followed, rad/s²."""
 
     def __post_init__(self) -> None:
-        for name in ("hold", "late", "wait", "acceleration"):
+        for name, unit in {"hold": "s", "late": "s", "wait": "s", "acceleration": "rad/s²"}.items():
             if not 0 < getattr(self, name) < np.inf:
-                raise UsageError(f"live: {name} is {getattr(self, name)}; give a positive number")
+                raise UsageError(f"live: {name} is {getattr(self, name)} {unit}; give a positive number")
 
 
 @dataclass(frozen=True)

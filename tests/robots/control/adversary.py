@@ -213,7 +213,9 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
             target[rng.integers(len(target))] = rng.choice([np.nan, np.inf, 1e300])
         return target if k < length else None
 
-    controller = Controller(driver, robot, QUICK, SAFETY, Wild(rng, clock), clock, unchecked=True)
+    controller = Controller(
+        driver, robot, config=QUICK, safety=SAFETY, compensator=Wild(rng, clock), clock=clock, unchecked=True
+    )
     controller.dt = DT
     with contextlib.suppress(RuntimeError):
         controller.run(policy)

@@ -76,7 +76,7 @@ class Tampered(VirtualDriver):
 
 
 def run(robot: RobotSpec, driver: VirtualDriver, motion: Motion = MOTION, **how: object) -> Recording:
-    controller = Controller(driver, robot, how.pop("config", QUICK), clock=driver.clock, **how)
+    controller = Controller(driver, robot, config=how.pop("config", QUICK), clock=driver.clock, **how)
     return controller.run(play(motion, controller.dt))
 
 
@@ -118,7 +118,7 @@ def test_nothing_is_collected_while_it_runs_and_nothing_piles_up_for_it(arm):
 
 
 def test_its_recording_can_be_imported_and_trained_on(arm, tmp_path):
-    recording = run(arm, Tampered(arm, SimulatedClock()), unit_id="virtual-1", payload_mass=0.0)
+    recording = run(arm, Tampered(arm, SimulatedClock()), metadata={"unit_id": "virtual-1"}, payload_mass=0.0)
     meta = SequenceMeta(arm.name, "virtual-1", "sway", 0.0, virtual=True)
     sequence = to_sequence(recording.log(), arm, meta)
     assert sequence.meta.notes["rows"] == "as recorded"
@@ -194,7 +194,7 @@ def test_a_robot_is_commanded_after_five_good_states_in_a_row(arm):
 @pytest.mark.parametrize("how", ["call", "signal"])
 def test_a_stop_takes_effect_in_the_next_period(arm, how):
     driver = Tampered(arm, SimulatedClock())
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     motion = play(MOTION, 0.02)
 
     def policy(k, state):
@@ -241,7 +241,7 @@ def test_a_joint_that_is_far_from_its_command_for_a_quarter_of_a_second_stops_th
 
 def test_a_stop_is_latched(arm):
     driver = Tampered(arm, SimulatedClock())
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     controller.stop("first")
     controller.stop("second")
     assert phases(controller.run(play(MOTION, 0.02))) == ["idle", "stopped"]
@@ -259,14 +259,16 @@ def test_from_damp_the_only_way_is_to_stopped():
 
 def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
     driver = Tampered(arm, SimulatedClock())
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     recording = controller.run(lambda k, state: np.full(2, np.nan if k == 10 else 0.0))
     assert recording.fault.kind == "target"
     assert sum(r.phase == "run" for r in recording.rows) == 10, "damped in the period in which it is seen"
 
     driver = Tampered(arm, SimulatedClock())
     with pytest.raises(ZeroDivisionError):
-        Controller(driver, arm, QUICK, clock=driver.clock).run(lambda k, state: np.zeros(2) / (1 if k < 9 else 1 // 0))
+        Controller(driver, arm, config=QUICK, clock=driver.clock).run(
+            lambda k, state: np.zeros(2) / (1 if k < 9 else 1 // 0)
+        )
     damping = [t for t, ctrl in driver.sent if ctrl is None]
     assert damping[-1] - damping[0] >= QUICK.damp, "the whole damping, as after any other fault"
     assert driver.sent[-1][1] is None
@@ -279,7 +281,7 @@ def test_a_listener_that_fails_does_not_keep_the_robot_from_damping(arm):
 
     driver = Tampered(arm, SimulatedClock())
     with pytest.raises(BrokenPipeError):
-        Controller(driver, arm, QUICK, clock=driver.clock, on_event=broken).run(play(MOTION, 0.02))
+        Controller(driver, arm, config=QUICK, clock=driver.clock, on_event=broken).run(play(MOTION, 0.02))
     assert driver.sent[-1][1] is None
 
 
@@ -312,7 +314,7 @@ def test_a_period_that_stood_still_sends_nothing(arm, where):
         stand("policy")
         return motion(k, state)
 
-    recording = Controller(driver, arm, QUICK, compensator=Model(), clock=clock).run(policy)
+    recording = Controller(driver, arm, config=QUICK, compensator=Model(), clock=clock).run(policy)
     assert stood
     assert recording.fault.kind == "overrun"
     assert all(ctrl is None for t, ctrl in driver.sent if t > stood[0])
@@ -357,6 +359,28 @@ def test_a_fault_while_little_is_handed_over_damps_with_that_little(arm):
     assert 0 < max(weights) < 0.7, "the robot keeps what it held"
 
 
+@pytest.mark.parametrize("rows", [0, 1])
+def test_a_policy_that_ends_at_its_first_step_goes_back(arm, rows):
+    """Its only target is the goal of the blend: row 0, or where the robot was found if even that is no more given."""
+    driver, controller = Tampered(arm, SimulatedClock()), None
+
+    def policy(k, state):
+        return np.full(2, 0.2) if controller.phase.value in ("idle", "blend_in")[: 1 + rows] else None
+
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
+    recording = controller.run(policy)
+    assert recording.fault is None
+    assert phases(recording) == ["idle", "blend_in", "run", "blend_out", "stopped"]
+    furthest = max(ctrl[0] for _, ctrl in driver.sent)
+    assert furthest == pytest.approx(0.2 if rows else driver.sent[0][1][0], abs=0.02)
+
+
+@pytest.mark.parametrize("option", ["safetyconfig", "wachdog"])
+def test_a_misspelt_option_of_a_controller_is_refused(arm, option):
+    with pytest.raises(TypeError, match=option):
+        Controller(Tampered(arm, SimulatedClock()), arm, **{option: False})
+
+
 def test_a_slow_policy_is_an_overrun(arm):
     driver = Tampered(arm, SimulatedClock())
 
@@ -365,7 +389,7 @@ def test_a_slow_policy_is_an_overrun(arm):
             driver.clock.wait_until(driver.clock.now() + 0.09)
         return np.zeros(2) if k < 20 else None
 
-    recording = Controller(driver, arm, QUICK, clock=driver.clock).run(policy)
+    recording = Controller(driver, arm, config=QUICK, clock=driver.clock).run(policy)
     assert recording.fault.kind == "overrun"
     assert recording.missed == 3
 
@@ -490,7 +514,7 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
 
     clock, watchdog = SimulatedClock(), Watchdog()
     driver = Tampered(arm, clock)
-    controller = Controller(driver, arm, QUICK, compensator=Slow(), clock=clock)
+    controller = Controller(driver, arm, config=QUICK, compensator=Slow(), clock=clock)
     controller._watchdog = watchdog
     recording = controller.run(play(MOTION, controller.dt))
     assert recording.fault is None

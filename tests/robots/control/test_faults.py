@@ -61,7 +61,9 @@ def once(at_fault: Callable[[], object], injected: list[float]) -> Recording:
             at_fault()
         return swing(k) if k < AT + 30 else None
 
-    return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, watchdog=False).run(policy)
+    return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=SAFETY, watchdog=False).run(
+        policy
+    )
 
 
 def steady(served: RobotProcess, attempt: Callable[[list[float]], Any], kind: str = "", tries: int = 8) -> Any:
@@ -145,7 +147,9 @@ def test_a_step_of_the_robots_clock_is_no_fault_and_hides_none(served):
                 served.ask(word)
             return swing(k)
 
-        return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY, watchdog=False).run(policy)
+        return Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=SAFETY, watchdog=False).run(
+            policy
+        )
 
     recording = steady(served, attempt, "stale")
     assert recording.fault.kind == "stale", recording.fault.text
@@ -171,7 +175,7 @@ def test_a_robot_that_comes_back_is_not_commanded_again(served):
         robots.append(RobotProcess(domain))
         driver = UnitreeDriver(ROBOT, domain=domain, sole=False)  # DDS remembers for a while who commanded before
         try:
-            return Controller(driver, ROBOT, config, SAFETY, watchdog=False, on_event=told).run(policy)
+            return Controller(driver, ROBOT, config=config, safety=SAFETY, watchdog=False, on_event=told).run(policy)
         finally:
             if not injected:
                 robots[-1].kill()
@@ -196,11 +200,13 @@ def test_a_g1_is_refused_and_hears_nothing(served):
 
 def test_a_stop_before_the_start_and_a_robot_that_is_never_ready_send_nothing(served):
     served.ask("clear")
-    controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY)
+    controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=SAFETY)
     controller.stop("before the start")
     assert controller.run(lambda k, state: swing(k)).fault.kind == "stop"
     cold = SafetyConfig(acceleration=5.0, temperature=1.0)
-    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, cold).run(lambda k, state: swing(k))
+    recording = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=cold).run(
+        lambda k, state: swing(k)
+    )
     assert recording.fault.kind == "temperature"
     time.sleep(0.3)
     assert served.ask("heard")["time"] == []
@@ -209,7 +215,7 @@ def test_a_stop_before_the_start_and_a_robot_that_is_never_ready_send_nothing(se
 def test_a_good_run_ends_with_the_arms_held_until_they_are_the_robots_again(served):
     rest = lambda k, state: ROBOT.qpos_home if k < 10 else None  # noqa: E731
     driver = lambda: UnitreeDriver(ROBOT, domain=DOMAIN)  # noqa: E731
-    recording = steady(served, lambda _: Controller(driver(), ROBOT, SLOW, SAFETY).run(rest))
+    recording = steady(served, lambda _: Controller(driver(), ROBOT, config=SLOW, safety=SAFETY).run(rest))
     assert recording.fault is None
     heard = served.ask("heard")
     held = ROBOT.index(recording.commanded)
@@ -245,7 +251,8 @@ class Slow:
     def reset(self, target, payload_mass=None):
         print("preparing", flush=True)
         time.sleep(60)
-Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY, Slow()).run(lambda k, state: swing(k))
+driver = UnitreeDriver(ROBOT, domain=int(sys.argv[1]))
+Controller(driver, ROBOT, config=SLOW, safety=SAFETY, compensator=Slow()).run(lambda k, state: swing(k))
 """
 
 
@@ -268,7 +275,8 @@ import sys
 from robots.control.test_faults import ROBOT, SAFETY, SLOW, swing
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.drivers.unitree import UnitreeDriver
-Controller(UnitreeDriver(ROBOT, domain=int(sys.argv[1])), ROBOT, SLOW, SAFETY).run(lambda k, state: swing(k))
+driver = UnitreeDriver(ROBOT, domain=int(sys.argv[1]))
+Controller(driver, ROBOT, config=SLOW, safety=SAFETY).run(lambda k, state: swing(k))
 """
 
 

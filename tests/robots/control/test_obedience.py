@@ -132,7 +132,7 @@ def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched:
             controller.stop("the operator")
         return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
 
-    controller = Controller(SO101Driver(so101, timeout=0.001), so101, QUICK, clock=clock, watchdog=False)
+    controller = Controller(SO101Driver(so101, timeout=0.001), so101, config=QUICK, clock=clock, watchdog=False)
     if watched:
         controller._watchdog = watched
         controller._start_watchdog = lambda lock, stack: stack.callback(lambda: watched.release(controller._loose))
@@ -288,7 +288,7 @@ def swing(
 
     config = ControlConfig(blend=1.5, settle=0.1, damp=1.0)
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
-    recording = Controller(driver, robot, config, clock=clock, watchdog=False, payload_mass=told).run(policy)
+    recording = Controller(driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told).run(policy)
     return recording, clock.robot.heard.weight
 
 
@@ -340,7 +340,7 @@ def test_a_run_in_which_nothing_moves_shows_nothing_and_is_no_data(monkeypatch):
     driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
     rest = lambda k, state: robot.qpos_home if k < 10 else None  # noqa: E731
     recording = Controller(
-        driver, robot, ControlConfig(blend=0.3, settle=0.0, damp=0.3), clock=clock, watchdog=False
+        driver, robot, config=ControlConfig(blend=0.3, settle=0.0, damp=0.3), clock=clock, watchdog=False
     ).run(rest)
     assert recording.fault is None
     assert recording.events[-1].text == "no data: no joint was told to go far enough to show whether the robot obeys"

@@ -98,7 +98,7 @@ def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.nd
 
     stands = dataclasses.replace(robot, qpos_home=found)
     driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock)
-    return Controller(driver, robot, QUICK, clock=clock), sent
+    return Controller(driver, robot, config=QUICK, clock=clock), sent
 
 
 def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):

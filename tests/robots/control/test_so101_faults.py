@@ -86,7 +86,7 @@ def once(servos: ServoProcess, fault: str) -> Recording:
             servos.tell(fault)
         return None if k > 12 else np.array([0.2 * np.sin(0.3 * k), *np.zeros(5)])
 
-    return Controller(driver, ROBOT, SLOW, CALM, watchdog=False).run(policy)
+    return Controller(driver, ROBOT, config=SLOW, safety=CALM, watchdog=False).run(policy)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_a_cable_that_is_pulled_ends_the_run(servos):
             servos.process.wait()
         return None if k > 12 else np.zeros(6)
 
-    recording = Controller(driver, ROBOT, SLOW, CALM, watchdog=False).run(policy)
+    recording = Controller(driver, ROBOT, config=SLOW, safety=CALM, watchdog=False).run(policy)
     assert recording.fault.kind in ("driver", "stale", "overrun")
 
 
@@ -149,7 +149,7 @@ def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(ser
         "    if k == 5: print('moving', flush=True)\n"
         "    return np.zeros(6)\n"
         f"driver, calm = SO101Driver(robot, sys.argv[1], timeout={TIMEOUT}), SafetyConfig(acceleration=2.0)\n"
-        "Controller(driver, robot, config, calm).run(policy)\n"
+        "Controller(driver, robot, config=config, safety=calm).run(policy)\n"
     )
     controller = subprocess.Popen([sys.executable, "-c", script, servos.port], stdout=subprocess.PIPE)
     try:

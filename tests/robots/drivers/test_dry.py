@@ -34,7 +34,7 @@ def test_a_dry_run_goes_through_the_motion_and_sends_nothing(arm):
     clock = SimulatedClock()
     driver = DryRun(Deaf(arm, load_fleet("easy", arm).unit("virtual-1"), clock))
     config = ControlConfig(blend=0.3, blend_speed=4.0, settle=0.1, damp=0.1)
-    controller = Controller(driver, arm, config, clock=clock)
+    controller = Controller(driver, arm, config=config, clock=clock)
     recording = controller.run(play(MOTION, 0.02))
     assert recording.fault is None
     sent = would_send(recording, controller.limits)
