@@ -51,7 +51,7 @@ def test_motors_of_half_the_torque_that_the_file_says_come_back(tmp_path):
     robot, template = write_arm(tmp_path / "arm"), recordings(write_arm(tmp_path / "arm"), 1, rows=80)[0]
     jumps = np.random.default_rng(0).uniform(-1, 1, (3, 4, 2)).repeat(20, axis=1)
     asked = [replace(template, ctrl=c, meta=replace(template.meta, motion=f"m{i}")) for i, c in enumerate(jumps)]
-    weak = robot.with_servos(dict.fromkeys(robot.joint_names, {"effort_limit": 2.5}))
+    weak = robot.with_servos({joint: {"effort_limit": 2.5} for joint in robot.joint_names})
     parts = [replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(asked, replay(asked, weak), strict=True)]
     found = identify(parts[:2], robot, parts[2:], windows=2, terms=("limit",), table=False)
     assert [t.name for t in found.tried if t.kept] == ["limit"]
