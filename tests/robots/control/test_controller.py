@@ -251,6 +251,12 @@ def test_a_stop_is_latched(arm):
         controller.run(play(MOTION, 0.02))
 
 
+@pytest.mark.parametrize(("field", "value"), [("rate", 0.5), ("rate", 1001.0), ("rate", np.nan), ("damp", 0.0)])
+def test_times_that_no_run_can_have_are_refused(field, value):
+    with pytest.raises(UsageError, match=f"{field} is {value:g}"):
+        ControlConfig(**{field: value})
+
+
 def test_from_damp_the_only_way_is_to_stopped():
     assert NEXT[Phase.DAMP] == (Phase.STOPPED,)
     assert NEXT[Phase.STOPPED] == ()
