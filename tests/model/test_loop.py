@@ -75,6 +75,25 @@ class TorchRule:
         return Bound(x, delta, lambda: delta.copy_(x @ weights))
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("when", [0, 5])
+@pytest.mark.parametrize("tensors", [False, True])
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(bad, when, tensors):
+    config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
+    rule, rng = TorchRule(config), np.random.default_rng(1)
+    kind = torch.from_numpy if tensors else np.asarray
+    hit, clean = (DeltaLoop(config, limits, 3, rule if tensors else rule.numpy()) for _ in range(2))
+    for t in range(10):
+        q, v, a = rng.normal(0, 0.3, (3, 3, 2)).astype(np.float32)
+        held, payload = a.copy(), np.zeros(3, np.float32)
+        if t == when:
+            held[1, 0] = np.asarray(clean.applied)[1, 0] if t else q[1, 0]
+            a[1, 0] = bad
+        told = [loop.delta(*map(kind, (q, v, ctrl, payload))) for loop, ctrl in ((hit, a), (clean, held))]
+        np.testing.assert_array_equal(*map(np.asarray, told))
+        np.testing.assert_array_equal(*(np.asarray(loop.applied) for loop in (hit, clean)))
+
+
 @pytest.mark.parametrize("change", [{}, {"stride": 3}, {"payload_input": False}])
 def test_torch_and_numpy_arrays_give_the_same_corrections(change):
     config = ModelConfig(**{"history": 3} | change)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array, library, zeros_like
+from gaponet.arrays import Array, copy_of, library, zeros_like
 from gaponet.errors import UsageError
 from gaponet.model.backends import Bound, Network
 from gaponet.model.config import ModelConfig
@@ -99,7 +99,8 @@ class DeltaLoop:
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
         """The correction for the coming control period; ask exactly once per period.
 
-        What the history then holds as the target of this period is ctrl + Δa, so apply that.
+        What the history then holds as the target of this period is ctrl + Δa, so apply that. A target that is no
+        finite number counts as the last one applied; `applied` is finite then, while ctrl + Δa is not.
 
         Args:
             qpos, qvel: State now, (num_envs, n) or, for one robot, (n,); rad, rad/s.
@@ -113,6 +114,8 @@ class DeltaLoop:
             UsageError: Arrays of another shape.
         """
         q, v, a = self._rows(qpos, qvel, ctrl)
+        if not (self._host and np.vdot(a, a) < np.inf):  # the cheapest test of finite numbers
+            a = self._finite(q, a)
         self.observe(q, v, a, payload_mass)
         self.bound.run()
         self.applied = self._xp.minimum(self._xp.maximum(a + self.bound.delta, self.low), self.high)
@@ -140,6 +143,16 @@ class DeltaLoop:
         return wanted + offset
 
     # ---- parts
+
+    def _finite(self, q: Any, a: Any) -> Any:
+        """Targets, with the last one applied, of robots without a past the state, where they are no finite numbers.
+
+        Else the correction would be none either, would enter the history, and no later one would be a number.
+        """
+        a, last = a.reshape(-1, self.n), copy_of(self.history.target)
+        if self.any_fresh:
+            last[self.fresh] = q.reshape(-1, self.n)[self.fresh]
+        return self._xp.where(self._xp.isfinite(a), a, last)
 
     def _rows(self, *given: Any) -> tuple[Any, ...]:
         rows = tuple(map(np.asarray, given)) if self._host else given

@@ -90,14 +90,21 @@ class Aligner:
         self.past = Past(module, num_envs, facts.get("model", {}).get("depth", 1), len(corrected), device)
         mass = facts["payload_mass"] if payload_mass is None else payload_mass
         self.payload_mass = torch.full((num_envs,), float(mass), device=device)
+        self.sent = torch.zeros(num_envs, len(joint_names), device=device)
 
     @torch.no_grad()
     def __call__(self, qpos: Tensor, qvel: Tensor, target: Tensor) -> Tensor:
-        """State and targets now, (num_envs, joints) rad, rad/s, rad → what to send for this control period."""
+        """State and targets now, (num_envs, joints) rad, rad/s, rad → what to send for this control period.
+
+        A target that is no finite number counts as what was sent last; in worlds that begin anew, as the state.
+        """
+        last = torch.where(self.past.fresh[:, None], qpos, self.sent)
+        target = torch.where(torch.isfinite(target), target, last)
         q, v, a = (x[:, self.columns].float() for x in (qpos, qvel, target))
         out = target.clone()
         out[:, self.columns] = (a + self.past.delta(q, v, a, self.payload_mass)).to(out.dtype)
-        return torch.minimum(torch.maximum(out, self.low), self.high)
+        self.sent = torch.minimum(torch.maximum(out, self.low), self.high)
+        return self.sent
 
 
 class AlignedAction:

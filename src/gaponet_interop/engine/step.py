@@ -47,11 +47,13 @@ class DeltaStep(nn.Module):
         """Δa (B, n) rad, within the joint limits, and the new past; gradients do not reach earlier periods.
 
         Args:
-            qpos, qvel, ctrl: (B, n) rad, rad/s, rad.
+            qpos, qvel, ctrl: (B, n) rad, rad/s, rad; a target that is no finite number counts as the last one applied.
             payload_mass: (B,) kg.
             frames: The past, newest first, (B, depth, 3n).
             fresh: Worlds without a past, (B,) bool: the present frame, repeated, is theirs.
         """
+        last = torch.where(fresh[:, None], qpos, frames[:, 0, 2 * self.n :])
+        ctrl = torch.where(torch.isfinite(ctrl), ctrl, last)  # anything else would stay in the past for ever
         state = torch.cat([qpos, qvel], dim=1)
         now = torch.cat([state, ctrl], dim=1).detach()
         frames = torch.where(fresh[:, None, None], now[:, None], frames)

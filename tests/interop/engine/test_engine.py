@@ -101,6 +101,29 @@ def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
     assert not torch.equal(now[1], first[1])
 
 
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("when", [0, 2])
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(place, model, bad, when):
+    aligners = [Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu") for _ in range(2)]
+    step = program(delta_step(model, place / "run")).module()
+    frames, fresh = [torch.zeros(3, 3, 6)] * 2, torch.ones(3, dtype=torch.bool)
+    for t in range(6):
+        q, v, a = drawn(3, seed=t)
+        targets, held = [a.clone(), a.clone()], a.clone()
+        if t == when:
+            targets[0][1, 0] = bad
+            targets[1][1, 0] = aligners[1].sent[1, 0] if t else q[1, 0]
+            held[1, 0] = frames[1][1, 0, 4] if t else q[1, 0]
+        sent = [aligner(q, v, target) for aligner, target in zip(aligners, targets, strict=True)]
+        assert torch.equal(*sent)
+        assert sent[0].isfinite().all()
+        made = [step(q, v, b, torch.zeros(3), f, fresh) for b, f in zip((targets[0], held), frames, strict=True)]
+        frames, fresh = [f for _, f in made], torch.zeros_like(fresh)
+        assert torch.equal(made[0][0], made[1][0])
+        assert torch.equal(*frames)
+        assert frames[0].isfinite().all()
+
+
 def test_gradients_reach_the_present_command_and_no_earlier_one(model, place):
     step = program(delta_step(model, place / "run")).module()
     frames, fresh, payload = torch.zeros(2, 3, 6), torch.ones(2, dtype=torch.bool), torch.zeros(2)
