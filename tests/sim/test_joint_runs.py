@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from arm import TOML, recordings, write_arm
+from arm import TOML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.eval.verdict import verdict
@@ -108,3 +108,23 @@ def test_no_joint_flies_away_where_gravity_is_stiffer_than_its_servo():
     for errors in (runs.errors(values), runs._arrays(values)):
         assert (np.abs(errors).max(axis=(2, 3)) <= way).all()
         assert np.abs(errors[2]).max() > 0.3  # the softest falls
+
+
+def test_windows_at_several_rates_each_run_at_their_own(tmp_path):
+    """Two seconds of one servo, recorded at 50, at 100 and at 400 Hz: its numbers explain all of them."""
+    robot = write_arm(tmp_path)
+    acting = robot.with_servos({j: FIRST | {"kp": 14.0, "delay": 0.03, "damping": 0.8} for j in robot.joint_names})
+    template, parts = recordings(robot, 1)[0], []
+    for motion, dt in enumerate([0.02, 0.01, 0.01, 0.0025]):
+        rows = round(2 / dt)
+        ctrl = commands(rows, motion, dt)
+        asked = Sequence(template.meta, robot.joint_names, dt, ctrl, np.tile(ctrl[0], (rows, 1)), 0 * ctrl)
+        (twin,) = replay([asked], acting)
+        parts.append(replace(asked, qpos=twin.qpos, qvel=twin.qvel))
+    runs = JointRuns(parts, robot)
+    values = {f: np.array([getattr(acting, f)]) for f in FIRST}
+    first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(axis=(0, 1, 3))
+    assert (np.abs(runs.errors(values)).mean(axis=(0, 1, 3)) < 0.1 * first).all()
+    np.testing.assert_allclose(runs._arrays(values) * runs.counted, runs.errors(values), atol=2e-4)
+    np.testing.assert_allclose(runs.counted.sum(axis=1), [95, 190, 190, 190], atol=5)  # no row in less than 10 ms
+    np.testing.assert_allclose(runs.regressed()["kp"], 14.0, rtol=0.35)  # where a search starts

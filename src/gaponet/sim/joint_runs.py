@@ -51,15 +51,16 @@ class JointRuns:
     def __init__(self, parts: list[Sequence], robot: RobotSpec, below: float = -np.inf, nthread: int = 0) -> None:
         """
         Args:
-            parts: Windows at one control period.
+            parts: Windows, each at its own control period.
             robot: Stops, zeros, limits and inertias are its own.
             below: Height (m) under which a tip counts as touching.
             nthread: Threads of the compiled runs, 0 for all cores.
         """
         self.parts, self.robot, self.op = parts, robot, robot.operated_index
         self.nthread = nthread or os.cpu_count() or 1
-        self.dt = float(np.median([p.dt for p in parts]))
-        self.count = robot.steps_per(self.dt)
+        self.periods = np.array([p.dt for p in parts])  # (windows,) s
+        self.dt = float(self.periods.max())
+        self.count = robot.steps_per(self.dt)  # of every period, so that all windows step side by side
         self.thin = max(1, round(THIN / self.dt))
         rows = max(map(len, parts))
         made: dict[tuple[float, str], _Along] = {}
@@ -67,7 +68,8 @@ class JointRuns:
             key = (p.meta.payload_mass, p.meta.payload_side)
             if key not in made:
                 made[key] = _Along(robot, build_model(robot, *key, self.dt, bare=True))
-        along = [made[p.meta.payload_mass, p.meta.payload_side].follow(p, self.thin) for p in parts]
+        thins = self._thins()
+        along = [made[p.meta.payload_mass, p.meta.payload_side].follow(p, thins[i]) for i, p in enumerate(parts)]
         low, high = robot.qpos_range[self.op].T
         # (n, windows, rows) each, so that a run reads what lies side by side.
         stack = lambda xs: np.stack([_held(x, rows) for x in xs]).transpose(2, 0, 1).astype(np.float32)  # noqa: E731
@@ -75,7 +77,7 @@ class JointRuns:
         self.ctrl = stack([np.clip(p.ctrl[:, self.op], low, high) for p in parts])
         if (speed := robot.target_speed[self.op]).any():
             most = np.where(speed > 0, speed, np.inf)[:, None]
-            slow = ramped(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.dt)
+            slow = ramped(np.moveaxis(self.ctrl, -1, 0), self.qpos[..., 0], most, self.periods)
             self.ctrl = np.ascontiguousarray(np.moveaxis(slow, 0, -1))
         self.qvel = stack([p.qvel[:, self.op] for p in parts])
         # In the middle of each period: inertia, gravity's torque at an angle of zero, the others' pull, its slope.
@@ -98,12 +100,19 @@ class JointRuns:
         self.stiffer = np.array([(r.kp / robot.kp)[self.op] for r in set_to])
         self.kd = np.array([r.kd[self.op] for r in set_to])
 
+    def _thins(self) -> Array:
+        """Rows of each window from one that is compared to the next, (windows,): multiples of `thin`."""
+        return self.thin * np.maximum(1, np.round(THIN / self.periods / self.thin)).astype(int)
+
     def _counted(self) -> Array:
         """Rows that count, (windows, rows): after the start has settled, away from what may be touched."""
-        rows, after = self.touch.shape[1], round(SETTLE / self.dt)
-        near = np.array([self.touch[:, max(0, t - after) : t + 1].any(axis=1) for t in range(rows)]).T
-        time = np.arange(rows)
-        counted = (time > max(after, 1)) & (time < self.lengths[:, None]) & ~near
+        rows, after = self.touch.shape[1], np.round(SETTLE / self.periods).astype(int)
+        near = np.zeros_like(self.touch)
+        for k in np.unique(after):
+            touch = self.touch[after == k]
+            near[after == k] = np.array([touch[:, max(0, t - k) : t + 1].any(axis=1) for t in range(rows)]).T
+        time, thin = np.arange(rows), self._thins()[:, None]
+        counted = (time > np.maximum(after, 1)[:, None]) & (time < self.lengths[:, None]) & ~near & (time % thin == 0)
         return np.asarray(counted[:, :: self.thin])
 
     @property
@@ -120,7 +129,8 @@ class JointRuns:
         """The same windows, put back on the recording every so many seconds: a smoother surface to descend on."""
         short = copy.copy(self)
         short.touch = self.touch.copy()
-        short.touch[:, :: max(round(seconds / self.dt), 1)] = True
+        for touch, period in zip(short.touch, self.periods, strict=True):
+            touch[:: max(round(seconds / period), 1)] = True
         short.counted = short._counted()
         return short
 
@@ -133,16 +143,16 @@ class JointRuns:
         window = np.repeat(np.arange(len(self.lengths)), self.lengths)
         part = slice(None, None, max(1, len(period) // MOST))
         for j in range(n):
-            smooth = [lowpass(self.qpos[j, w, :k, None].astype(float), self.dt, CUTOFF)[:, 0]
+            smooth = [lowpass(self.qpos[j, w, :k, None].astype(float), self.periods[w], CUTOFF)[:, 0]
                       for w, k in enumerate(self.lengths)]  # fmt: skip
-            q = np.concatenate(smooth)
-            v = np.concatenate([np.gradient(x, self.dt) for x in smooth])
-            a = np.concatenate([np.gradient(np.gradient(x, self.dt), self.dt) for x in smooth])
+            speed = [np.gradient(x, dt) for x, dt in zip(smooth, self.periods, strict=True)]
+            q, v = np.concatenate(smooth), np.concatenate(speed)
+            a = np.concatenate([np.gradient(x, dt) for x, dt in zip(speed, self.periods, strict=True)])
             inertia, weight, pull, slope = self.tables[:, j, window, period]
             asked = inertia * a + weight + slope * q + pull
             least = np.inf
             for delay in np.arange(0.0, LATEST, max(self.dt / 2, 5e-3)):
-                rows = period - delay / self.dt
+                rows = period - delay / self.periods[window]
                 whole = np.floor(rows).astype(int)
                 aim = [self.ctrl[j, window, np.clip(whole + i, 0, self.lengths[window] - 1)] for i in (0, 1)]
                 error = aim[0] + (rows - whole) * (aim[1] - aim[0]) - q
@@ -177,7 +187,7 @@ class JointRuns:
         kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
         own, mass, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
         damping, limit = own + kd, v.get("effort_limit", _filled(self.robot.effort_limit[self.op][:, None], shape))
-        h = np.float32(self.dt / self.count)
+        h = _filled(self.periods / self.count, shape)
         low, high = (_filled(x[:, None], shape) for x in self.stops.T)
         driven = bool(kd.any())
         q, w = _filled(self.qpos[..., 0], shape), _filled(self.qvel[..., 0], shape)
@@ -207,12 +217,12 @@ class JointRuns:
     def _targets(self, t: int, delay: Array) -> Array:
         """The commands in force in the physics steps of a period, (count, k, n, windows); a part of each where they
         change on the way."""
-        at = np.arange(self.count)[:, None, None] / self.count - delay / self.dt  # rows from t
+        at = np.arange(self.count)[:, None, None, None] / self.count - delay[..., None] / self.periods  # rows from t
         row = np.floor(at).astype(int)
-        share = np.maximum((at - row - 1) * self.count + 1, 0)[..., None].astype(np.float32)
+        share = np.maximum((at - row - 1) * self.count + 1, 0).astype(np.float32)
         last, joint = self.lengths - 1, np.arange(len(self.op))[:, None]
         window = np.arange(len(self.lengths))
-        first, then = (self.ctrl[joint, window, np.clip(t + row[..., None] + more, 0, last)] for more in (0, 1))
+        first, then = (self.ctrl[joint, window, np.clip(t + row + more, 0, last)] for more in (0, 1))
         return np.asarray((1 - share) * first + share * then)
 
 
@@ -271,7 +281,7 @@ def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
     out = np.zeros((k, n * windows, runs.counted.shape[1]), np.float32)
     cuts = np.linspace(0, n * windows, runs.nthread + 1).astype(int)
     rest = (packed, law, runs.tables, runs.ctrl, runs.qpos, runs.qvel, runs.touch, runs.lengths, runs.stiffer, runs.kd,
-            runs.stops, runs.dt, runs.count, runs.thin, out)  # fmt: skip
+            runs.stops, runs.periods, runs.count, runs.thin, out)  # fmt: skip
     with ThreadPoolExecutor(runs.nthread) as pool:
         list(pool.map(lambda a, b: advance(a, b, *rest), cuts[:-1].tolist(), cuts[1:].tolist()))
     return out.reshape(k, n, windows, -1)

@@ -64,21 +64,23 @@ def servo_torque(law: Law, kp: Any, aim: Any, qpos: Any) -> Any:
 
 def advance(
     first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
-    lengths: Any, stiffer: Any, kd: Any, stops: Any, dt: float, count: int, thin: int, out: Any,
+    lengths: Any, stiffer: Any, kd: Any, stops: Any, periods: Any, count: int, thin: int, out: Any,
 ) -> None:  # fmt: skip
     """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them.
 
     Candidates take each step side by side: none waits for its own last one. numba compiles this; it stands here since a
     compiled function is made anew when its own file changes, and no other.
     """
-    k, windows, h = len(values), qpos.shape[1], dt / count
+    k, windows = len(values), qpos.shape[1]
     for item in range(first, last):
         j, p = item // windows, item % windows
+        h = periods[p] / count
         v, rows = np.ascontiguousarray(values[:, j].T), lengths[p]
         kp, dry, mass, offset, limit = v[0] * stiffer[p, j], v[2], v[3], v[4], v[6]
         rest, speed, by_motor, by_load, least, step = v[7], np.maximum(v[8], SLOWEST), v[9], v[10], v[11], v[12]
         brake, own = np.maximum(kd[p, j] + np.minimum(v[1], 0.0), 0.0), np.maximum(v[1], 0.0)
-        late = np.arange(count).reshape(-1, 1) / count - v[5] / dt  # a part of each command where it changes on the way
+        # A part of each command where it changes on the way.
+        late = np.arange(count).reshape(-1, 1) / count - v[5] / periods[p]
         row = np.floor(late).astype(np.int64)
         share = np.maximum((late - row - 1) * count + 1, 0.0)
         q, w = np.full(k, float(qpos[j, p, 0])), np.full(k, float(qvel[j, p, 0]))

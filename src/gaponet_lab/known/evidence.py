@@ -116,8 +116,8 @@ def evidence(
     here, jac = (y[0] for y in slopes(x[None], axes.high, flat))
     jac = jac / axes.unit[:, None] * (axes.low < axes.high)[:, None]
     ends = slice(None, None, runs.thin)
-    late = np.round(bounds.first["delay"] / runs.dt).astype(int)
-    aim = np.stack([np.roll(c, d, axis=-1) for c, d in zip(runs.ctrl, late, strict=True)])
+    late = np.round(bounds.first["delay"][:, None] / runs.periods).astype(int)
+    aim = np.array([[np.roll(c, d) for c, d in zip(*j, strict=True)] for j in zip(runs.ctrl, late, strict=True)])
     asked = aim + bounds.first["offset"][:, None, None].astype(np.float32) - runs.qpos
     play = 0.5 / SOFT * np.tanh(asked / SLACK)[..., ends] * (runs.counted & runs.recorded[..., None])
     jac = np.concatenate([jac, play.reshape(bounds.n, -1, 1)], axis=-1)
