@@ -105,6 +105,7 @@ def test_of_many_none_is_listed_twice_or_lost_where_the_block_ends_badly(dataset
         raise KeyboardInterrupt
     again = Dataset(dataset.path)
     assert len(again) < 4
+    assert len(list((dataset.path / "sequences").iterdir())) == len(dataset) == len(again)
     with again.appending():
         for s in some:
             if again.find(s.content_hash()) is None:

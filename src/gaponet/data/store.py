@@ -184,12 +184,18 @@ class Dataset:
 
     @contextmanager
     def appending(self) -> Iterator[None]:
-        """The same as `writing`, for many: what is appended is listed once a second and at the end, not one by one."""
+        """The same as `writing`, for many: what is appended is listed once a second and at the end, not one by one.
+
+        If the block raises, the files that are not listed yet are removed.
+        """
         with self.writing():
             self._many = True
             try:
                 yield
                 self._list()
+            except BaseException:
+                self._remove_unlisted()
+                raise
             finally:
                 self._many = False
 
@@ -273,10 +279,10 @@ class Dataset:
             findings=findings,
             command=sketch(sequence.ctrl, sequence.dt),
         )
-        columns = {c: getattr(sequence, c) for c in entry.channels}
+        columns, line = {c: getattr(sequence, c) for c in entry.channels}, entry.line + b"\n"
         self._file(entry).parent.mkdir(exist_ok=True)
         _write_table(self._file(entry), columns, sequence.dt, self.joint_names)
-        self._lines += entry.line + b"\n"
+        self._lines += line
         self.entries.append(entry)
         self._by_hash[digest] = entry
         if not self._many or time.monotonic() > self._due:
@@ -296,6 +302,19 @@ class Dataset:
         if not self._end:
             sync(self.path)
         self._end, self._lines, self._due = self._end + len(self._lines), b"", time.monotonic() + LIST_S
+
+    def _remove_unlisted(self) -> None:
+        """Remove the files of sequences that the journal does not list, and forget them."""
+        count = self._lines.count(b"\n")
+        if not count:
+            return
+        journal = self.path / JOURNAL
+        if journal.is_file():  # listing may have failed halfway: no line may outlive its file
+            os.truncate(journal, self._end)
+            sync(journal)
+        for entry in self.entries[-count:]:
+            self._file(entry).unlink(missing_ok=True)
+        self._load()
 
     def remove(self, patterns: tuple[str, ...]) -> list[Entry]:
         """Take out the sequences whose ids match, with their twins; refuses a pattern that matches none."""
