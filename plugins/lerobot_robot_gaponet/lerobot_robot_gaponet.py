@@ -72,6 +72,7 @@ class GaponetSO101Config(RobotConfig):
     known: Path | None = None  # robot folder of gaponet identify: targets are compensated by what is known of the arm
     model: Path | None = None  # run of gaponet train, on top; without both targets go to the arm as they are
     fps: float | None = None  # control rate, Hz, the same as LeRobot's: default what the model was trained at, else 30
+    yes: bool = False  # do not ask before the arm moves
     options: str = ""  # further options of gaponet run: "--payload-mass 0.1 --safety.speed 2"
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
 
@@ -134,9 +135,12 @@ class GaponetSO101(Robot):
         """Servos are left as they are set; the limits and the model's card ask what they have."""
 
     def connect(self, calibrate: bool = True) -> None:
+        from gaponet_robots.control.consent import require_consent
         from gaponet_robots.control.driver import DriverError
         from gaponet_robots.targets.client import RemoteRobot
 
+        if not self.config.yes:
+            require_consent(f"The SO-101 at {self.config.port} will move as LeRobot says.", option="--robot.yes=true")
         self._folder = tempfile.TemporaryDirectory(prefix="gaponet-lerobot-")
         address, said = f"ipc://{self._folder.name}/targets", Path(self._folder.name, "said")
         with said.open("wb") as log:

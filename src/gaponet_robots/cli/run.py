@@ -14,6 +14,7 @@ from gaponet.cli.options import Flag, Json
 from gaponet.cli.out import Out, writes
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.errors import UsageError
+from gaponet_robots.control.consent import require_consent, require_terminal
 from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.safety import SafetyConfig
 from gaponet_robots.targets.live import LiveConfig
@@ -136,7 +137,7 @@ def run(
 ) -> None:
     """Play a motion or live targets on a robot; any key stops it.
 
-    Ctrl-C and SIGTERM do as well, within one control period.
+    Ctrl-C, Ctrl-Z and SIGTERM do as well, within one control period. A real robot moves only after the word yes.
 
     Args:
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
@@ -174,8 +175,8 @@ def perform(
         raise UsageError("live targets come in real time; leave out --fast")
     clock = SimulatedClock() if fast else MonotonicClock()
     asks = asked.driver != "virtual" and not asked.yes and not asked.dry_run
-    if asks and not sys.stdin.isatty():
-        raise UsageError("no terminal to ask on; say --yes if the space around the robot is free")
+    if asks:
+        require_terminal()
     _require_shapes(screen, asked, spec)
     _require_hung(asked)
     motion, limits = find_motion(motion_name, asked, spec)
@@ -203,7 +204,8 @@ def perform(
             controller.plan = plan
             _show(screen, controller.plan, spec, robot, limits.max_payload)
         if asks:
-            _ask(screen, robot, f"as {asked.targets} says" if motion is None else "as planned")
+            how = f"as {asked.targets} says" if motion is None else "as planned"
+            require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")
 
     controller = Controller(
         driver, spec, config=asked.control, safety=asked.safety, compensator=compensator, clock=clock,
@@ -295,12 +297,10 @@ def _require_hung(asked: Request) -> None:
         return
     words = {"arms": "legs and torso", "upper_body": "the legs", "all": "at the end of the run all motors"}
     off = words[asked.reach.joints]
-    if not asked.yes and sys.stdin.isatty():
-        sys.stderr.write(f"With --topic lowcmd {off} go off: a robot that stands falls. Does it hang? Say 'it hangs': ")
-        sys.stderr.flush()
-        if sys.stdin.readline().strip().strip("'") == "it hangs":
-            return
-    raise UsageError(f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs")
+    if asked.yes:
+        raise UsageError(f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs")
+    text = f"With --topic lowcmd {off} go off: a robot that stands falls."
+    require_consent(text, "Does it hang?", "it hangs", "--hangs")
 
 
 def find_motion(name: str | None, asked: Request, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
@@ -419,15 +419,6 @@ def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: f
     ):  # fmt: skip
         if text:
             screen.say(f"  {text}")
-
-
-def _ask(screen: Out, driver: Driver, what: str) -> None:
-    screen.say(
-        f" will move {len(driver.commanded)} joints {what}. Is the space around it free, and a hand on its own "
-        "emergency stop? Enter to start, Ctrl-C to leave.",
-        driver.address,
-    )
-    sys.stdin.readline()
 
 
 def _tell(screen: Out, event: Event) -> None:

@@ -69,8 +69,9 @@ def virtual(
         raise UsageError(f"--heard {heard}: there is no folder {heard.parent}")
     name = f"virtual-{unit}" if unit.isdigit() else unit
     physics = load_fleet(fleet, spec).unit(name)
-    for number in set(SIGNALS) - {signal.SIGINT}:
-        signal.signal(number, signal.default_int_handler)
+    for number in SIGNALS:
+        if number.name not in ("SIGINT", "SIGTSTP"):  # Ctrl-Z suspends it, as any program
+            signal.signal(number, signal.default_int_handler)
     label = f"VIRTUAL {spec.name}, fleet {fleet}, unit {name}, {payload_mass:g} kg"
     limit = float("inf") if seconds is None else seconds
     if spec.name == "so101":

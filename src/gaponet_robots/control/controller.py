@@ -133,7 +133,7 @@ class Controller:
 
         Args:
             policy: Says the targets of the run, once a control period; None: the plan's motion is played.
-            keys: Whether any key on the terminal stops the run.
+            keys: Whether any key on the terminal, Ctrl-C included, stops the run.
 
         Raises:
             DriverError: The robot could not be reached; nothing was commanded.
@@ -150,18 +150,19 @@ class Controller:
             self.recording.virtual = self.driver.virtual
             self._adopt_servos()
             self._on_connect(self.driver)
+            stack.enter_context(on_signal(self.stop))
+            pressed = stack.enter_context(Keys(self.stop)) if keys else None  # from the consent on, not from the loop
             gains = {name: getattr(self.driver, name)[self.joints].tolist() for name in ("kp", "kd")}
             self.recording.meta |= gains | self.driver.facts
             if self._folder:
                 self.recording.grow_in(self._folder)
             stack.callback(self.recording.rows.close)
             self._start_watchdog(lock, stack)
-            stack.enter_context(on_signal(self.stop))
             if policy is None:
                 if self.plan is None or self.plan.motion is None:
                     raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
                 policy = play(self.plan.motion, self.dt)
-            self._loop(policy, stack.enter_context(Keys(self.stop)) if keys else None)
+            self._loop(policy, pressed)
             self._verify()
         if self._error:
             raise self._error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import signal
 import sys
@@ -9,8 +10,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+from typing import Any
 
-SIGNALS = tuple(s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP"))  # Windows has no SIGHUP
+# By name: Windows has only the first two.
+SIGNALS = tuple(s for s in signal.Signals if s.name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"))
 
 
 class StopRequest:
@@ -27,7 +30,7 @@ class StopRequest:
 
 @contextmanager
 def on_signal(stop: StopRequest) -> Iterator[None]:
-    """SIGINT, SIGTERM and SIGHUP ask to stop instead of ending the process; only the main thread can do this."""
+    """SIGNALS ask to stop instead of ending or suspending the process; only the main thread can do this."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -44,26 +47,37 @@ def on_signal(stop: StopRequest) -> Iterator[None]:
 
 
 class Keys:
-    """Any key on the terminal asks to stop; polled once a period. Without a terminal it does nothing."""
+    """Any key on the terminal asks to stop, Ctrl-C, Ctrl-Z and Ctrl-S too; so does the end of the terminal.
+
+    Polled once a period. Without a terminal it does nothing.
+    """
 
     def __init__(self, stop: StopRequest) -> None:
         self.stop = stop
-        self._before: list[object] | None = None
+        self._before: list[Any] | None = None
 
     def __enter__(self) -> Keys:
         if sys.stdin is not None and sys.stdin.isatty():
             import termios
-            import tty
 
-            self._before = termios.tcgetattr(sys.stdin)
-            tty.setcbreak(sys.stdin)
+            self._terminal = sys.stdin.fileno()
+            self._before = termios.tcgetattr(self._terminal)
+            mode = termios.tcgetattr(self._terminal)
+            mode[0] &= ~(termios.IXON | termios.IGNCR)  # input flags
+            mode[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG | termios.IEXTEN)  # local flags
+            mode[6][termios.VMIN], mode[6][termios.VTIME] = 1, 0
+            # Now: what was typed before this counts, and output that Ctrl-S holds back is not waited for.
+            termios.tcsetattr(self._terminal, termios.TCSANOW, mode)
         return self
 
     def poll(self) -> None:
         """Look, without waiting."""
+        if self._before is None:
+            return
         try:
-            if self._before is not None and select.select([sys.stdin], [], [], 0)[0]:
-                self.stop(f"key {sys.stdin.read(1)!r}")
+            if select.select([self._terminal], [], [], 0)[0]:
+                typed = os.read(self._terminal, 1024)  # all: what is left would go to the shell
+                self.stop(f"key {chr(typed[0])!r}" if typed else "the terminal is gone")
         except OSError as error:
             self.stop(f"the terminal is gone ({error})")
 
@@ -72,4 +86,4 @@ class Keys:
             import termios
 
             with suppress(termios.error):  # the terminal is gone
-                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
+                termios.tcsetattr(self._terminal, termios.TCSANOW, self._before)

@@ -100,9 +100,10 @@ def test_a_real_robot_is_not_moved_without_asking(arm, tmp_path, capsys, monkeyp
     robot = load_robot("h1_2")
     ctrl = np.repeat(robot.qpos_home[None], 20, axis=0)
     write_motion(tmp_path / "still.npz", Motion("still", "joint", 0.02, ctrl), robot)
-    monkeypatch.setattr("sys.stdin", io.StringIO())
-    assert main(["run", "--driver", "unitree", "--motion", str(tmp_path / "still.npz")]) == 2
-    assert "no terminal to ask on" in capsys.readouterr().err
+    monkeypatch.setattr("sys.stdin", io.StringIO("yes\n"))
+    for words in (["--motion", str(tmp_path / "still.npz")], ["--targets", "stdin"]):
+        assert main(["run", "--driver", "unitree", *words]) == 2
+        assert "no terminal to ask on" in capsys.readouterr().err
 
 
 def test_a_model_runs_on_the_robot_that_its_run_keeps_and_on_no_other(arm, motion, tmp_path, capsys):

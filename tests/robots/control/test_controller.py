@@ -191,23 +191,23 @@ def test_a_robot_is_commanded_after_five_good_states_in_a_row(arm):
     assert sum(r.phase == "idle" for r in recording.rows) == 4 + 5 - 1, "the fifth one is commanded already"
 
 
-@pytest.mark.parametrize("how", ["call", "signal"])
+@pytest.mark.parametrize("how", ["the operator", "SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP"])
 def test_a_stop_takes_effect_in_the_next_period(arm, how):
     driver = Tampered(arm, SimulatedClock())
     controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     motion = play(MOTION, 0.02)
 
     def policy(k, state):
-        if k == 20 and how == "call":
-            controller.stop("the operator")
-        if k == 20 and how == "signal":
-            os.kill(os.getpid(), signal.SIGTERM)
+        if k == 20 and how == "the operator":
+            controller.stop(how)
+        elif k == 20:
+            os.kill(os.getpid(), signal.Signals[how])
             time.sleep(0)
         return motion(k, state)
 
     recording = controller.run(policy)
     assert recording.fault.kind == "stop"
-    assert ("SIGTERM" if how == "signal" else "the operator") in recording.fault.text
+    assert how in recording.fault.text
     assert sum(r.phase == "run" for r in recording.rows) == 21
 
 

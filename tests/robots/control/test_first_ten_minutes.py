@@ -41,8 +41,8 @@ def kept(play: Callable[[], str], tries: int = 8) -> str:
 
 def answered(run: Terminal, key: str = "", code: int = 0) -> str:
     """A run that asks, is told to start and, where a key is given, stopped on its way to the first target."""
-    run.until("Enter to start")
-    run.key()
+    run.until("Type 'yes' to start")
+    run.key("yes\n")
     if key:
         run.until("to the first target")
         run.key(key)
@@ -102,7 +102,7 @@ class Terminal:
                     return
                 self.said += data.decode(errors="replace")
 
-    def key(self, letter: str = "\n") -> None:
+    def key(self, letter: str) -> None:
         os.write(self.master, letter.encode())
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ def test_an_h1_2_from_the_rehearsal_to_the_stop(at, tmp_path):
     said = kept(lambda: answered(at(first, *bus, *BUSY)))
     assert "torso" in said
     assert "stopped handed over" in said
-    assert "stop: asked to stop: key 'x'" in kept(lambda: answered(at(first, *bus, *BUSY), "x", 3))
+    assert r"stop: asked to stop: key '\x1a'" in kept(lambda: answered(at(first, *bus, *BUSY), "\x1a", 3))
 
     words = ["--motion", "sweep-left_elbow", "--unit-id", "lab", "--payload-mass", "0", "--out", "set", "--yes"]
     words = ["--driver", "unitree", *words, *bus, *BUSY]

@@ -68,6 +68,15 @@ def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
     assert [read() for *_, read in robot._pictures()] == ["colours", "colours", "depth"]
 
 
+def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a controller was started"))
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.config = plugin.GaponetSO101Config()
+    with pytest.raises(UsageError, match=r"nothing was commanded; give --robot\.yes=true"):
+        robot.connect()
+
+
 def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(plugin, so101, tmp_path):
     (tmp_path / "roll.csv").write_text("time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5)))
     config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
