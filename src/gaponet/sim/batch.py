@@ -97,8 +97,8 @@ def _under_way(target: Array, qpos: Array, speed: Array) -> Array:
     return np.asarray(np.clip(target, qpos - most, qpos + most))
 
 
-def ramped(ctrl: Array, qpos: Array, speed: Array, dt: float) -> Array:
-    """Targets (T, …), rad, as a servo moves them that goes at `speed` (…), rad/s, at most, from where qpos (…) is."""
+def ramped(ctrl: Array, qpos: Array, speed: Array, dt: Array | float) -> Array:
+    """Return targets (T, …), rad, limited to `speed` (…), rad/s, from qpos (…) on; dt in s, one or (…)."""
     found = np.empty_like(ctrl)
     aim = _under_way(ctrl[0], qpos, speed)
     for t, target in enumerate(ctrl):
