@@ -89,7 +89,7 @@ def import_logs(
         raise UsageError("say where the dataset goes: --out FOLDER (or --guess, to see how these logs are described)")
     report = api.import_logs(
         src, spec, out, unit_id, payload_mass, payload_side=payload_side, level=level, fmt=format,
-        joint_map=_joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
+        joint_map=joint_map(map), logs=logs, position_unit=position_unit, time_unit=time_unit, rate=rate, cut=cut,
         kp=kp, kd=kd,
         skip_bad=skip_bad, allow_pickle=allow_pickle, strict=strict,
     )  # fmt: skip
@@ -175,7 +175,7 @@ def _unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
     return [f"{some(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says where"]
 
 
-def _joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
+def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:
     """("a=b",) → {"a": "b"}."""
     for pair in pairs:
         if pair.count("=") != 1 or not all(part.strip() for part in pair.split("=")):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from gaponet.data.describe.guess import guess_logs
 from gaponet.data.formats import find_logs, look, read_logs
-from gaponet.data.log import Log
+from gaponet.data.log import Log, skipping
 from gaponet.errors import GAPONetError, LogError, UsageError
 from gaponet.files import write_text
 from gaponet.robot import RobotSpec
@@ -24,23 +25,28 @@ class UnreadError(LogError):
         self.text = text
 
 
-def read_first(logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: bool = False) -> tuple[Log, int, str]:
+def read_first(
+    logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: bool = False, skip_bad: bool = False, **options: Any
+) -> tuple[Log, int, str]:
     """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
 
     Args:
         logs: File or folder.
         told: A logs.toml; nothing is guessed beside it.
         anyhow: Also by a guess of which joint is which.
+        skip_bad: Leave out recordings that cannot be read.
+        options: As read_logs takes them.
 
     Raises:
         UnreadError, LogError, UsageError: The message says what is missing.
     """
 
     def by(file: Path | None, described: str = "") -> tuple[Log, int, str]:
-        first = next(iter(read_logs(logs, robot, logs=file)), None)
+        with skipping(skip_bad):
+            first = next(iter(read_logs(logs, robot, logs=file, **options)), None)
         if first is None:
             raise UsageError(f"{logs}: holds no recording")
-        return first[1], len(find_logs(logs)), described
+        return first[1], len(find_logs(logs, options.get("fmt"))), described
 
     if told is not None:
         return by(told)
@@ -48,7 +54,7 @@ def read_first(logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: b
         return by(None)
     except GAPONetError as error:
         try:
-            kind, known, recordings = look(logs)
+            kind, known, recordings = look(logs, options.get("fmt"), allow_pickle=options.get("allow_pickle", False))
         except GAPONetError:
             raise error from None
     text = guess_logs(recordings, robot, kind, dict(known))

@@ -79,6 +79,54 @@ def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, mon
     assert [shlex.split(line)[1] for line in lines] == ["robot", "import", "doctor", "gap", "identify", "gap"]
 
 
+def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_from_them(place, monkeypatch, capsys):
+    ran, look = [], start.api.doctor
+    monkeypatch.setattr(start, "main", lambda words: ran.append(words[0]) or main(words))
+    monkeypatch.setattr(start, "commands", lambda: dict.fromkeys(ORDER[:3]))  # robot, import and doctor
+    monkeypatch.setattr(start.api, "doctor", lambda data: ran.append("doctor") or look(data))
+    last = Path("logs/swing_4.csv").rename("swing_4.csv")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    shutil.copytree("logs", "other")
+    assert main(["start", "arm.xml", "other"]) == 0  # the same logs elsewhere are the same data
+    assert ran == ["robot", "import", "doctor", "import"]
+    Path("logs/swing_4.csv").write_text("no log\n")
+    assert main(["start", "arm.xml", "logs"]) == 2  # a new log that cannot be read may be mended
+    assert ran.pop() == "import"
+    last.rename("logs/swing_4.csv")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran[4:] == ["import", "doctor"]
+    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 5
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran[6:] == []
+    capsys.readouterr()
+    before = {file: file.read_bytes() for file in Path("started").rglob("*") if file.is_file()}
+    Path("other/swing_3.csv").write_text(Path("logs/swing_4.csv").read_text())
+    Path("logs/swing_3.csv").unlink()
+    for logs, more in (("other", []), ("other", ["--dry-run"]), ("logs", [])):
+        assert main(["start", "arm.xml", logs, *more]) == 2
+        gone = "swing_3.csv, swing_4.csv are missing or changed in other" if logs == "other" else "swing_3.csv is"
+        assert gone in (said := capsys.readouterr().err)
+        assert "Give another --out for these logs, or the same logs again; or delete started/data" in said
+    assert {file: file.read_bytes() for file in before} == before
+    shutil.rmtree("started/data")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 4
+
+
+def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
+    """Options that messages of import recommend; by some of them the first recording is read here already."""
+    for file in Path("logs").iterdir():
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+        head = file.read_text().split("\n", 1)[0].replace("shoulder", "a1")
+        np.savetxt(file, np.c_[table[:, :1], np.rad2deg(table[:, 1:])], delimiter=",", header=head, comments="")
+    said = ["--map", "a1=shoulder", "--position-unit", "deg", "--time-unit", "ms", "--cut", "3", "--skip-bad"]
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json", *said]) == 0
+    found = json.loads(capsys.readouterr().out)
+    words = shlex.split(found["commands"][1])
+    assert (found["joints"], found["rate_hz"]) == (["shoulder", "elbow"], 50.0)
+    assert {"--map=a1=shoulder", "--position-unit=deg", "--time-unit=ms", "--cut=3.0", "--skip-bad"} < set(words)
+
+
 @pytest.mark.parametrize("name", ["a1", "x"])
 def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, capsys, name):
     for file in Path("logs").iterdir():
