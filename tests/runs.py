@@ -45,7 +45,7 @@ def corrects_by(delta: float, robot: RobotSpec, folder: Path) -> GapModel:
     return GapModel.load(folder)
 
 
-def random_run(folder: Path, robot: RobotSpec, **how: object) -> GapModel:
+def random_run(folder: Path, robot: RobotSpec, payload_seen: tuple[float, ...] = (0.0, 0.2), **how: object) -> GapModel:
     """A run whose operator answers anything, up to some 0.1 rad: whatever it is told makes a difference."""
     small = {"history": 2, "stride": 2, "num_probes": 4}
     small |= dict.fromkeys(("branch_hidden", "trunk_hidden", "sensor_hidden"), (8,))
@@ -55,7 +55,7 @@ def random_run(folder: Path, robot: RobotSpec, **how: object) -> GapModel:
         for p in net.parameters():
             p.add_(0.1 * torch.randn_like(p))
     net.features.standardise.std.fill_(0.3)
-    card = make_card(net.config, robot, dt=[robot.dt], payload_seen=[0.0, 0.2])
+    card = make_card(net.config, robot, dt=[robot.dt], payload_seen=list(payload_seen))
     export(net, folder / "model", card, torch.randn(20, net.config.input_dim(len(robot.operated))).numpy())
     torch.save({"best_state": net.state_dict()}, folder / "checkpoint.pt")
     save_robot(robot, folder / "robot")

@@ -258,6 +258,11 @@ def test_several_robots_are_compensated_as_each_alone(robot, model):
         np.testing.assert_allclose(u, [c.step(a, 0.9 * a) for c, a in zip(alone, target, strict=True)], atol=1e-9)
 
 
+def test_a_step_before_a_start_is_refused(robot):
+    with pytest.raises(UsageError, match="call reset"):
+        Compensator(robot).step(np.zeros(2), np.zeros(2))
+
+
 def test_other_arrays_and_robots_are_refused(robot, model):
     with pytest.raises(UsageError, match="all 2 joints of arm"):
         Compensator(robot, model).reset(np.zeros(3), 0.0)

@@ -12,7 +12,7 @@ import tyro
 
 from gaponet import api
 from gaponet.cli.identify import COLUMNS
-from gaponet.cli.options import Flag, Folder, Json, Robot, like
+from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.tables import mrad
@@ -32,7 +32,7 @@ def calibrate(
     run: Known,
     dataset: Logs,
     out: Path | None = None,
-    unit: str = "",
+    unit: Unit = "",
     motions: tuple[str, ...] = (),
     seconds: float = 30.0,
     payload_mass: str = "recorded",

@@ -32,6 +32,7 @@ Robot = Annotated[
     str | None,
     tyro.conf.arg(help="Robot name or folder, if not the one that the dataset or the run keeps.", metavar="ROBOT"),
 ]
+Unit = Annotated[str, tyro.conf.arg(aliases=["--unit-id"])]  # gaponet import calls it --unit-id
 Json = Annotated[Flag, tyro.conf.arg(help="One JSON object on stdout.")]
 
 

@@ -236,7 +236,12 @@ class Compensator:
                 or qvel is not a number.
             qvel: Measured now, rad/s.
             tau: Measured joint torque, N·m, for the payload estimate; default that of the servo law, kp (u − q) − kd q̇.
+
+        Raises:
+            UsageError: `reset` was not called before.
         """
+        if not hasattr(self, "_asked"):
+            raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")
         told = self._all(target)
         self._asked = a_all = np.where(np.isfinite(told), told, self._asked)
         a = a_all[:, self.op]

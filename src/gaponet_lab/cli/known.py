@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gaponet.cli.options import Folder, Json, Motions
+from gaponet.cli.options import Folder, Json, Motions, Unit
 from gaponet.cli.out import Out
 from gaponet.errors import UsageError
 from gaponet.eval.knowledge import Knowledge
@@ -81,7 +81,7 @@ def _opened(folder: Path) -> tuple[RobotSpec, Knowledge]:
 def check(
     robot: Known,
     logs: Logs,
-    unit: str = "",
+    unit: Unit = "",
     motions: Motions = (),
     payload_mass: float | None = None,
     threads: int = 0,

@@ -1,0 +1,310 @@
+"""Blocks of README.md and docs: Python is run, each gaponet line is parsed, and quick commands are run."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import shlex
+import shutil
+import typing
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext, redirect_stdout, suppress
+from dataclasses import replace
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from arm import XML, record
+from logs import wave, write_sage
+from runs import random_run, untrained
+from strange_logs import write_bag
+
+import gaponet.api
+from gaponet.cli.main import commands, main
+from gaponet.data.store import Dataset
+from gaponet.model.artifact import GapModel
+from gaponet.parts import named
+from gaponet.robot import load_robot
+from gaponet.robot_folder import save_robot
+from gaponet.sim.model import build_model
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in ("log.md", "results.md"))]
+PATHS = {page.name: page for page in PAGES}
+NEWCOMERS = ("README.md", "newcomer.md", "ten-minutes.md", "index.md", "install.md", "logs.md", "first-ten-minutes.md",
+             "api.md", "deploy.md")  # fmt: skip
+# A part of a block → why it is not run here.
+NOT_RUN = {
+    "def resting_friction": "a piece of servo.py, compared with it in tests/examples/test_newcomer.py",
+    "from gaponet_action import": "needs mjlab; make engines",
+    "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
+    "mujoco_servos.Servos": "needs an exported folder; tests/interop/engine plays it",
+    "gp.RemoteRobot()": "needs a run that takes live targets; tests/robots/targets",
+}
+# First words of console lines that are not gaponet's → why they are not run here.
+OTHERS = {
+    "pip": "installs", "git": "needs a network", "cmake": "installs", "CYCLONEDDS_HOME=$HOME/cyclonedds": "installs",
+    "source": "needs an environment", "make": "takes minutes", "pytest": "takes minutes",
+    "cd": "needs a folder of an export", "python": "needs a folder of an export",
+}  # fmt: skip
+SO101_IN_SAGE = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*\w")
+MENTION = re.compile(r"\bgaponet ([a-z]+)(?: ([a-z]+))?((?:(?!gaponet )[^;`\n)])*)")  # command, action, what follows
+
+
+class Understood(Exception):  # noqa: N818
+    """The command line was parsed, and the command would begin now."""
+
+
+def understood() -> None:
+    raise Understood
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    return re.findall(rf"```(?:{'|'.join(languages)})\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def lines(page: Path) -> list[str]:
+    """Lines of a page's console blocks, and its indented lines that call gaponet."""
+    text = page.read_text(encoding="utf-8")
+    found = "\n".join(blocks(page, "console", "sh", "bash", "shell")).replace("\\\n", " ").splitlines()
+    outside = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    return [*filter(str.strip, found), *re.findall(r"^ {4,}((?:.* \| )?gaponet .*)$", outside, re.MULTILINE)]
+
+
+def words(line: str) -> list[str]:
+    """What follows `gaponet` in a line of a shell, up to the next pipe; or nothing."""
+    found = shlex.split(line, comments=True)
+    while found and found[0] != "gaponet":
+        found.pop(0)
+    ends = [i for i, word in enumerate(found) if word in ("|", ">", "&&", "||", ";", "&")]
+    return found[1 : min(ends, default=len(found))]
+
+
+def actions(command: str) -> dict[str, Any]:
+    """Name → tyro's entry of each action of a command that has some: gaponet robot new."""
+    found: dict[str, Any] = {}
+
+    def walk(hint: Any) -> None:
+        for note in getattr(hint, "__metadata__", ()):
+            if type(note).__name__ == "_SubcommandConfig":
+                found[note.name] = note
+        for inner in (*typing.get_args(hint), getattr(hint, "__origin__", None)):
+            if hasattr(inner, "__metadata__") or typing.get_origin(inner):
+                walk(inner)
+
+    walk(typing.get_type_hints(named(commands()[command]), include_extras=True).get("action"))
+    return found
+
+
+@pytest.fixture
+def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
+    """Parse a command line without running it. An action runs while it is parsed, so a function stands in for it."""
+
+    def one(argv: list[str]) -> None:
+        for note in actions(argv[0]).values() if argv[0] in commands() else ():
+            stand_in = wraps(note.constructor_factory())(lambda *args, **kwargs: understood())
+            monkeypatch.setitem(vars(note), "constructor_factory", lambda f=stand_in: f)
+        with pytest.raises(Understood):
+            main(argv, understood)
+
+    return one
+
+
+@pytest.fixture(scope="module")
+def options() -> dict[tuple[str, ...], set[str]]:
+    """Command, or command and action → its options, as its help lists them."""
+    found: dict[tuple[str, ...], set[str]] = {}
+    patch = pytest.MonkeyPatch()
+    patch.setenv("COLUMNS", "100")  # one column of options
+    for command in commands():
+        for path in [(command, action) for action in actions(command)] or [(command,)]:
+            said = io.StringIO()
+            with redirect_stdout(said), suppress(SystemExit):
+                main([*path, "--help"])
+            rows = re.findall(r"^\W+?(-.*)$", said.getvalue(), re.MULTILINE)
+            found[path] = {option for row in rows for option in OPTION.findall(row.split("  ")[0])}
+    patch.undo()
+    return found
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """LOGS and NEW_LOGS of two VIRTUAL SO-101 with weaker and late servos."""
+    folder, robot = tmp_path_factory.mktemp("blocks"), load_robot("so101")
+    low, high = robot.qpos_range[5]
+    for seed, name in enumerate(["LOGS"] * 4 + ["NEW_LOGS"] * 3):
+        pace = 0.3 + 0.1 * seed
+        ctrl = robot.qpos_home + wave(200, 6, robot.dt, 0.2, pace) * [1, 1, 1, 1, 1, 0.5]
+        s = record(robot, np.clip(ctrl, *robot.qpos_range.T), name, kp=0.8 if name == "LOGS" else 0.6, delay=1)
+        logged = [values.copy() for values in (s.ctrl, s.qpos)]
+        for values in logged:  # SAGE has the gripper as a fraction of its range
+            values[:, 5] = (values[:, 5] - low) / (high - low)
+        time = 1e6 * robot.dt * np.arange(200)
+        write_sage(folder / name / f"m{seed}", *logged, names=SO101_IN_SAGE, time=time, qvel=s.qvel)
+    return folder
+
+
+@pytest.fixture
+def quick(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Identification of seconds, done once; and a network that nobody trained. Both have tests of their own."""
+    original = gaponet.api.identify
+
+    def identify(dataset: str, out: str, **others: object) -> None:
+        if not (place / "identified").exists():
+            original(dataset, place / "identified", windows=4, terms=(), table=False, budget="1s")
+        shutil.copytree(place / "identified", out)
+
+    def train(dataset: str, out: str, budget: str) -> GapModel:
+        parts = {"train": ("m0", "m1"), "val": ("m2",), "test": ("m3",)}
+        return GapModel.load(untrained(Path(out), load_robot("so101"), Dataset(dataset), **parts))
+
+    monkeypatch.setattr(gaponet.api, "identify", identify)
+    monkeypatch.setattr(gaponet.api, "train", train)
+
+
+def in_copy(place: Path, folder: Path) -> None:
+    """The logs in a folder of a block's own."""
+    for name in ("LOGS", "NEW_LOGS"):
+        shutil.copytree(place / name, folder / name)
+
+
+def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
+    """What a page's Python blocks take from their reader: names, and run and robot folders below `folder`."""
+    if page != "deploy.md":
+        return dict.fromkeys(("qpos", "qvel", "target"), np.zeros(5)) if page == "api.md" else {}
+    robot = load_robot("h1_2")
+    model = random_run(folder / "run", robot, payload_seen=(0.0, 3.0))
+    for name in ("my_h1_2", "my_robot", "identified"):
+        save_robot(robot, folder / name)
+    mj_model = build_model(robot, 3.0)
+    data = mujoco.MjData(mj_model)
+    at_home = {"qpos": robot.qpos_home, "qvel": 0 * robot.qpos_home, "target": robot.qpos_home}
+    return at_home | {
+        "mj_model": mj_model, "data": data, "mujoco": mujoco, "targets": [robot.qpos_home] * 3, "model": model,
+        "mine": replace(robot, kp=1.1 * robot.kp),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("page", NEWCOMERS)
+def test_the_python_blocks_of_a_page_run(page, place, quick, tmp_path, monkeypatch):
+    found = [b for b in blocks(PATHS[page], "python") if not any(part in b for part in NOT_RUN)]
+    if not found:
+        pytest.skip("no Python")
+    in_copy(place, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": page, **names_of_a_reader(page, tmp_path)}
+    for block in found:
+        exec(compile(block, page, "exec"), names)
+
+
+QUICK = {  # Page → commands of it that take seconds; the others are parsed
+    "README.md": ("import", "doctor", "gap", "show", "export my_so101 --to randomization", "replay", "calibrate"),
+    "logs.md": ("formats",),
+    "ten-minutes.md": ("robot", "import", "doctor", "gap"),
+    "install.md": ("--version", "--tyro-print-completion"),
+}
+
+
+@pytest.mark.parametrize("page", QUICK)
+def test_quick_commands_of_a_page_run_in_its_order(page, place, quick, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if page == "ten-minutes.md":
+        write_arm_and_bags(tmp_path)
+    else:
+        in_copy(place, tmp_path)
+    told = io.StringIO()
+    for argv in filter(None, map(words, lines(PATHS[page]))):
+        if argv[0] == "identify" and page == "README.md":
+            gaponet.api.identify(argv[1], argv[3])
+        elif " ".join(argv).startswith(QUICK[page]):
+            argv = [{"ROLLOUTS": "LOGS"}.get(word, word) for word in argv]
+            with redirect_stdout(told), suppress(SystemExit) if argv[0].startswith("--tyro") else nullcontext():
+                assert main(argv) == 0, argv
+    if page == "ten-minutes.md":
+        said = " ".join(told.getvalue().split())
+        assert all(part in said for part in ("ok: arm compiles, holds its home and is stable", "2 sequences", "MPJAE"))
+
+
+def write_arm_and_bags(folder: Path) -> None:
+    """A vendor's model and ROS bags."""
+    servos = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+    (folder / "arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>"))
+    for name, rows in (("wave", 400), ("sway", 300)):
+        write_bag(folder / "bags" / name, rows=rows)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_each_line_of_a_console_block_is_understood(page, parse, capsys):
+    for line in lines(page):
+        argv, first = words(line), shlex.split(line, comments=True)[:1]
+        if not argv:
+            assert not first or first[0] in OTHERS, f"{page.name}: {line}"
+        elif argv[0] not in ("--version", "--tyro-print-completion") and "…" not in line:
+            try:
+                parse(argv)
+            except (SystemExit, pytest.fail.Exception):
+                pytest.fail(f"{page.name}: {line}\n{capsys.readouterr().err}")
+
+
+def literals(file: Path) -> Iterator[str]:
+    """Text in a source file: messages, help and docstrings; X stands for what is filled in."""
+    inner = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.JoinedStr):
+            inner |= {id(value) for value in node.values}
+            yield "".join(value.value if isinstance(value, ast.Constant) else "X" for value in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
+            yield node.value
+
+
+FOREIGN = {"--nproc-per-node": "torchrun", "--repo-type": "hf", "--index-url": "pip", "--version": "gaponet itself",
+           "--tyro": "gaponet itself"}  # fmt: skip
+
+
+def absent(text: str, options: dict[tuple[str, ...], set[str]]) -> Iterator[str]:
+    """Options that a text gives to a command that has no such option, and options that no command has."""
+    every, seen = set().union(*options.values(), FOREIGN), set()
+    for command, action, rest in MENTION.findall(text):
+        there = [have for path, have in options.items() if path in ((command,), (command, action))]
+        there = there or [have for path, have in options.items() if path[0] == command]
+        wanted = set(OPTION.findall(rest)) - FOREIGN.keys()
+        seen |= wanted if there else set()
+        yield from (f"gaponet {command}: {option}" for option in wanted if there and option not in set().union(*there))
+    yield from set(OPTION.findall(text)) - every - seen
+
+
+def test_every_option_that_a_message_names_is_there(options):
+    files = (f for part in sorted((ROOT / "src").glob("gaponet*")) for f in sorted(part.rglob("*.py")))
+    wrong = {
+        f"{file.relative_to(ROOT)}: {problem}"
+        for file in files
+        if file.name != "page.py"  # variables of a style sheet
+        for text in literals(file)
+        if "--" in text
+        for problem in absent(text, options)
+    }
+    assert wrong == set()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_option_that_a_sentence_of_a_page_gives_to_a_command_is_there(page, options):
+    pieces = re.findall(r"`(gaponet [^`]*)`", page.read_text(encoding="utf-8"))
+    assert [problem for piece in pieces for problem in absent(piece, options)] == []
+
+
+def test_a_wrong_command_option_or_value_is_found(parse, options):
+    for wrong in (
+        "robot nwe",
+        "robot check so101 --dta x",
+        "gap data --robto x",
+        "doctor",
+        "import L --out d --rate x",
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            parse(wrong.split())
+    assert [*absent("take `gaponet gap DATA --fix`, or --fixx", options)] == ["gaponet gap: --fix", "--fixx"]
