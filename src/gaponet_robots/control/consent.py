@@ -8,9 +8,6 @@ import sys
 from gaponet.errors import UsageError
 from gaponet.text import plain
 
-SPACE = "Is the space around it free, and a hand on its own emergency stop?"
-LONGEST_ANSWER = 1024  # bytes
-
 
 def require_terminal(option: str = "--yes") -> int:
     """Return the descriptor of the terminal that can be asked.
@@ -28,7 +25,12 @@ def require_terminal(option: str = "--yes") -> int:
     return sys.stdin.fileno()
 
 
-def require_consent(what: str, question: str = SPACE, word: str = "yes", option: str = "--yes") -> None:
+def require_consent(
+    what: str,
+    question: str = "Is the space around it free, and a hand on its own emergency stop?",
+    word: str = "yes",
+    option: str = "--yes",
+) -> None:
     """Return only if the word is typed on the terminal after the question is shown.
 
     Call it before the first command to the robot.
@@ -48,7 +50,7 @@ def require_consent(what: str, question: str = SPACE, word: str = "yes", option:
     termios.tcflush(descriptor, termios.TCIFLUSH)  # an answer typed before the question was shown answers nothing
     sys.stderr.write(f"{plain(what)} {question} Type '{word}' to start; anything else leaves: ")
     sys.stderr.flush()
-    line = os.read(descriptor, LONGEST_ANSWER).decode(errors="replace")  # not sys.stdin, which may hold earlier bytes
+    line = os.read(descriptor, 1024).decode(errors="replace")  # not sys.stdin, which may hold earlier bytes
     if not line.endswith("\n"):  # end of file, also behind a word
         sys.stderr.write("\n")
     elif line.strip().lower() == word:
