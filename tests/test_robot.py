@@ -52,10 +52,12 @@ def test_the_users_map_wins_over_aliases(so101):
     assert so101.resolve("Pitch", "a.csv", {"Pitch": "elbow_flex"}) == "elbow_flex"
 
 
-def test_an_unknown_joint_names_the_file_the_valid_names_and_the_likely_one(so101):
-    with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', but robot 'so101' has: shoulder_pan, .*"
-                       r"Map it with --map elbow=elbow_flex"):  # fmt: skip
+def test_an_unknown_joint_names_the_file_and_the_nearest_joints(so101):
+    with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
+                       r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex$"):  # fmt: skip
         so101.resolve("elbow", "a.csv")
+    with pytest.raises(JointMismatchError, match=r"nearest: elbow_flex, \w+, \w+$"):  # nothing to map there
+        so101.index(["elbow"])
 
 
 def test_an_unknown_robot_names_those_of_the_package():

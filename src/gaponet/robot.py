@@ -33,6 +33,7 @@ STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *LAW)
+NEAREST = 3  # joints that are shown beside a name that is none
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
@@ -222,10 +223,10 @@ class RobotSpec:
         return self.index(self.operated)
 
     def index(self, names: tuple[str, ...] | list[str]) -> Array:
-        """Positions of `names` in `joint_names`; raises with the valid names on a stranger."""
+        """Positions of `names` in `joint_names`; raises with the nearest names on a stranger."""
         for name in names:
             if name not in self.joint_names:
-                raise JointMismatchError(self._unknown(name, "a request"))
+                raise JointMismatchError(self._unknown(name, "a request")[0])
         return np.array([self.joint_names.index(name) for name in names], int)
 
     def resolve(self, name: str, where: str, extra: dict[str, str] | None = None) -> str:
@@ -245,16 +246,15 @@ class RobotSpec:
         found = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
         same = [found] if found else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
         if len(same) != 1:
-            raise JointMismatchError(self._unknown(short, where))
+            told, near = self._unknown(short, where)
+            raise JointMismatchError(f"{told}. Map it with --map {short}={near}")
         return same[0]
 
-    def _unknown(self, name: str, where: str) -> str:
-        close = difflib.get_close_matches(name, self.joint_names, n=1, cutoff=0.3)
-        hint = close[0] if close else self.joint_names[0]
-        return (
-            f"{where} names joint '{name}', but robot '{self.name}' has: {', '.join(self.joint_names)}. "
-            f"Map it with --map {name}={hint}"
-        )
+    def _unknown(self, name: str, where: str) -> tuple[str, str]:
+        """What is wrong with a name, and the joint with the most similar one."""
+        near = difflib.get_close_matches(name, self.joint_names, n=NEAREST, cutoff=0.0)
+        said = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
+        return said, near[0]
 
 
 def _letters(joint: str) -> str:

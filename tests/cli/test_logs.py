@@ -142,8 +142,8 @@ BROKEN = {
     "time going back": (sage_with(going_back), ".csv:32: time does not increase in channel"),
     "wrong joint name": (
         sage_with(rewrite("joint_list.txt", "Elbow", "Ellbow")),
-        "joint_list.txt names joint 'Ellbow', but robot 'so101' has: shoulder_pan, shoulder_lift, elbow_flex, "
-        "wrist_flex, wrist_roll, gripper. Map it with --map Ellbow=elbow_flex",
+        "joint_list.txt names joint 'Ellbow', which robot 'so101' does not have; nearest: elbow_flex, wrist_roll, "
+        "wrist_flex. Map it with --map Ellbow=elbow_flex",
     ),
     "degrees": (
         sage_with(rewritten(ctrl=wave(60, 6, amplitude=40.0))),
@@ -183,6 +183,13 @@ def test_another_robots_dataset_is_refused_and_left_as_it_was(arm, logs, tmp_pat
     assert "holds robot 'arm' (shoulder, elbow), not 'so101'" in error
     assert "use --robot arm or another dataset folder" in error
     assert {f: f.read_bytes() for f in (tmp_path / "data").rglob("*") if f.is_file()} == before
+
+
+def test_a_note_about_joints_begins_a_word_of_its_own(arm, tmp_path, capsys):
+    table = tmp_path / "wave.csv"
+    table.write_text(table_text({k: v for k, v in arm_columns().items() if "elbow" not in k}))
+    assert import_arm(table, arm, tmp_path / "data", *SI) == 0
+    assert "note  elbow: not in every recording" in capsys.readouterr().out
 
 
 def test_a_broken_file_leaves_an_existing_dataset_as_it_was(logs, tmp_path):

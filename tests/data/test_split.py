@@ -299,6 +299,11 @@ def test_one_command_played_again_is_split_by_repetition_and_long_logs_by_time(a
     )
     assert [(e.meta.motion, e.rows) for e in report.entries] == [("long@0s", 225), ("long@4s", 225), ("long@9s", 225),
                                                                  ("long@14s", 225)]  # fmt: skip
+    rested = arm_columns(900) | {k: np.zeros(900) for k in arm_columns() if k != "time"}
+    (tmp_path / "rest.csv").write_text(table_text(rested))
+    how = {"cut": 4.0, "position_unit": "rad", "time_unit": "s"}
+    (piece,) = import_logs(tmp_path / "rest.csv", arm, "a", 0.0, tmp_path / "rests", **how).entries
+    assert piece.meta.motion == "rest@0s"  # equal pieces of one recording are one
     parts = make_split(report.dataset, "time")
     named = [[e.meta.motion for e in parts[part]] for part in PARTS]
     assert named == [["long@0s", "long@4s"], ["long@9s"], ["long@14s"]]

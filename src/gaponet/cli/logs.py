@@ -198,13 +198,13 @@ def _show_import(out: Out, report: ImportReport, robot: RobotSpec) -> None:
         f"{robot.name}, unit {units}, payload {payloads} kg; {data.path!s} now holds {len(data)}"
     )
     for cut, motions in _cuts(entries).items():
-        out.say(f"{', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
+        out.say(f"  {', '.join(motions)}: {cut}; what follows was left out", "note", "cyan")
     for line in (*_nonsense(entries), *_unrecorded(entries, robot)):
-        out.say(line, "note", "cyan")
+        out.say(f"  {line}", "note", "cyan")
     for line in report.cut[:MAX_ROWS]:
-        out.say(line, "cut", "yellow")
+        out.say(f"  {line}", "cut", "yellow")
     if len(report.cut) > MAX_ROWS:
-        out.say(f"… and {len(report.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
+        out.say(f"  … and {len(report.cut) - MAX_ROWS} more; --json lists all", "cut", "yellow")
     lags = {name: _fast_lags(entries, name) for name in robot.operated}
     offsets = report.offsets.joints if report.offsets else {}
     _show_offsets(out, lags, offsets)

@@ -159,7 +159,7 @@ def _import(
         if size > HOLD:
             held.clear()
         progress(len(digests), max(total, len(digests)), sequence.meta.motion)  # a file may hold many
-    _refuse_twice(digests)
+    _refuse_twice(digests, given.cut is not None)
     again = (s for s, _ in _sequences(src, robot, given, fmt, options))
     dataset = Dataset.create(out, robot)
     if facts and not dataset.entries:
@@ -255,14 +255,14 @@ def findings(sequence: Sequence) -> dict[str, dict[str, float | None]]:
     return {"delay_s": by_joint(lag), "fast_speed": by_joint(fast_speed(sequence.ctrl, sequence.dt))}
 
 
-def _refuse_twice(recordings: list[tuple[str, str]]) -> None:
-    """Refuse (content hash, source) that stand twice in the source."""
+def _refuse_twice(recordings: list[tuple[str, str]], cut: bool) -> None:
+    """Refuse (content hash, source) that stand twice in the source; pieces of one recording may be equal: it rested."""
     if not recordings:
         raise LogError("no recording found")
     names: dict[str, str] = {}
     twice = []
     for digest, source in recordings:
-        if digest in names:
+        if digest in names and not (cut and names[digest] == source):
             twice.append((source, names[digest]))
         names.setdefault(digest, source)
     if twice:

@@ -105,7 +105,7 @@ def start(
         kp: The gain of the controller while recording, N·m/rad: a number, or PATTERN=NUMBER; default the model's.
         kd: Likewise, N·m·s/rad.
         effort_limit: Likewise, N·m.
-        map: As of gaponet import, like the next seven: a joint's name in the log and the robot's, as a=b; repeatable.
+        map: A joint's name in the log and the robot's, as a=b; may be repeated.
         format: Format of the logs; gaponet formats lists them.
         position_unit: Unit of positions, where the format leaves it open.
         time_unit: Unit of time, where the format leaves it open.
@@ -121,6 +121,7 @@ def start(
     if prepare := offered("PROVIDES").get("OpenGL"):
         named(prepare)()  # before MuJoCo is imported, which the report's picture would be too late for
     from gaponet_interop.setup.new import Wanted
+    from gaponet_interop.setup.reading import UnreadError
 
     screen, told = Out(json), out / "logs.toml"
     values = {"format": format, "position_unit": position_unit, "time_unit": time_unit, "rate": rate, "cut": cut}
@@ -133,7 +134,13 @@ def start(
     made = _earlier(out, logs, files)
     wanted = Wanted(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
-        found = understand(model, logs, told, wanted, options, keep=not dry_run)
+        try:
+            found = understand(model, logs, told, wanted, options, keep=not dry_run)
+        except UnreadError as unread:
+            for line in unread.text.splitlines():
+                screen.say(f"  {line}")
+            raise UsageError(f"{unread}. The lines above are what these logs show of themselves; without "
+                             f"--dry-run they are written to {told}, to be looked over") from None  # fmt: skip
         _tell(screen, found, model, logs, unit_id, payload_mass)
         todo = plan(found, model, logs, out, wanted, stated, cut is None)
         for words in todo:
@@ -173,6 +180,7 @@ def understand(
         keep: Write a guess there that these logs cannot be read by, or that a person has to look at.
 
     Raises:
+        UnreadError: Without `keep`, what a person has to look at.
         RobotError, UsageError, LogError: The model is broken, or the logs cannot be read; the message says what to do.
     """
     from gaponet_interop.setup.new import new_robot
@@ -190,7 +198,7 @@ def understand(
             return Understood(robot, packaged, *read_first(logs, robot, by, not keep, **options))
         except UnreadError as unread:
             if not keep:
-                raise UsageError(f"{unread}. As far as these logs explain themselves:\n{unread.text}") from None
+                raise
             told.parent.mkdir(parents=True, exist_ok=True)
             write_text(told, unread.text)
             raise UsageError(
@@ -275,7 +283,7 @@ def _sha256(file: Path) -> str:
 
 
 def _earlier(out: Path, logs: Path, files: dict[str, str]) -> _MadeFrom:
-    """What start.json says of OUT, without data in it only how the robot was made; refuses to mix data with other logs."""
+    """What start.json says of OUT, without data there only how its robot was made; refuses data of other logs."""
     data, made, where = out / "data", _MadeFrom(logs="", files={}, done={}), "logs that nothing tells any more"
     if (out / MADE_FROM).is_file():
         made = read_json(_MadeFrom, out / MADE_FROM, UsageError, f"delete it and {data}")

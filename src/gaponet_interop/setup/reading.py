@@ -35,7 +35,7 @@ def read_first(
         told: A logs.toml; nothing is guessed beside it.
         anyhow: Also by a guess of which joint is which.
         skip_bad: Leave out recordings that cannot be read.
-        options: As read_logs takes them.
+        options: Arguments of read_logs.
 
     Raises:
         UnreadError, LogError, UsageError: The message says what is missing.

@@ -82,7 +82,7 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
     columns = theirs() | {f"{j}_{w}": np.zeros(60) for j in ("hip", "knee") for w in ("des", "pos")}
     folder = write(tmp_path / "logs", NAMES, columns=columns)
     with pytest.raises(
-        JointMismatchError, match=r"names joints hip, knee, but .* Map them with --map hip=\S+ --map knee="
+        JointMismatchError, match=r"names joints hip, knee, which .* Map them with --map hip=\S+ --map knee="
     ):
         list(read_logs(folder, arm))
     write(tmp_path / "logs", NAMES + 'ignore = ["hip", "kn*"]\n', columns=columns)

@@ -178,7 +178,7 @@ def test_a_missing_file_is_named(motion, so101, file):
 
 def test_a_joint_of_another_robot_says_how_to_map_it(motion, so101):
     (motion / "joint_list.txt").write_text("\n".join([*SERVO_NAMES[:2], "forearm", *SERVO_NAMES[3:]]))
-    with pytest.raises(JointMismatchError, match=r"joint_list\.txt names joint 'forearm', but robot 'so101' has"):
+    with pytest.raises(JointMismatchError, match=r"joint_list\.txt names joint 'forearm', which robot 'so101'"):
         list(read_logs(motion, so101))
     ((_, log),) = read_logs(motion, so101, joint_map={"forearm": "elbow_flex"})
     assert log.joint_names == so101.joint_names

@@ -203,7 +203,7 @@ def test_a_parquet_cell_that_is_empty_or_no_number_is_refused(tmp_path, arm):
 def test_a_strange_joint_says_how_to_map_it(tmp_path, arm):
     file = write(tmp_path / "wave.csv", {k.replace("elbow", "knee"): v for k, v in arm_columns().items()})
     with pytest.raises(
-        JointMismatchError, match=r"wave\.csv:1 names joint 'knee', but robot 'arm' has: shoulder, elbow"
+        JointMismatchError, match=r"wave\.csv:1 names joint 'knee', which robot 'arm' does not have; nearest: "
     ):
         only(file, arm)
     assert only(file, arm, joint_map={"knee": "elbow"}).joint_names == ("shoulder", "elbow")

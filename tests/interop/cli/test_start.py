@@ -132,6 +132,10 @@ def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, 
     for file in Path("logs").iterdir():
         text = file.read_text()
         file.write_text(text.replace("shoulder", name) if name == "a1" else text.replace("meas", name))
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == (0 if name == "a1" else 2)
+    said = capsys.readouterr()
+    assert "\\n" not in said.err
+    assert re.search('^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE)
     assert main(["start", "arm.xml", "logs"]) == 2
     assert "started/logs.toml says what these logs show of themselves" in capsys.readouterr().err
     told = Path("started/logs.toml")

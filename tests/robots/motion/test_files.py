@@ -76,7 +76,7 @@ def test_uneven_time_is_an_error(arm, tmp_path):
 def test_a_stranger_is_named_with_the_valid_joints(arm, tmp_path):
     file = tmp_path / "bad.txt"
     file.write_text("knee\n0\n1\n")
-    with pytest.raises(JointMismatchError, match=r"names joint 'knee', but robot 'arm' has: shoulder, elbow"):
+    with pytest.raises(JointMismatchError, match=r"names joint 'knee', which robot 'arm' does not have; nearest: "):
         read_motion(file, arm)
 
 

@@ -41,9 +41,10 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             close = difflib.get_close_matches(name.split("/")[-1], free, n=1, cutoff=0.5)
             maps.append(f"--map {name}={close[0] if close else '…'}")
             free = [j for j in free if j not in close]
+        left = f" (… is one of {', '.join(free)})" if free and any(m.endswith("=…") for m in maps) else ""
         raise JointMismatchError(
-            f"{where} names joints {', '.join(n for n, _ in strange)}, but robot '{robot.name}' has: "
-            f"{', '.join(robot.joint_names)}. Map them with {' '.join(maps)}, or under [names] in logs.toml; "
+            f"{where} names joints {', '.join(n for n, _ in strange)}, which robot '{robot.name}' does not have. "
+            f"Map them with {' '.join(maps)}{left}, or under [names] in logs.toml; "
             'what is no joint of this robot is left out by ignore = ["NAME", …] there'
         )
     if len(set(found)) != len(found):
