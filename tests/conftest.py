@@ -58,6 +58,15 @@ def sage_so101() -> Path:
 
 
 @pytest.fixture(scope="session")
+def paper_network() -> Path:
+    """The weights that the paper's authors published, and pairs of inputs and outputs of their code."""
+    folder = SHARED / "paper_network"
+    if not folder.is_dir():
+        pytest.skip(f"no published network at {folder}; set GAPONET_DATA to the folder that holds paper_network")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def real_dataset(sage_so101: Path, so101: RobotSpec, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """The public SO-101 logs, imported once; read only."""
     model = build_model(so101)

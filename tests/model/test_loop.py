@@ -38,9 +38,10 @@ class FirstRow:
         return low
 
 
-def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path):
+@pytest.mark.parametrize("how", [{"stride": 2}, {"kind": "paper", "sensor_hold": 3}], ids=["stride", "held sensors"])
+def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
     robot = write_arm(tmp_path)
-    config = ModelConfig(history=2, stride=2, num_probes=3)
+    config = ModelConfig(history=2, num_probes=3, **how)
     sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
     free: list = []
 

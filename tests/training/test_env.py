@@ -141,5 +141,5 @@ def test_a_step_never_runs_past_the_end_of_a_motion(robot):
 
 
 def test_a_motion_of_one_row_is_refused(robot):
-    with pytest.raises(UsageError, match="motion motion0 has 1 row and a step needs two"):
+    with pytest.raises(UsageError, match="motion motion0 has 1 of the 2 rows that a step needs"):
         DeltaEnv(recordings(robot, 2, rows=1), robot, ModelConfig(), 8, 1000, RewardConfig())

@@ -9,13 +9,20 @@ from gaponet import api
 from gaponet.cli.main import main
 from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
-from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.config import PAPER_PPO, PPOConfig, TrainConfig, WarmStartConfig
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
     warm_start=WarmStartConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
     rates=(50.0, 100.0),
 )  # fmt: skip
+
+
+def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed():
+    config = TrainConfig(ModelConfig(kind="paper"), ppo=PPOConfig(std=0.03), seed=4).paper_recipe()
+    assert config.warm_start.rounds == 0
+    assert config.ppo == replace(PAPER_PPO, std=0.03)
+    assert (config.model.kind, config.seed) == ("paper", 4)
 
 
 def test_a_gpu_has_simulations_of_its_own_number_unless_told():
@@ -26,7 +33,9 @@ def test_a_gpu_has_simulations_of_its_own_number_unless_told():
     assert TrainConfig().options() == TrainConfig().sized().options() == []
 
 
-@pytest.mark.parametrize("config", [TrainConfig(), CHANGED, replace(TrainConfig(), seed=9).fast()])
+@pytest.mark.parametrize(
+    "config", [TrainConfig(), CHANGED, TrainConfig().paper_recipe(), replace(TrainConfig(), seed=9).fast()]
+)
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []
 

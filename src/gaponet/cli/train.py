@@ -14,6 +14,7 @@ from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.eval.tables import mrad
 from gaponet.eval.verdict import Added
+from gaponet.methods import title
 from gaponet.model.config import Kind
 from gaponet.robot_folder import KEPT
 from gaponet.training.config import TrainConfig
@@ -24,6 +25,7 @@ def train(
     dataset: Source,
     out: Path,
     model: Kind = "gaponet",
+    recipe: Literal["labels", "paper"] = "labels",
     budget: str = "10m",
     resume: Flag = False,
     fast: Flag = False,
@@ -38,6 +40,8 @@ def train(
     Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model.
 
     Args:
+        recipe: labels: a supervised start, then PPO. paper: PPO from an untrained network, with settings for that;
+            fields of --ppo that are given stay.
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         config: Everything else.
@@ -46,6 +50,7 @@ def train(
     from gaponet.training.ranks import started
 
     screen = Out(json)
+    config = config.paper_recipe() if recipe == "paper" else config
     config = config.fast() if fast else config
     trained = api.train(dataset, out, budget, config, model, robot, holdout_units, resume, log)
     if started():  # the first rank says it for all
@@ -85,6 +90,9 @@ def evaluate(
         out.say(
             "", "a model was trained or chosen on some of these motions: the numbers are not held-out ones", "yellow"
         )
+    for name, delta in evaluation.result["delta"].items():
+        if delta["at_limit"]:
+            out.say(f"{title(name)}: {delta['at_limit']:.2%} of the corrections are at the limit (--model.delta-max)")
     show_methods(out, evaluation.result)
     show_verdict(out, evaluation.result["methods"], dataset, run)
     out.result(evaluation.result)

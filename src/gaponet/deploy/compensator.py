@@ -336,6 +336,8 @@ class Compensator:
 def _corrected(model: GapModel, robot: RobotSpec, dt: float, config: CompensatorConfig) -> RobotSpec:
     """The simulator in which a model is asked: the given one, or that of its training; refuses what cannot be."""
     model.require_rate(dt)
+    if model.config.holds:
+        raise ModelError(f"{model.path}: holds corrections or sensors; to be inverted it must be trained without")
     if model.corrects(robot):
         return robot
     if config.aim == "simulator":

@@ -153,7 +153,9 @@ def evaluate(
         "robot": robot.name,
         "simulator_hash": model_hash(nominal),
         "simulators": simulators,
-        "delta": {name: _delta_summary(parts, sequences) for name, parts in deltas.items()},
+        "delta": {
+            name: _delta_summary(parts, sequences, models[name].config.delta_max) for name, parts in deltas.items()
+        },
         "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
         "command": _command(folders, dataset.address or dataset.path, motions),
@@ -220,11 +222,12 @@ def _by_unit(
     return [twins[i] for i in range(len(sequences))]
 
 
-def _delta_summary(parts: list[Array], sequences: list[Sequence]) -> dict[str, float]:
-    """Size of the corrections: mean and largest |Δa| rad, mean rate rad/s."""
+def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) -> dict[str, float]:
+    """Size of the corrections: mean and largest |Δa| rad, mean rate rad/s, share of them at the limit Δ_max (rad)."""
     dt = float(np.median([s.dt for s in sequences]))
     return {
         "mean": float(np.mean([np.abs(d).mean() for d in parts])),
         "max": float(max(np.abs(d).max() for d in parts)),
+        "at_limit": float(np.mean([(np.abs(d) >= limit - 1e-6).mean() for d in parts])),
         "rate": float(np.mean([np.abs(np.diff(d, axis=0)).mean() for d in parts]) / dt),
     }

@@ -12,7 +12,7 @@ from gaponet.methods import IDENTIFIED, title
 from gaponet.metrics import standard_error
 from gaponet.robot_folder import KEPT
 
-LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "gaponet")  # kinds of model
+LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "paper", "gaponet")  # kinds of model
 ALONE = ("nominal", "delay_offset", "identified")  # methods without a network
 WORTH = 0.02  # share of what is left that a network must remove, besides its standard error
 

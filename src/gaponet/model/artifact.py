@@ -32,9 +32,8 @@ WEIGHTS, CARD, FORMAT = "model.onnx", "card.json", 1
 RECORDED_TOLERANCE = 0.02  # relative, of gains
 # Switches of earlier versions that cards still name, and the value that they would have today.
 RETIRED = {
-    "payload_trunk": True, "payload_predictor": True, "sensor_hold": 1, "sensor_target": "delta", "context": "none",
-    "branch": "unstacked", "branch_history": True, "delta_hold": 1, "fno_width": 32, "fno_layers": 3,
-    "fno_modes": 4,
+    "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
+    "fno_layers": 3, "fno_modes": 4,
 }  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 
@@ -307,6 +306,8 @@ class GapModel:
             if done < planned
             else f"supervised start ({done} rounds)"
         )
+        if not planned and updates:
+            return f"{updates} updates of PPO from the untrained network, no supervised start"
         if card["stages"].get("ppo_anew"):
             return f"{warm}, worse than no correction; {updates} updates of PPO from the untrained network"
         return f"{warm}, {updates} updates of PPO" if updates else f"{warm}, no PPO"

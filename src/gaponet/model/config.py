@@ -9,7 +9,7 @@ from annotated_types import Interval, Len
 
 from gaponet.errors import UsageError
 
-Kind = Literal["gaponet", "shared_mlp", "mlp", "transformer", "inverse"]
+Kind = Literal["gaponet", "paper", "shared_mlp", "mlp", "transformer", "inverse"]
 OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
@@ -17,6 +17,7 @@ POSITIVE = (
     "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
     "transformer_width", "transformer_layers", "transformer_heads",
 )  # fmt: skip
+PAPER_ONLY = ("payload_trunk", "delta_hold", "sensor_hold", "sensor_target")
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class ModelConfig:
     """Shape of a delta-action model; every dimension is derived from it and the number of operated joints n."""
 
     kind: Kind = "gaponet"
-    """gaponet: the operator. shared_mlp: one plain network with exactly the operator's inputs and as many weights as
+    """gaponet: the operator. paper: the network of the paper in its literal form, with the paper's layer widths
+    (model/paper.py). shared_mlp: one plain network with exactly the operator's inputs and as many weights as
     its branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form.
     transformer: attention over the past frames and the present. inverse: the mlp fitted once to the labels on the
     recorded motions, without roll-outs of its own and without PPO."""
@@ -34,10 +36,18 @@ class ModelConfig:
     """Control periods between past frames."""
     payload_input: bool = True
     """Whether the payload mass is observed."""
+    payload_trunk: bool = True
+    """paper: whether the trunk sees the observed payload beside the action."""
     payload_max: Annotated[float, Interval(gt=0, le=100)] = 3.0
     """Mass that counts as 1 at the input, kg."""
     delta_max: Annotated[float, Interval(gt=0, le=10)] = 0.3
     """Largest correction, rad."""
+    delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
+    """paper: control periods that a correction is held (action duration)."""
+    sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
+    """paper: control periods that the sensor values are held."""
+    sensor_target: Literal["delta", "absolute"] = "delta"
+    """paper: what a sensor value is. delta: the change of state, S(t+1) − S(t). absolute: the next state, S(t+1)."""
     num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
     """m, how many targets the simulator is asked about."""
     probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
@@ -80,11 +90,21 @@ class ModelConfig:
             )
         if self.kind == "shared_mlp" and self.coupling == "full":
             raise UsageError("shared_mlp takes one joint at a time; with full coupling the plain network is mlp")
+        for name in PAPER_ONLY if self.kind != "paper" else ():
+            if (value := getattr(self, name)) != getattr(ModelConfig, name):
+                raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
+        if self.delta_hold > 1 and self.sensor_hold > 1:
+            raise UsageError(f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them")
         if self.transformer_width % self.transformer_heads:
             raise UsageError(
                 f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
                 "make it a multiple of transformer_heads"
             )
+
+    @property
+    def holds(self) -> bool:
+        """Whether corrections or sensor values are held for several control periods."""
+        return self.delta_hold > 1 or self.sensor_hold > 1
 
     @property
     def joint_wise(self) -> bool:

@@ -1,41 +1,17 @@
-"""Networks: sensor predictor, branch, trunk and their inner product; and the one place that builds any network."""
+"""Networks: branch, trunk and their inner product; and the one place that builds any network."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from gaponet.model.baselines.mlp import DeltaMLP
 from gaponet.model.baselines.transformer import DeltaTransformer
 from gaponet.model.config import ModelConfig
-from gaponet.model.layers import DeltaNet, Standardise, dense, size
-from gaponet.model.observation import Layout
-
-
-class _SensorPredictor(nn.Module):
-    """f_φ(o_t) → mean and log-variance of the standardised sensor values, (B, 2nm) each."""
-
-    def __init__(self, config: ModelConfig, n: int) -> None:
-        super().__init__()
-        at = Layout(config, n)
-        self.seen = at.observation
-        self.outputs = Standardise(config.sensor_dim(n))
-        self.net = dense(self.seen.stop, config.sensor_hidden, 2 * config.sensor_dim(n))
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Takes standardised features; the action, their last n columns, is not looked at."""
-        mean, log_var = self.net(features[:, self.seen]).chunk(2, dim=1)
-        return mean, log_var.clamp(-10.0, 4.0)
-
-    def mean(self, features: Tensor) -> Tensor:
-        """The mean alone, (B, 2nm)."""
-        hidden: nn.Module = self.net[:-1]
-        head: Any = self.net[-1]
-        return linear(hidden(features[:, self.seen]), head.weight.chunk(2)[0], head.bias.chunk(2)[0])
+from gaponet.model.layers import DeltaNet, dense, size
+from gaponet.model.paper import PaperNet, SensorPredictor
 
 
 class OperatorNet(DeltaNet):
@@ -50,7 +26,8 @@ class OperatorNet(DeltaNet):
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
         if config.sensors == "predicted":
-            self.predictor = _SensorPredictor(config, n)
+            inputs = config.observation_dim(n)
+            self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
         self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)
         sensed, seen, asked = self.input_dims(config, n)
@@ -86,7 +63,7 @@ class OperatorNet(DeltaNet):
 
     def sensors(self, z: Tensor) -> Tensor:
         """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
-        return self.predictor.mean(z)
+        return self.predictor.mean(z[:, self.features.layout.observation])
 
     def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
         at = self.features.layout
@@ -132,6 +109,8 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
     """The network a config describes, for n operated joints."""
     if config.kind == "gaponet":
         return OperatorNet(config, n)
+    if config.kind == "paper":
+        return PaperNet(config, n)
     if config.kind == "shared_mlp":
         return SharedMLP(config, n)
     if config.kind == "transformer":

@@ -94,6 +94,8 @@ class Features(nn.Module):
 class _Bounded(nn.Module):
     """Δ_max · tanh(gain · unit · y / Δ_max): near gain · unit · y for small corrections, never more than Δ_max.
 
+    A hard bound is gain · unit · y, clipped outside training (the environment clips in training).
+
     The unit, rad, is what labels usually are, so that y is a number near 1 whatever the robot. The gain is 1 while
     training; training/validation.py lowers it where less of a correction does better.
     """
@@ -101,9 +103,9 @@ class _Bounded(nn.Module):
     gain: Tensor
     unit: Tensor
 
-    def __init__(self, delta_max: float) -> None:
+    def __init__(self, delta_max: float, hard: bool) -> None:
         super().__init__()
-        self.delta_max = delta_max
+        self.delta_max, self.hard = delta_max, hard
         self.register_buffer("gain", torch.tensor(1.0))
         self.register_buffer("unit", torch.tensor(1.0))
 
@@ -112,6 +114,9 @@ class _Bounded(nn.Module):
         super()._load_from_state_dict(state, prefix, *rest)
 
     def forward(self, y: Tensor) -> Tensor:
+        if self.hard:
+            delta = self.gain * self.unit * y
+            return delta if self.training else delta.clamp(-self.delta_max, self.delta_max)
         return self.delta_max * torch.tanh(self.gain * self.unit * y / self.delta_max)
 
 
@@ -128,12 +133,16 @@ class DeltaNet(nn.Module):
         super().__init__()
         self.config, self.n = config, n
         self.features = Features(config, n)
-        self.bounded = _Bounded(config.delta_max)
+        self.bounded = _Bounded(config.delta_max, hard=config.kind == "paper")
         self.predictor = None
 
     def fit_inputs(self, x: Tensor) -> None:
         """Take the statistics of inputs from samples of x."""
         self.features.standardise.fit(self.features.relative(x))
+
+    def sensor_inputs(self, x: Tensor) -> Tensor:
+        """x → what the sensor predictor sees, (B, …)."""
+        return self.features(x)[:, self.features.layout.observation]
 
     def prepare(self, x: Tensor) -> Tensor:
         """x → what `correct` is given, (B, …)."""

@@ -57,6 +57,8 @@ class DeltaLoop:
             np.array(side[None], float) if self._host else x.new_tensor(side) for side in np.transpose(qpos_range)
         )
         self.applied: Any = zeros_like(self.x, num_envs, n)
+        self.holds, self.age = config.holds, zeros_like(self.x, num_envs)  # control periods since the start
+        self.held: Any = zeros_like(self.x, num_envs, n)  # the correction that is held
         self.fresh = np.ones(num_envs, bool)  # robots without a past
         self.any_fresh = True
 
@@ -70,6 +72,7 @@ class DeltaLoop:
     def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
         """Give robots `ids` a past: frames (k, depth, n), newest first, or (k, 1, n), repeated; rad, rad/s, rad."""
         self.history.reset(ids, qpos, qvel, u)
+        self.age[ids] = 0
         if self.any_fresh:
             self.fresh[ids] = False
             self.any_fresh = bool(self.fresh.any())
@@ -77,6 +80,7 @@ class DeltaLoop:
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """One control period has passed: the state before it and the target applied over it, (num_envs, n) each."""
         self.history.push(qpos, qvel, u)
+        self.age += self.holds
 
     # ---- a period
 
@@ -90,8 +94,15 @@ class DeltaLoop:
         """
         if self.any_fresh:
             self.begin(self.fresh.copy(), *(x.reshape(-1, 1, self.n)[self.fresh] for x in (qpos, qvel, ctrl)))
-        self._q[...], self._v[...], self._action[...] = qpos, qvel, ctrl
-        self.history.write()
+        if self.config.sensor_hold == 1:
+            self._q[...], self._v[...], self._action[...] = qpos, qvel, ctrl
+            self.history.write()
+        else:  # the sensor predictor sees the observation of the last refresh, the trunk the present action
+            due = self.age % self.config.sensor_hold == 0
+            self._q[...] = self._xp.where(due[:, None], qpos, self._q)
+            self._v[...] = self._xp.where(due[:, None], qvel, self._v)
+            self._action[...] = ctrl
+            self.history.write(due)
         if self._most is not None:
             self._mass[...] = payload_mass / self._most
         return self.x
@@ -118,8 +129,15 @@ class DeltaLoop:
             a = self._finite(q, a)
         self.observe(q, v, a, payload_mass)
         self.bound.run()
-        self.applied = self._xp.minimum(self._xp.maximum(a + self.bound.delta, self.low), self.high)
-        self.history.push(None, None, self.applied)
+        delta = self.bound.delta
+        if self.config.delta_hold > 1:
+            due = self.age % self.config.delta_hold == 0
+            delta = self.held = self._xp.where(due[:, None], delta, self.held)
+        self.applied = self._xp.minimum(self._xp.maximum(a + delta, self.low), self.high)
+        if self.holds:
+            self.push(q, v, self.applied)
+        else:
+            self.history.push(None, None, self.applied)
         return (self.applied - a).reshape(ctrl.shape if hasattr(ctrl, "shape") else np.shape(ctrl))
 
     def solve(

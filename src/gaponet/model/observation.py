@@ -44,14 +44,15 @@ class History:
     def __init__(self, config: ModelConfig, n: int, x: Any) -> None:
         """
         Args:
-            x: The network's input, (num_envs, dim). Without a stride the frames are kept there and nothing is copied.
+            x: The network's input, (num_envs, dim). Without a stride or held sensors the frames are kept there and
+                nothing is copied.
         """
         layout = Layout(config, n)
         self.n = n
         self.depth = (config.history - 1) * config.stride + 1
         self.picked = slice(0, self.depth, config.stride)  # newest first
         self.place, self.present = x[:, layout.past], x[:, layout.state]
-        self.inside = config.stride == 1
+        self.inside = config.stride == config.sensor_hold == 1
         held = self.place if self.inside else zeros_like(x, len(x), 3 * n * self.depth)
         self.frames = held.reshape(len(x), self.depth, 3 * n)  # a view, of a slice of columns too
         self.state, self.target = held[:, : 2 * n], held[:, 2 * n : 3 * n]  # of the newest
@@ -79,10 +80,11 @@ class History:
             self.state[:, : self.n], self.state[:, self.n :] = qpos, qvel
         self.target[...] = u
 
-    def write(self) -> None:
-        """Bring x up to date."""
+    def write(self, ids: Any = slice(None)) -> None:
+        """Bring x up to date, for environments `ids`."""
         if not self.inside:
-            self.place[:] = self.frames[:, self.picked].reshape(len(self.place), -1)
+            frames = self.frames[ids][:, self.picked]
+            self.place[ids] = frames.reshape(len(frames), self.place.shape[1])
 
     @staticmethod
     def rows_before(t: Array, depth: int) -> Array:

@@ -29,7 +29,7 @@ class ProbeOracle:
     ) -> None:
         """One state slot per entry of `conditions`; states are of the joints that are not locked."""
         self.offsets = self.offsets_of(config, len(robot.operated))
-        self.dt = np.array([c[2] for c in conditions])
+        self.dt, self.absolute = np.array([c[2] for c in conditions]), config.sensor_target == "absolute"
         m = len(self.offsets)
         prompt = replace(robot, delay=np.zeros(len(robot.joint_names)))  # a late servo would not answer within a period
         self.sim = sim = BatchSim(prompt, [c for c in conditions for _ in range(m)], nthread, locked)
@@ -54,7 +54,7 @@ class ProbeOracle:
             qpos, qvel: States of the joints, (k, n_free), one per slot.
 
         Returns:
-            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints.
+            (k, m, 2n): [q' − q, Δt·(q̇' − q̇)] of the operated joints, or [q', Δt·q̇'] with an absolute target.
         """
         k, m, op, sim = len(qpos), len(self.offsets), self.operated, self.sim
         rows, each = np.arange(k * m), np.repeat(np.arange(k), m)
@@ -64,6 +64,7 @@ class ProbeOracle:
         sim.reset(rows, q, v, past=target[:, None])
         self.target[rows] = target
         sim.step(self.target, None if len(rows) == sim.num_envs else rows)
-        moved = sim.qpos[rows][:, op] - q[:, op]
-        sped = (sim.qvel[rows][:, op] - v[:, op]) * self.dt[each][:, None]
+        start = 0.0 if self.absolute else 1.0
+        moved = sim.qpos[rows][:, op] - start * q[:, op]
+        sped = (sim.qvel[rows][:, op] - start * v[:, op]) * self.dt[each][:, None]
         return np.concatenate([moved, sped], axis=1).astype(np.float32).reshape(k, m, 2 * len(op))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -61,7 +61,7 @@ class PPOConfig:
     num_envs: Annotated[int, Interval(ge=0, le=1000000)] = 0
     """Simulations; 0 for 256, with --device cuda 4,096."""
     num_steps: Annotated[int, Interval(ge=1, le=100000)] = 32
-    """Control periods between updates."""
+    """Decisions between updates; a decision is model.delta_hold control periods."""
     epochs: Annotated[int, Interval(ge=1, le=1000)] = 5
     """Passes over each batch."""
     mini_batches: Annotated[int, Interval(ge=1, le=10000)] = 4
@@ -92,6 +92,14 @@ class PPOConfig:
     """Share of the joints that explore at a time; a joint at rest beside them shows what it does alone."""
     critic_hidden: Layers = (256, 128)
     """Hidden layers of the critic."""
+    refit_sensors: Annotated[int, Interval(ge=0, le=10000000)] = 0
+    """Updates between new fits of the sensor predictor to states that the policy visits; 0 for none."""
+
+
+# The paper's training: PPO from an untrained network. Step size and exploration suit a start from nothing.
+PAPER_PPO = PPOConfig(
+    learning_rate=3e-4, desired_kl=0.01, critic_warmup=4, explained=0.2, std=0.02, noise_share=1.0, refit_sensors=50
+)
 
 
 @dataclass(frozen=True)
@@ -145,6 +153,12 @@ class TrainConfig:
     def fast(self) -> TrainConfig:
         """The same with PPO of one pass over each batch and a smaller critic; gaponet bench train shows the gain."""
         return replace(self, ppo=replace(self.ppo, epochs=1, critic_hidden=(128,)))
+
+    def paper_recipe(self) -> TrainConfig:
+        """The same with the paper's training: PPO from an untrained network. Fields of PPO that were changed stay."""
+        usual = PPOConfig()
+        mine = {f.name: value for f in fields(usual) if (value := getattr(self.ppo, f.name)) != getattr(usual, f.name)}
+        return replace(self, ppo=replace(PAPER_PPO, **mine), warm_start=replace(self.warm_start, rounds=0))
 
     def sized(self) -> TrainConfig:
         """The same with as many simulations as suit the device, where none were asked for."""

@@ -46,7 +46,7 @@ class DeltaEnv:
         nthread: int = 0,
         device: str = "cpu",
     ) -> None:
-        """Every sequence needs two rows; `episode_steps` counts control periods.
+        """Every sequence needs a row more than a correction is held; `episode_steps` counts control periods.
 
         On "cpu" C MuJoCo steps and arrays are numpy's; elsewhere mujoco_warp's (sim/warp.py), tensors that stay there.
         """
@@ -84,9 +84,11 @@ class DeltaEnv:
         recorded = [x[:, self.op] for x in (self.qpos, self.qvel, self.ctrl)]
         self.track = np.ascontiguousarray(np.concatenate(recorded, axis=1), np.float32)  # take() copies anything else
         length = np.array([len(s) for s in sequences])
-        if length.min() < 2:
-            short = sequences[int(length.argmin())]
-            raise UsageError(f"motion {short.meta.motion} has {len(short)} row and a step needs two: drop the motion")
+        if length.min() <= self.config.delta_hold:
+            short, needed = sequences[int(length.argmin())], self.config.delta_hold + 1
+            raise UsageError(
+                f"motion {short.meta.motion} has {len(short)} of the {needed} rows that a step needs: drop the motion"
+            )
         self.seq_last = np.cumsum(length) - 1
         self.seq_first = self.seq_last - length + 1
         keys = [(Condition.of(s, self.robot), s.meta.unrecorded) for s in sequences]
@@ -135,7 +137,7 @@ class DeltaEnv:
         drawn = np.minimum(group + self.rng.random(len(group)), np.nextafter(group + 1.0, 0.0))  # in its group
         seq = self.members[np.searchsorted(self.ends, drawn, side="right")]
         first, last = self.seq_first[seq], self.seq_last[seq]
-        t = self.rng.integers(first, last)
+        t = self.rng.integers(first, last - self.config.delta_hold + 1)
         before = first[:, None] + History.rows_before(t - first, self.depth)
         self.first[ids], self.last[ids], self.row[ids], self.elapsed[ids] = first, last, t, 0
         t, last, before = (self.sim.array(x) for x in (t, last, before))
@@ -159,21 +161,25 @@ class DeltaEnv:
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
 
     def step(self, delta: Any) -> tuple[Any, Any]:
-        """Correct targets for a control period, and compare with the recording one row on.
+        """Correct targets for delta_hold control periods, and compare each with the recording one row on.
 
         Args:
             delta: (num_envs, n) rad, numpy or torch.
 
         Returns:
-            Reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
+            Mean reward of each joint, (num_envs, n), and whose motion or time ended and who begins anew, (num_envs,);
             arrays of the simulator's kind.
         """
-        self.advance(self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max))
-        return self._reward(), self.sim.array(self.restart())
+        delta = self.sim.array(delta).clip(-self.config.delta_max, self.config.delta_max)
+        hold, reward = self.config.delta_hold, 0.0
+        for _ in range(hold):
+            self.advance(delta)
+            reward = reward + self._reward()
+        return reward / hold, self.sim.array(self.restart())
 
     def restart(self) -> Array:
-        """Reset whose recording has no row left or whose time is over; returns whose, (num_envs,), on the host."""
-        done = (self.row >= self.last) | (self.elapsed >= self.max_episode_length)
+        """Reset whose recording or time is over; returns whose, (num_envs,), on the host."""
+        done = (self.row > self.last - self.config.delta_hold) | (self.elapsed >= self.max_episode_length)
         if done.any():
             self.reset(np.flatnonzero(done))
         return done
@@ -218,6 +224,7 @@ class DeltaEnv:
     def state(self) -> dict[str, Any]:
         """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
         arrays = {name: getattr(self, name) for name in ROWS} | {"frames": self.loop.history.frames} | self.sim.state()
+        arrays |= {"age": self.loop.age, "x": self.loop.x} if self.loop.holds else {}
         return {
             "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
             "reward": (float(self.reward_sum), self.reward_count),
@@ -232,6 +239,8 @@ class DeltaEnv:
         self.here[:], self.until[:] = self.sim.array(self.row), self.sim.array(self.last)
         self.now[:] = self.track[self.here]
         self.loop.history.frames[:] = like(self.loop.history.frames, arrays["frames"])
+        for name in ("age", "x") if self.loop.holds else ():
+            getattr(self.loop, name)[:] = like(getattr(self.loop, name), arrays[name])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]
         self.rng_state = state["rng"]

@@ -53,13 +53,14 @@ class _Batch:
 @dataclass
 class Update:
     """What an update found. Attributes: share of the returns' variance that the critic explains; KL of the actor's
-    step, per joint; step sizes; mean |Δa|, rad; mean reward."""
+    step, per joint; step sizes; mean |Δa|, rad; share of corrections at or beyond Δ_max; mean reward."""
 
     explained_variance: float = float("nan")
     kl: float = float("nan")
     learning_rate: float = float("nan")
     critic_learning_rate: float = float("nan")
     mean_delta: float = float("nan")
+    at_limit: float = float("nan")
     reward: float = float("nan")
 
 
@@ -68,7 +69,7 @@ class Learner:
 
     def __init__(self, env: DeltaEnv, net: DeltaNet, config: PPOConfig) -> None:
         """net: Trained in place, its sensor predictor excepted."""
-        self.env, self.net, self.config = env, net, config
+        self.env, self.net, self.config = env, net.train(), config
         if net.predictor is not None:
             net.predictor.requires_grad_(False)
         self.trained = [p for p in net.parameters() if p.requires_grad]
@@ -78,13 +79,14 @@ class Learner:
         ranks.spread(self.critic)
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
-        self.kept = math.exp(-env.robot.dt / config.noise_time) if config.noise_time else 0.0
+        step = env.robot.dt * env.config.delta_hold
+        self.kept = math.exp(-step / config.noise_time) if config.noise_time else 0.0
         self.spread = config.std * math.sqrt(1 - self.kept**2)
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
         self.updates, self.ready, self.found = 0, False, Update()
 
     def update(self) -> Update:
-        """Run num_steps control periods in every environment, then learn from them."""
+        """Run num_steps decisions in every environment, then learn from them."""
         batch = self.collect()
         self.learn(batch)
         self.updates += 1
@@ -96,7 +98,7 @@ class Learner:
         explored = (torch.rand_like(self.noise) < config.noise_share).float()
         self.noise *= explored
         rows: list[dict[str, Tensor]] = []
-        gamma = config.gamma
+        gamma = config.gamma**env.config.delta_hold  # a step is a decision
         with torch.no_grad():
             for _ in range(config.num_steps):
                 row = self.look()
@@ -129,10 +131,12 @@ class Learner:
 
     def _measure(self, seen: dict[str, Tensor]) -> None:
         left = (seen["returns"] - seen["value"]).flatten(0, 1).var(0) / seen["returns"].flatten(0, 1).var(0)
-        explained, delta, reward = ranks.mean(
-            1 - float(left.mean()), float(seen["mean"].abs().mean()), self.env.mean_reward()
+        size = seen["mean"].abs()
+        at_limit = (size >= self.env.config.delta_max).float().mean()
+        explained, delta, limited, reward = ranks.mean(
+            1 - float(left.mean()), float(size.mean()), float(at_limit), self.env.mean_reward()
         )
-        found = self.found = Update(explained_variance=explained, mean_delta=delta, reward=reward)
+        found = self.found = Update(explained_variance=explained, mean_delta=delta, at_limit=limited, reward=reward)
         self.ready |= self.updates >= self.config.critic_warmup and found.explained_variance >= self.config.explained
 
     def learn(self, batch: _Batch) -> None:

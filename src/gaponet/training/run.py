@@ -50,7 +50,7 @@ from gaponet.training.kept import Kept, StateDict
 from gaponet.training.labels import trajectory_labels
 from gaponet.training.loggers import Loggers
 from gaponet.training.ppo import Learner, Update
-from gaponet.training.sensor_fit import fit_inputs
+from gaponet.training.sensor_fit import fit_inputs, refit_sensors
 from gaponet.training.validation import added, choose_gain, errors
 from gaponet.training.warm_start import WarmStart, recipe
 
@@ -212,7 +212,12 @@ class Trainer:
         while self._spent() < 1:
             self.found = learner.update()
             self.kept.updates += 1
-            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps
+            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
+            if ppo.refit_sensors and self.kept.updates % ppo.refit_sensors == 0 and self.net.predictor is not None:
+                seed = self.config.seed + self.kept.updates
+                self.kept.sensor_r2 = refit_sensors(
+                    self.net, env, self.own.warm_start.sensor_states, seed, self.own.threads
+                )
             self._tick()
             if self.kept.updates % self.config.validate_every == 0:
                 self.kept.learner, self.kept.env = learner.state(), env.state()
@@ -226,8 +231,8 @@ class Trainer:
         self.kept.anew = bool(recipe(self.config).rounds) and self._in_vain()
         if not self.kept.anew:
             return best
-        fitted_before = ("predictor.", "features.", "bounded.")
-        return {k: v if k.startswith(fitted_before) else self.untrained[k] for k, v in best.items()}
+        trained = {name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")}
+        return {k: self.untrained[k] if k in trained else v for k, v in best.items()}
 
     def _in_vain(self) -> bool:
         """Whether nothing that was fitted is better than no correction."""
@@ -235,7 +240,7 @@ class Trainer:
 
     def _shrink(self) -> None:
         """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
-        if not np.isfinite(self.kept.trained):
+        if not np.isfinite(self.kept.trained) or self.config.model.kind == "paper":  # which has no gain
             return
         self.stage = "gain"
         self._tick()

@@ -56,8 +56,9 @@ class WarmStart:
         seed: int,
         nthread: int = 0,
     ) -> None:
-        """labels: Δa* of every row of the environment's data, (N, n)."""
+        """labels: Δa* of every row of the environment's data, (N, n); a held correction has their mean."""
         self.net, self.env, self.config = net, env, config
+        labels = _held(labels, env.config.delta_hold)
         self.labels: Any = env.sim.array(labels)
         self.unit = float(np.sqrt(np.nanmean(np.square(labels)))) or 1.0
         self.seed, self.nthread = seed, nthread
@@ -79,7 +80,8 @@ class WarmStart:
 
     def collect(self, follow_labels: bool) -> None:
         """Roll out for config.steps, motions restarting where they end."""
-        env, net, steps = self.env, self.net, self.config.steps
+        env, net, hold = self.env, self.net, self.env.config.delta_hold
+        steps = max(self.config.steps // hold, 1)
         env.reset()
         net.eval()
         xs, ys, every = [], [], math.ceil(self.config.rounds * steps * env.num_envs / MOST) or 1
@@ -94,7 +96,8 @@ class WarmStart:
             else:
                 with torch.inference_mode():
                     delta = net(x)
-            env.advance(delta)
+            for _ in range(hold):
+                env.advance(delta)
             env.restart()
         self.pool_x.append(torch.cat(xs))
         self.pool_y.append(torch.cat(ys))
@@ -160,6 +163,11 @@ class WarmStart:
         self.generator.set_state(state["generator"])
         self.env.rng_state = state["env_rng"]
         self.rounds, self.done = list(state["rounds"]), len(state["rounds"])
+
+
+def _held(labels: Array, hold: int) -> Array:
+    """Mean of the labels of rows t … t + hold − 1, (N, n) → (N − hold + 1, n); across motions it is never used."""
+    return np.mean([labels[i : len(labels) - hold + 1 + i] for i in range(hold)], axis=0) if hold > 1 else labels
 
 
 def _rms(losses: Array) -> float:

@@ -68,7 +68,13 @@ class DeltaStep(nn.Module):
 
 
 def delta_step(model: GapModel, run: Path) -> DeltaStep:
-    """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz."""
+    """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz.
+
+    Raises:
+        ModelError: The model holds corrections or sensors.
+    """
+    if model.config.holds:
+        raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
     return DeltaStep(torch_network(model, run), model)
 
 

@@ -38,7 +38,7 @@ def test_a_field_that_may_be_absent_reads_none():
 @pytest.mark.parametrize(
     ("word", "complaint"),
     [
-        ("lstm", "no model 'lstm'; there are gaponet, shared_mlp, mlp"),
+        ("lstm", "no model 'lstm'; there are gaponet, paper, shared_mlp"),
         ("mlp:hidden=3", "fields like that are .*mlp_hidden"),
         ("mlp:history", "'history' is not FIELD=VALUE"),
         ("mlp:kind=gaponet", "'kind=gaponet' is not"),

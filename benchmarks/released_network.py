@@ -1,0 +1,36 @@
+"""Compare the network that the paper's authors published with `--model paper`, output by output.
+
+    python benchmarks/released_network.py FOLDER
+
+FOLDER holds weights.npz (their state dict by its names) and pairs.npz (model_obs, action, and delta, the outputs of
+their code). Exit code 1 above 1e-6.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gaponet.model.paper import released_inputs, released_network
+
+LIMIT = 1e-6  # rad
+
+
+def difference(folder: Path) -> float:
+    """Largest |module − published output| over the pairs, rad."""
+    net, pairs = released_network(dict(np.load(folder / "weights.npz"))), np.load(folder / "pairs.npz")
+    with torch.inference_mode():
+        delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
+    return float(np.abs(delta - pairs["delta"]).max())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    largest = difference(parser.parse_args().folder)
+    print(f"max |difference| {largest:.2e} rad")
+    sys.exit(largest > LIMIT)

@@ -1,0 +1,208 @@
+"""The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.data.store import Dataset
+from gaponet.errors import UsageError
+from gaponet.eval.evaluate import evaluate
+from gaponet.model.artifact import GapModel, make_card
+from gaponet.model.backends import FunctionNetwork
+from gaponet.model.config import ModelConfig
+from gaponet.model.deeponet import build_network
+from gaponet.model.export import drawn_states, export
+from gaponet.model.loop import DeltaLoop
+from gaponet.model.paper import released_inputs, released_network
+from gaponet.model.sensor import ProbeOracle
+from gaponet.training.budget import Budget
+from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.run import Trainer
+
+PAPER = ModelConfig(kind="paper", num_probes=4, history=2)
+
+
+def network(config=PAPER, n=2):
+    """One whose trunk answers something."""
+    torch.manual_seed(0)
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.02)
+    return net.eval()
+
+
+@pytest.mark.parametrize(
+    ("history", "payload", "trunk", "seen", "asked"),
+    [(2, False, True, 80, 10), (4, False, True, 140, 10), (6, False, True, 200, 10), (8, False, True, 260, 10),
+     (4, True, True, 141, 11), (4, True, False, 141, 10)],
+)  # fmt: skip
+def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, asked):
+    net = build_network(ModelConfig(kind="paper", history=history, payload_input=payload, payload_trunk=trunk), 10)
+    assert net.predictor.net[0].in_features == seen
+    assert net.branch[0].in_features == 20 * 2 * 10
+    assert net.trunk[0].in_features == asked
+    assert net.branch[-2].out_features == net.trunk[-1].out_features == 16 * 10
+    assert build_network(net.config, 10)(torch.randn(3, net.config.input_dim(10))).abs().max() == 0
+
+
+def test_the_published_weights_give_the_published_outputs(paper_network):
+    net, pairs = released_network(dict(np.load(paper_network / "weights.npz"))), np.load(paper_network / "pairs.npz")
+    with torch.inference_mode():
+        delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
+    assert np.abs(delta - pairs["delta"]).max() < 1e-6
+    assert np.abs(pairs["delta"]).max() > 0.1
+
+
+def test_the_branch_sees_sensor_values_alone():
+    net = network()
+    x = torch.randn(5, net.config.input_dim(2))
+    other = torch.cat([torch.randn(5, net.config.observation_dim(2) - 1), x[:, -3:]], dim=1)
+    assert not torch.allclose(net(x), net(other))
+    for p in net.predictor.net[-1].parameters():
+        torch.nn.init.zeros_(p)
+    assert torch.equal(net(x), net(other))
+
+
+def test_sensors_are_sampled_in_training_and_the_mean_otherwise():
+    net, x = network(), torch.randn(1, PAPER.input_dim(2)).expand(4000, -1)
+    with torch.inference_mode():
+        mean = net.sensors(x)
+        sample = net.train().sensors(x)
+        _, log_var = net.predictor(net.sensor_inputs(x))
+    assert torch.equal(mean[0], mean[1])
+    assert torch.allclose(sample.mean(0), mean[0], atol=0.1)
+    assert torch.allclose(sample.var(0), log_var[0].exp(), rtol=0.15)
+
+
+def test_the_limit_changes_no_correction_within_it():
+    net, x = network(), torch.randn(50, PAPER.input_dim(2))
+    with torch.inference_mode():
+        prepared = net.prepare(x)
+        raw = net.train().correct(prepared)
+        small = network(replace(PAPER, delta_max=float(raw.abs().median())))
+        limited = small.correct(prepared)
+    within = raw.abs() < small.config.delta_max
+    assert 0.3 < within.float().mean() < 0.7
+    assert torch.equal(limited[within], raw[within])
+    assert torch.allclose(limited[~within].abs(), torch.tensor(small.config.delta_max))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2}],
+)  # fmt: skip
+def test_the_artifact_answers_as_the_network(tmp_path, how):
+    config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
+    net = network(config)
+    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net)) <= 1e-5
+    model = GapModel.load(tmp_path / "run")
+    assert model.config == config
+    x = torch.randn(7, config.input_dim(2))
+    with torch.inference_mode():
+        np.testing.assert_allclose(model.infer(x.numpy()), net(x).numpy(), atol=1e-6)
+    assert model.loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1).shape == (2,)
+
+
+def loop(infer, **how):
+    config = replace(PAPER, **how)
+    return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, FunctionNetwork(infer, config.input_dim(2), 2))
+
+
+def test_a_correction_is_held_for_its_duration_and_begins_anew_after_a_reset():
+    count = iter(range(100))
+    held = loop(lambda x: np.full((2, 2), next(count), np.float32), delta_hold=3)
+    zero = np.zeros((2, 2))
+    seen = []
+    for t in range(8):
+        if t == 4:
+            held.reset(np.array([1]))
+        seen.append(held.delta(zero, zero, zero, 0.0)[:, 0])
+    assert np.array(seen).T.tolist() == [[0, 0, 0, 3, 3, 3, 6, 6], [0, 0, 0, 3, 4, 4, 4, 7]]
+
+
+def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_present_action():
+    inputs = []
+    held = loop(lambda x: inputs.append(x.copy()) or np.zeros((2, 2), np.float32), sensor_hold=3)
+    for t in range(6):
+        held.delta(*np.full((3, 2, 2), float(t)), 0.0)
+    inputs = np.array(inputs)[:, 0]
+    at = held.layout
+    assert inputs[:, at.q.start].tolist() == [0, 0, 0, 3, 3, 3]
+    assert inputs[:, at.past.start].tolist() == [0, 0, 0, 2, 2, 2]
+    assert inputs[:, at.action.start].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
+    robot = write_arm(tmp_path)
+    q, v = np.array([[0.2, -0.1]]), np.array([[0.5, -0.3]])
+    change, state = (
+        ProbeOracle(robot, replace(PAPER, sensor_target=form), [(0.0, "both", 0.02)])(q, v)
+        for form in ("delta", "absolute")
+    )
+    np.testing.assert_allclose(state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6)
+
+
+def test_other_networks_refuse_the_paper_s_switches():
+    for how in ({"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_target": "absolute"}, {"payload_trunk": False}):
+        with pytest.raises(UsageError, match="use --model paper"):
+            ModelConfig(**how)
+    with pytest.raises(UsageError, match="hold one of them"):
+        replace(PAPER, delta_hold=3, sensor_hold=3)
+
+
+TRAINING = TrainConfig(
+    PAPER,
+    warm_start=WarmStartConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
+    ppo=PPOConfig(num_envs=8, num_steps=8, mini_batches=2, epochs=1, critic_warmup=0, explained=-1e9, refit_sensors=2,
+                  critic_hidden=(16,)),
+    episode_s=0.5, validate_every=2, threads=1,
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def few_gradient_steps(monkeypatch):
+    monkeypatch.setattr("gaponet.training.sensor_fit.STEPS", 20)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    place = tmp_path_factory.mktemp("world")
+    robot = write_arm(place / "arm")
+    data = Dataset.create(place / "data", robot)
+    for sequence in recordings(robot, 8, rows=60, kp=0.5):
+        data.append(sequence)
+    return data, robot
+
+
+@pytest.mark.parametrize("how", [{}, {"delta_hold": 3}, {"sensor_hold": 3}], ids=["plain", "action", "sensors"])
+def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
+    config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
+    update = 8 * 8 * config.model.delta_hold
+    run = tmp_path / "whole"
+    model = Trainer(*world, run, config, Budget(steps=6 * update)).run()
+    assert GapModel.how_trained(model.card) == "6 updates of PPO from the untrained network, no supervised start"
+    assert model.card["steps"] == 6 * update
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update)).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=6 * update), resume=True).run()
+    whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
+    assert all(torch.equal(x, parts[name]) for name, x in whole.items())
+    untrained = build_network(config.model, 2)
+    assert whole.keys() == untrained.state_dict().keys()
+
+
+def test_it_trains_by_labels_too_and_is_evaluated_with_the_share_of_corrections_at_the_limit(world, tmp_path):
+    config = replace(TRAINING, model=replace(PAPER, delta_max=1e-4))
+    Trainer(*world, tmp_path / "run", config, Budget(steps=8 * 30 + 2 * 64)).run()
+    result = evaluate([tmp_path / "run"], *world).result
+    assert 0 <= result["delta"]["paper"]["at_limit"] <= 1
+    assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
+
+
+def test_a_refitted_predictor_keeps_the_units_that_the_branch_has_learned(world, tmp_path):
+    trainer = Trainer(*world, tmp_path / "run", TRAINING.paper_recipe(), Budget(steps=4 * 64))
+    trainer.run()
+    fitted = trainer.untrained["predictor.net.0.weight"]
+    assert not torch.equal(trainer.net.predictor.net[0].weight, fitted)
+    assert len(trainer.kept.sensor_r2["by_probe"]) == 4
