@@ -21,10 +21,12 @@ def corrector(infer, config, robot):
     return DeltaCorrector(FunctionNetwork(infer, config.input_dim(2), 2), config, robot)
 
 
-@pytest.mark.parametrize("config", [ModelConfig(), ModelConfig(payload_input=False), ModelConfig(kind="mlp")])
+@pytest.mark.parametrize(
+    "config", [ModelConfig(), ModelConfig(payload_input=False), ModelConfig(kind="paper", sensor_source="fixed")]
+)
 def test_the_parts_of_x_touch_and_fill_it(config):
     layout = Layout(config, 3)
-    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action]
+    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors]
     assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
 
 
@@ -38,7 +40,14 @@ class FirstRow:
         return low
 
 
-@pytest.mark.parametrize("how", [{"stride": 2}, {"kind": "paper", "sensor_hold": 3}], ids=["stride", "held sensors"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"stride": 2}, {"kind": "paper", "sensor_hold": 3}, {"kind": "paper", "sensor_source": "fixed"},
+        {"kind": "paper", "sensor_source": "fixed", "sensor_hold": 2},
+    ],
+    ids=["stride", "held sensors", "fixed probes", "held probes"],
+)  # fmt: skip
 def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
     robot = write_arm(tmp_path)
     config = ModelConfig(history=2, num_probes=3, **how)

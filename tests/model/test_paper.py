@@ -8,7 +8,7 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.data.store import Dataset
-from gaponet.errors import UsageError
+from gaponet.errors import ModelError, UsageError
 from gaponet.eval.evaluate import evaluate
 from gaponet.model.artifact import GapModel, make_card
 from gaponet.model.backends import FunctionNetwork
@@ -18,6 +18,7 @@ from gaponet.model.export import drawn_states, export
 from gaponet.model.loop import DeltaLoop
 from gaponet.model.paper import released_inputs, released_network
 from gaponet.model.sensor import ProbeOracle
+from gaponet.sim.replay import replay
 from gaponet.training.budget import Budget
 from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
 from gaponet.training.run import Trainer
@@ -144,8 +145,29 @@ def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
     np.testing.assert_allclose(state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6)
 
 
+def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_has_them(tmp_path):
+    config, robot = replace(PAPER, sensor_source="fixed"), write_arm(tmp_path / "arm")
+    net = network(config)
+    assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
+    x = torch.randn(5, config.input_dim(2))
+    assert torch.equal(net.prepare(x)[:, :16], x[:, -16:])
+    assert net.predictor is None
+    export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net))
+    model = GapModel.load(tmp_path / "run")
+    with pytest.raises(ModelError, match="for gaponet eval alone"):
+        model.loop()
+    (twin,) = replay(recordings(robot, 1, rows=20), robot, model.corrector(robot), nthread=1)
+    assert np.isfinite(twin.qpos).all()
+
+
 def test_other_networks_refuse_the_paper_s_switches():
-    for how in ({"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_target": "absolute"}, {"payload_trunk": False}):
+    for how in (
+        {"delta_hold": 3},
+        {"sensor_hold": 3},
+        {"sensor_target": "absolute"},
+        {"payload_trunk": False},
+        {"sensor_source": "fixed"},
+    ):
         with pytest.raises(UsageError, match="use --model paper"):
             ModelConfig(**how)
     with pytest.raises(UsageError, match="hold one of them"):
@@ -176,7 +198,11 @@ def world(tmp_path_factory):
     return data, robot
 
 
-@pytest.mark.parametrize("how", [{}, {"delta_hold": 3}, {"sensor_hold": 3}], ids=["plain", "action", "sensors"])
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_source": "fixed", "sensor_hold": 3}],
+    ids=["plain", "action", "sensors", "fixed"],
+)
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold

@@ -175,7 +175,15 @@ class GapModel:
         """The corrections of num_envs robots, with a past of their own: loop.delta(qpos, qvel, ctrl, payload_mass).
 
         Joints are those of the card (joint_names), in that order.
+
+        Raises:
+            ModelError: It asks its simulator, which stands in no control loop.
         """
+        if self.config.asks_simulator:
+            raise ModelError(
+                f"{self.path}: its sensor values are the simulator's answers (sensor_source fixed), for gaponet eval "
+                "alone; train with --model.sensor-source predicted"
+            )
         return DeltaLoop(self.config, self.qpos_range, num_envs, self.infer)
 
     def corrects(self, robot: RobotSpec) -> bool:

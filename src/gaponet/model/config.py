@@ -17,7 +17,7 @@ POSITIVE = (
     "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
     "transformer_width", "transformer_layers", "transformer_heads",
 )  # fmt: skip
-PAPER_ONLY = ("payload_trunk", "delta_hold", "sensor_hold", "sensor_target")
+PAPER_ONLY = ("payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target")
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class ModelConfig:
     """Largest correction, rad."""
     delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: control periods that a correction is held (action duration)."""
+    sensor_source: Literal["predicted", "fixed"] = "predicted"
+    """paper: who gives the sensor values. predicted: the sensor predictor. fixed: the simulator itself, stepped once
+    for each of the num_probes fixed probes; for training and gaponet eval alone, a robot has no simulator."""
     sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: control periods that the sensor values are held."""
     sensor_target: Literal["delta", "absolute"] = "delta"
@@ -107,6 +110,11 @@ class ModelConfig:
         return self.delta_hold > 1 or self.sensor_hold > 1
 
     @property
+    def asks_simulator(self) -> bool:
+        """Whether sensor values are the simulator's own answers, a part of x."""
+        return self.sensor_source == "fixed"
+
+    @property
     def joint_wise(self) -> bool:
         """Whether one joint at a time passes through branch and trunk."""
         return self.kind in OPERATORS and self.coupling != "full"
@@ -120,5 +128,5 @@ class ModelConfig:
         return self.num_probes * 2 * n
 
     def input_dim(self, n: int) -> int:
-        """Numbers in x = [o_t | a_t]."""
-        return self.observation_dim(n) + n
+        """Numbers in x = [o_t | a_t], with the simulator's answers behind where it is asked."""
+        return self.observation_dim(n) + n + self.sensor_dim(n) * self.asks_simulator

@@ -25,10 +25,16 @@ class DeltaCorrector:
         """Begin one simulation per sequence at its first row; that frame, with its command, repeated is the history."""
         self.loop = DeltaLoop(self.config, self.robot.qpos_range[self.op], len(start), self.network)
         self.payload = np.array([s.meta.payload_mass for s in start], np.float32)
+        if self.config.asks_simulator:
+            from gaponet.model.sensor import ProbeOracle
+            from gaponet.sim.batch import Condition
+
+            oracle = ProbeOracle(self.robot, self.config, [Condition.of(s, self.robot) for s in start])
+            self.loop.probe = lambda: oracle(*self.now).reshape(len(start), -1)
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Corrected targets, (k, n_all) rad."""
-        op = self.op
+        op, self.now = self.op, (qpos, qvel)
         self.loop.delta(qpos[:, op], qvel[:, op], target[:, op], self.payload)
         out = np.array(target, float)
         out[:, op] = self.loop.applied

@@ -92,11 +92,11 @@ def trained_network(run: Path, config: Any, n: int) -> DeltaNet:
 
 
 def drawn_states(net: DeltaNet, count: int = 256, seed: int = 0) -> Array:
-    """Observations [o_t | a_t] spread as those trained on, (count, dim) float32, where no recording is at hand."""
+    """Inputs x spread as those trained on, (count, dim) float32, where no recording is at hand; sensor values are 0."""
     features = net.features
     generator = torch.Generator().manual_seed(seed)
     z = torch.randn(count, features.dim, generator=generator)
     relative = features.standardise.mean + features.standardise.std * z
     # relative(x) is linear and the identity but for differences to q_t: its inverse is solved for, not written down.
     x = torch.linalg.solve(features.relative(torch.eye(features.dim)).T.double(), relative.double().T).T
-    return x.float().contiguous().numpy()
+    return torch.nn.functional.pad(x.float(), (0, net.config.input_dim(net.n) - features.dim)).contiguous().numpy()

@@ -59,6 +59,7 @@ class DeltaLoop:
         self.applied: Any = zeros_like(self.x, num_envs, n)
         self.holds, self.age = config.holds, zeros_like(self.x, num_envs)  # control periods since the start
         self.held: Any = zeros_like(self.x, num_envs, n)  # the correction that is held
+        self.probe: Callable[[], Any] | None = None  # the simulator's answers now, (num_envs, 2nm), where x has them
         self.fresh = np.ones(num_envs, bool)  # robots without a past
         self.any_fresh = True
 
@@ -98,13 +99,15 @@ class DeltaLoop:
             self._q[...], self._v[...], self._action[...] = qpos, qvel, ctrl
             self.history.write()
         else:  # the sensor predictor sees the observation of the last refresh, the trunk the present action
-            due = self.age % self.config.sensor_hold == 0
+            due = self._due(self.config.sensor_hold)
             self._q[...] = self._xp.where(due[:, None], qpos, self._q)
             self._v[...] = self._xp.where(due[:, None], qvel, self._v)
             self._action[...] = ctrl
             self.history.write(due)
         if self._most is not None:
             self._mass[...] = payload_mass / self._most
+        if self.probe is not None and (due := self._due(self.config.sensor_hold)).any():
+            self.x[due, self.layout.sensors] = self.probe()[due]
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:
@@ -131,8 +134,7 @@ class DeltaLoop:
         self.bound.run()
         delta = self.bound.delta
         if self.config.delta_hold > 1:
-            due = self.age % self.config.delta_hold == 0
-            delta = self.held = self._xp.where(due[:, None], delta, self.held)
+            delta = self.held = self._xp.where(self._due(self.config.delta_hold)[:, None], delta, self.held)
         self.applied = self._xp.minimum(self._xp.maximum(a + delta, self.low), self.high)
         if self.holds:
             self.push(q, v, self.applied)
@@ -171,6 +173,10 @@ class DeltaLoop:
         if self.any_fresh:
             last[self.fresh] = q.reshape(-1, self.n)[self.fresh]
         return self._xp.where(self._xp.isfinite(a), a, last)
+
+    def _due(self, hold: int) -> Any:
+        """Robots for which a multiple of `hold` control periods has passed, (num_envs,)."""
+        return self.age % hold == 0
 
     def _rows(self, *given: Any) -> tuple[Any, ...]:
         rows = tuple(map(np.asarray, given)) if self._host else given

@@ -14,6 +14,8 @@ joints.
 The paper also names the recorded state, Q_real and V_real, in (1). The critic of PPO sees both (training/env.py). The
 predictor does not: the simulator's answers do not depend on them.
 
+With `sensor_source = "fixed"` the simulator itself gives S, without a predictor: what a perfect one would be worth.
+
 S is sampled in training and is the mean in evaluation and export. Δ_max is a safety limit: exact clipping, in
 evaluation and export; training reports the share of corrections at the limit.
 """
@@ -68,7 +70,10 @@ class PaperNet(DeltaNet):
         self.query = slice(at.payload.start if config.payload_trunk else at.action.start, at.action.stop)
         asked = self.query.stop - self.query.start
         self.observed, self.asked = Standardise(self.seen.stop), Standardise(asked)
-        self.predictor = SensorPredictor(self.seen.stop, PREDICTOR, sensors)
+        if config.asks_simulator:
+            self.answers = Standardise(sensors)
+        else:
+            self.predictor = SensorPredictor(self.seen.stop, PREDICTOR, sensors)
         self.branch = nn.Sequential(*dense(sensors, BRANCH, outputs), nn.ELU())
         self.trunk = dense(asked, TRUNK, outputs, zero=True)
 
@@ -76,13 +81,17 @@ class PaperNet(DeltaNet):
         super().fit_inputs(x)
         self.observed.fit(x[:, self.seen])
         self.asked.fit(x[:, self.query])
+        if self.config.asks_simulator:
+            self.answers.fit(x[:, self.features.layout.sensors], floor=1e-6)
 
     def sensor_inputs(self, x: Tensor) -> Tensor:
         z = self.observed(x[:, self.seen])
         return z + self.features.noise * torch.randn_like(z) if self.features.noise else z
 
     def sensors(self, x: Tensor) -> Tensor:
-        """Equation (1): S, standardised, (B, 2nm); a sample in training, else the mean."""
+        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean; or the simulator's answers."""
+        if self.config.asks_simulator:
+            return self.answers(x[:, self.features.layout.sensors])
         observed = self.sensor_inputs(x)
         if not self.training:
             return self.predictor.mean(observed)

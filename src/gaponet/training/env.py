@@ -15,6 +15,7 @@ from gaponet.errors import UsageError
 from gaponet.model.config import ModelConfig
 from gaponet.model.loop import DeltaLoop
 from gaponet.model.observation import History
+from gaponet.model.sensor import ProbeOracle
 from gaponet.robot import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.free_runs import IMMOVABLE
@@ -64,6 +65,11 @@ class DeltaEnv:
             sim.batch.expand("dof_armature")[:] += IMMOVABLE * self.unknown[self.group]
         self._place(sim, device)
         self.loop = DeltaLoop(config, sim.range[self.op], num_envs, of=self.now)
+        if config.asks_simulator:
+            if device != "cpu":
+                raise UsageError(f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}")
+            oracle = ProbeOracle(robot, config, conditions, nthread, self.locked)
+            self.loop.probe = lambda: oracle(self.sim.qpos, self.sim.qvel).reshape(num_envs, -1)
         shortest = min(c[2] for c in self.conditions)
         # Periods whose command a late servo has not met yet.
         under_way = 1 + int(np.ceil(self.sim.robot.delay.max() / shortest))
