@@ -2,10 +2,9 @@
 
     python benchmarks/steps.py WORK --logs LOGS [--seeds 3] [--arms usual:1 usual:10 layers:10:1 …] [--workers 2]
 
-An arm is a network: today's, one with the paper's layers, and that with every joint's answer from every joint (full
-coupling), as the paper has it. Each is trained by the supervised start alone, in the nominal simulator, for six rounds
-of 102,400 steps and for ten times as many. Curves are of validation motions at gain 1; test motions are played once, by
-the best on validation.
+An arm is a network: today's, one with the paper's layers, and the paper's own form (`--model paper`). Each is trained
+by the supervised start alone, in the nominal simulator, for six rounds of 102,400 steps and for ten times as many.
+Curves are of validation motions at gain 1; test motions are played once, by the best on validation.
 
 Writes docs/results/steps.{md,json,csv,svg,png}. What is in WORK is kept.
 """
@@ -38,9 +37,9 @@ from gaponet_lab.study.pool import RESULT, Cell
 from gaponet_lab.study.result import Result, facts
 from gaponet_lab.study.study import Study
 
-LAYERS = "branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"  # the paper's
-ARMS = {"usual": ("today's network", "", 0.0), "layers": ("the paper's layers", LAYERS, -0.4),
-        "full": ("the paper's layers, full coupling", f"coupling=full:{LAYERS}", 0.5)}  # fmt: skip
+LAYERS = "gaponet:branch_hidden=256,256,256:trunk_hidden=128,128,128:sensor_hidden=256,256"  # the paper's
+ARMS = {"usual": ("today's network", "gaponet", 0.0), "layers": ("the paper's layers", LAYERS, -0.4),
+        "paper": ("the paper's form", "paper", 0.5)}  # fmt: skip
 ROUNDS, TIMES = 6, (1, 10)
 
 
@@ -56,7 +55,7 @@ class Arm:
     def cells(self) -> list[Cell]:
         """A training per seed."""
         warm, network = self.study.config.warm_start, ARMS[self.name][1]
-        word = ":".join(["gaponet", f"warm_start.rounds={ROUNDS * self.times}", *([network] if network else [])])
+        word = f"{network}:warm_start.rounds={ROUNDS * self.times}"
         steps = ROUNDS * self.times * warm.num_envs * warm.steps
         return replace(self.study, budget=str(steps)).cells([word])
 

@@ -48,8 +48,7 @@ def artifact(robot, tmp_path_factory):
 @pytest.mark.parametrize(
     "how",
     [
-        {}, {"coupling": "full"}, {"sensors": "predicted"}, {"sensors": "predicted", "coupling": "full"},
-        {"payload_input": False}, {"payload_input": False, "coupling": "full"},
+        {}, {"sensors": "predicted"}, {"payload_input": False},
         {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensors": "predicted", "sensor_hidden": (16,)},
         {"branch_hidden": (16, 8), "trunk_hidden": (8,)}, {"kind": "shared_mlp"},
         {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
@@ -214,6 +213,8 @@ def test_a_card_with_switches_of_an_earlier_version_is_read_where_they_had_the_v
         (artifact / "card.json").write_text(json.dumps(card))
         return GapModel.load(artifact)
 
-    assert written(sensor_hold=1, context="none", branch="unstacked", payload_trunk=True).loop().n == 2
+    assert (
+        written(sensor_hold=1, context="none", branch="unstacked", payload_trunk=True, coupling="posture").loop().n == 2
+    )
     with pytest.raises(ModelError, match="trained with branch stacked, which is no more; train again"):
         written(branch="stacked")

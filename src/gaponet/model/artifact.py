@@ -33,7 +33,7 @@ RECORDED_TOLERANCE = 0.02  # relative, of gains
 # Switches of earlier versions that cards still name, and the value that they would have today.
 RETIRED = {
     "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
-    "fno_layers": 3, "fno_modes": 4,
+    "fno_layers": 3, "fno_modes": 4, "coupling": "posture",
 }  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 

@@ -10,7 +10,6 @@ from annotated_types import Interval, Len
 from gaponet.errors import UsageError
 
 Kind = Literal["gaponet", "paper", "shared_mlp", "mlp", "transformer", "inverse"]
-OPERATORS = ("gaponet", "shared_mlp")  # kinds that take what branch and trunk take
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
 POSITIVE = (
@@ -60,16 +59,12 @@ class ModelConfig:
     sensors: Literal["off", "predicted"] = "off"
     """off: the branch sees the observation. predicted: a sensor predictor's stand-in for the simulator's probes as
     well, as in the paper; worth nothing where it was measured (docs/results/unnamed.md)."""
-    coupling: Literal["posture", "full"] = "posture"
-    """posture: branch and trunk are shared by the joints; the branch sees a joint's own past, and of all joints
-    position, speed and how far behind their targets they are. full: the paper's, every joint sees every joint. The mlp
-    is always full."""
     num_basis: Annotated[int, Interval(ge=1, le=4096)] = 16
     """p, basis functions per joint."""
     branch_hidden: Layers = (64, 64)
-    """Hidden layers of the branch net; the paper's full coupling has 256 256 256."""
+    """Hidden layers of the branch net."""
     trunk_hidden: Layers = (32, 32)
-    """Hidden layers of the trunk net; the paper's full coupling has 128 128 128."""
+    """Hidden layers of the trunk net."""
     sensor_hidden: Layers = (128, 64)
     """Hidden layers of the sensor predictor; 256 256 predict no better (docs/log.md)."""
     mlp_hidden: Layers = (512, 256, 128)
@@ -91,8 +86,6 @@ class ModelConfig:
             raise UsageError(
                 "mlp_match or shared_mlp without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1"
             )
-        if self.kind == "shared_mlp" and self.coupling == "full":
-            raise UsageError("shared_mlp takes one joint at a time; with full coupling the plain network is mlp")
         for name in PAPER_ONLY if self.kind != "paper" else ():
             if (value := getattr(self, name)) != getattr(ModelConfig, name):
                 raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
@@ -113,11 +106,6 @@ class ModelConfig:
     def asks_simulator(self) -> bool:
         """Whether sensor values are the simulator's own answers, a part of x."""
         return self.sensor_source == "fixed"
-
-    @property
-    def joint_wise(self) -> bool:
-        """Whether one joint at a time passes through branch and trunk."""
-        return self.kind in OPERATORS and self.coupling != "full"
 
     def observation_dim(self, n: int) -> int:
         """2n + 3nH (+ 1 with payload)."""

@@ -17,8 +17,8 @@ from gaponet.model.paper import PaperNet, SensorPredictor
 class OperatorNet(DeltaNet):
     """Δa = bounded(⟨branch(o [, sensors]), trunk(a, P)⟩ + c), a DeepONet.
 
-    Coupling "posture": one branch and one trunk, shared by all joints, take what belongs to a joint and its name; the
-    branch is told q, q̇ and a − q of all joints as well. "full": the paper's, every joint sees every joint.
+    One branch and one trunk, shared by all joints, take what belongs to a joint and its name; the branch is told q, q̇
+    and a − q of all joints as well.
     """
 
     which: Tensor
@@ -28,29 +28,24 @@ class OperatorNet(DeltaNet):
         if config.sensors == "predicted":
             inputs = config.observation_dim(n)
             self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
-        self.per_joint = config.joint_wise
         self.register_buffer("which", torch.eye(n), persistent=False)
         sensed, seen, asked = self.input_dims(config, n)
-        outputs = config.num_basis * (1 if self.per_joint else n)
-        inputs = sensed * (config.sensors != "off") + seen + n * self.per_joint
-        self.branch_inputs = inputs
-        self.branch: nn.Module = dense(inputs, config.branch_hidden, outputs)
-        self.trunk = dense(asked + n * self.per_joint, config.trunk_hidden, outputs, zero=True)
+        self.branch_inputs = sensed * (config.sensors != "off") + seen + n
+        self.branch = dense(self.branch_inputs, config.branch_hidden, config.num_basis)
+        self.trunk = dense(asked + n, config.trunk_hidden, config.num_basis, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
 
     @staticmethod
     def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
         """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
         payload = int(config.payload_input)
-        if config.joint_wise:
-            return 2 * config.num_probes, 2 + 3 * config.history + payload + 3 * n, 1 + payload
-        return config.sensor_dim(n), config.observation_dim(n), 2 * n + payload
+        return 2 * config.num_probes, 2 + 3 * config.history + payload + 3 * n, 1 + payload
 
     def prepare(self, x: Tensor) -> Tensor:
         """x = [o_t | a_t], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
         z = self.features(x)
         sensors = self.sensors(z) if self.config.sensors != "off" else None
-        see, ask = (self._joint_inputs if self.per_joint else self._full_inputs)(z, sensors)
+        see, ask = self._joint_inputs(z, sensors)
         return torch.cat([see, ask], dim=-1)
 
     def correct(self, prepared: Tensor) -> Tensor:
@@ -64,13 +59,6 @@ class OperatorNet(DeltaNet):
     def sensors(self, z: Tensor) -> Tensor:
         """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
         return self.predictor.mean(z[:, self.features.layout.observation])
-
-    def _full_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
-        at = self.features.layout
-        see = ([] if sensors is None else [sensors]) + [z[:, at.observation]]
-        # The query a_t reads as (a_t, a_t − q_t): q_t + (a_t − q_t), both standardised, span the action.
-        ask = [z[:, at.q], z[:, at.action]] + ([z[:, at.payload]] if self.config.payload_input else [])
-        return torch.cat(see, dim=1), torch.cat(ask, dim=1)
 
     def _joint_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
         n, at = self.n, self.features.layout

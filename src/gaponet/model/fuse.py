@@ -21,7 +21,7 @@ def fuse(net: nn.Module) -> dict[str, Array] | None:
     if type(net) is DeltaMLP:
         weights = _mlp(net)
     elif isinstance(net, OperatorNet) and type(net) in (OperatorNet, SharedMLP) and _plain(net):
-        weights = (_joint if net.per_joint else _full)(net)
+        weights = _joint(net)
     else:
         return None
     return {
@@ -42,27 +42,6 @@ def _mlp(net: DeltaMLP) -> dict[str, Array]:
     }  # fmt: skip
 
 
-def _full(net: OperatorNet) -> dict[str, Array]:
-    n, dim = net.n, net.features.dim
-    weights = _features(net, np.arange(dim))
-    branch, trunk = _dense_layers(_sequential(net.branch)), _dense_layers(net.trunk)
-    w, b = branch[0]
-    predictor: Layers = []
-    sensed = net.config.sensor_dim(n) if net.predictor is not None else 0
-    parts = []
-    if net.predictor is not None:
-        *predictor, (last, last_bias) = _dense_layers(net.predictor.net)
-        predictor[0] = (_rows(predictor[0][0], np.arange(dim - n), dim), predictor[0][1])
-        parts.append(last[:, :sensed] @ w[:sensed])
-        b = b + last_bias[:sensed] @ w[:sensed]
-    parts.append(_rows(w[sensed:], np.arange(dim - n), dim))
-    branch[0] = (np.concatenate(parts), b)
-    asked = [*range(n), *range(dim - n, dim), *([dim - n - 1] if net.config.payload_input else [])]
-    trunk[0] = (_rows(trunk[0][0], np.array(asked), dim), trunk[0][1])
-    weights |= _name("predictor", predictor) | _name("branch", branch) | _name("trunk", _scaled(trunk, net))
-    return weights | {"kind": np.array("full"), "bias": _bias(net)}
-
-
 def _joint(net: OperatorNet) -> dict[str, Array]:
     n, dim, config = net.n, net.features.dim, net.config
     depth, payload = 2 + 3 * config.history, int(config.payload_input)
@@ -75,7 +54,7 @@ def _joint(net: OperatorNet) -> dict[str, Array]:
     ).astype(int)
     weights = _named(_features(net, columns), n)
     alone = isinstance(net, SharedMLP)  # one net is a branch whose trunk answers 1
-    branch = _dense_layers(net.net if isinstance(net, SharedMLP) else _sequential(net.branch))
+    branch = _dense_layers(net.net if isinstance(net, SharedMLP) else net.branch)
     trunk = [(np.zeros((1 + payload + n, 1)), np.ones(1))] if alone else _dense_layers(net.trunk)
     predictor: Layers = []
     (w, b), sensed = branch[0], 0
@@ -141,12 +120,6 @@ def _features(net: OperatorNet | DeltaMLP, columns: Array) -> dict[str, Array]:
     return {"relative": relative / std, "offset": -mean / std, "delta_max": np.array(_limit(net))}
 
 
-def _sequential(net: nn.Module) -> nn.Sequential:
-    """An unstacked branch."""
-    assert isinstance(net, nn.Sequential)
-    return net
-
-
 def _dense_layers(net: nn.Sequential) -> Layers:
     """Weights (in, out) and biases of Linear layers with ELU between, double precision."""
     linear = [m for m in net if isinstance(m, nn.Linear)]
@@ -207,7 +180,7 @@ class FusedNet(nn.Module):
         each = torch.from_numpy(weights["quarter"]).T if self.pair else torch.ones(1, basis)
         self.register_buffer("total", torch.kron(torch.eye(self.n), each))  # Σ over a joint's basis
 
-    def layers(self, part: str, x: Tensor, sensed: Tensor | None = None, last_elu: bool = False) -> Tensor:
+    def layers(self, part: str, x: Tensor, sensed: Tensor | None = None) -> Tensor:
         """x W + b with ELU between; of [sensed | x], without putting them side by side."""
         indices = getattr(self, part)
         for i in indices:
@@ -217,7 +190,7 @@ class FusedNet(nn.Module):
                 x = torch.addmm(seen, sensed, weight[:, : self.sensed].T)
             else:
                 x = nn.functional.linear(x, weight, bias)
-            if last_elu or i < len(indices) - 1:
+            if i < len(indices) - 1:
                 # onnxruntime's Elu takes 6 ns a number, as exp and maximum a fraction of it: worth it for many rows.
                 x = torch.maximum(x, x.clamp(max=0).exp() - 1) if part == "pair" else nn.functional.elu(x)
         return x
@@ -227,7 +200,7 @@ class FusedNet(nn.Module):
         rows = z.reshape(-1, self.width) if self.kind in JOINT_WISE else z
         sensed = None
         if self.predictor:
-            sensed = self.layers("predictor", z, last_elu=self.kind == "full").reshape(-1, self.sensed)
+            sensed = self.layers("predictor", z).reshape(-1, self.sensed)
         if self.pair:
             y = self.layers("pair", rows, sensed)
             y = nn.functional.linear((y * y).reshape(-1, self.total.shape[1]), self.total, self.bias)

@@ -5,9 +5,8 @@
     b = branch([sensors | z]),  t = trunk(z)
     Δa = Δ_max · tanh(Σ_basis b t + c)      the trunk's last layer carries gain / Δ_max
 
-With full coupling (kind full) nothing lies between the predictor's last layer and the branch's first: they are one
-product. With one joint at a time (kind joint) z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that
-a joint's part is a slice; its name is one-hot. Branch and trunk of the same depth are one net side by side (kind pair)
+With one joint at a time (kind joint) z is joint by joint, [q | q̇ | past | payload | a | name] of each, so that a
+joint's part is a slice; its name is one-hot. Branch and trunk of the same depth are one net side by side (kind pair)
 that ends in b + t and b − t: Σ b t = ¼ Σ (b + t)² − (b − t)². model/fuse.py makes the weights from a trained network.
 """
 
@@ -45,7 +44,7 @@ class FusedForward:
         z = self._standardised()
         rows = z.reshape(batch * n, -1) if kind in JOINT_WISE else z
         predictor, branch, trunk, pair = (_layers(weights, part) for part in PARTS)
-        sensed = self._chain(z, predictor, last_elu=kind == "full") if predictor else None
+        sensed = self._chain(z, predictor) if predictor else None
         self.delta = _empty(batch, n)
         if pair:
             y = self._chain(rows, pair, sensed)
@@ -84,7 +83,7 @@ class FusedForward:
         self._do(np.minimum, z, np.float32(CLAMP), out=z)
         return z
 
-    def _chain(self, x: Array, layers: Layers, sensed: Array | None = None, last_elu: bool = False) -> Array:
+    def _chain(self, x: Array, layers: Layers, sensed: Array | None = None) -> Array:
         """x W + b with ELU between; of [sensed | x], without putting them side by side."""
         for i, (weight, bias) in enumerate(layers):
             out, count = _empty(len(x), weight.shape[1]), weight.shape[0] - x.shape[1]
@@ -95,7 +94,7 @@ class FusedForward:
                 self._do(np.add, out, part, out=out)
             if bias.any():
                 self._do(np.add, out, bias, out=out)
-            if last_elu or i < len(layers) - 1:
+            if i < len(layers) - 1:
                 self._elu(out)
             x = out
         return x
