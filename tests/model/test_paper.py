@@ -1,12 +1,13 @@
 """The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 import torch
 from arm import recordings, write_arm
 
+from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.eval.evaluate import evaluate
@@ -218,12 +219,18 @@ def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stoppe
     assert whole.keys() == untrained.state_dict().keys()
 
 
-def test_it_trains_by_labels_too_and_is_evaluated_with_the_share_of_corrections_at_the_limit(world, tmp_path):
-    config = replace(TRAINING, model=replace(PAPER, delta_max=1e-4))
-    Trainer(*world, tmp_path / "run", config, Budget(steps=8 * 30 + 2 * 64)).run()
-    result = evaluate([tmp_path / "run"], *world).result
-    assert 0 <= result["delta"]["paper"]["at_limit"] <= 1
+def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
+    run = tmp_path / "run"
+    card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
+    assert GapModel.how_trained(card) == "supervised start (1 rounds), 2 updates of PPO"
+    result = evaluate([run], *world).result
     assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
+    assert result["delta"]["paper"]["at_limit"] == 0
+    net = network(replace(PAPER, delta_max=1e-3))
+    export(net, run / "model", card | {"model": asdict(net.config)}, drawn_states(net))
+    assert evaluate([run], *world).result["delta"]["paper"]["at_limit"] > 0.5
+    assert main(["eval", str(run), str(world[0].path)]) == 0
+    assert "of the corrections are at the limit (--model.delta-max)" in capsys.readouterr().out
 
 
 def test_a_refitted_predictor_keeps_the_units_that_the_branch_has_learned(world, tmp_path):

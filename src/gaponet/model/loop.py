@@ -73,7 +73,8 @@ class DeltaLoop:
     def begin(self, ids: Array | slice, qpos: Any, qvel: Any, u: Any) -> None:
         """Give robots `ids` a past: frames (k, depth, n), newest first, or (k, 1, n), repeated; rad, rad/s, rad."""
         self.history.reset(ids, qpos, qvel, u)
-        self.age[ids] = 0
+        if self.holds:
+            self.age[ids] = 0
         if self.any_fresh:
             self.fresh[ids] = False
             self.any_fresh = bool(self.fresh.any())
@@ -81,7 +82,8 @@ class DeltaLoop:
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """One control period has passed: the state before it and the target applied over it, (num_envs, n) each."""
         self.history.push(qpos, qvel, u)
-        self.age += self.holds
+        if self.holds:
+            self.age += 1
 
     # ---- a period
 
