@@ -147,6 +147,10 @@ def start(
             words += ["--to", to] if words[0] == "export" else []
             words += ["--budget", budget] if words[0] == "identify" and budget else []
         lines = [shlex.join(["gaponet", *words]) for words in todo]
+        said = shlex.join(next(words for words in todo if words[0] == "import")[2:])
+        if made["options"] not in ("", said):
+            raise UsageError(f"{out / 'data'} was imported with {made['options']}, not with {said}. Give another --out, "
+                             f"or the same options again; or delete {out / 'data'}, and it is made anew")  # fmt: skip
         if dry_run:
             for line in lines:
                 screen.say(line, "  ")
@@ -155,7 +159,7 @@ def start(
                 if found.described:
                     write_text(told, found.described)
                     files[f"{out.name}/logs.toml"] = _sha256(told)
-                now = made | {"logs": str(logs.resolve()), "files": files}
+                now = made | {"logs": str(logs.resolve()), "files": files, "options": said}
                 if not (out / "data").exists():  # an import that is interrupted leaves data of these
                     write_json(out / MADE_FROM, now)
                 _run(screen, todo, lines, out, anyway, now)
@@ -258,9 +262,10 @@ def _tell(screen: Out, found: Understood, model: Path, logs: Path, unit_id: str,
 
 
 class _MadeFrom(TypedDict):
-    """start.json: logs is their path, files their hashes, done a command that ran → what it ran on."""
+    """start.json: logs is their path, files their hashes, options import's, done a command that ran → on what."""
 
     logs: str
+    options: str
     files: dict[str, str]
     done: dict[str, str]
 
@@ -284,12 +289,18 @@ def _sha256(file: Path) -> str:
 
 def _earlier(out: Path, logs: Path, files: dict[str, str]) -> _MadeFrom:
     """What start.json says of OUT, without data there only how its robot was made; refuses data of other logs."""
-    data, made, where = out / "data", _MadeFrom(logs="", files={}, done={}), "logs that nothing tells any more"
+    data, made, where = (
+        out / "data",
+        _MadeFrom(logs="", files={}, options="", done={}),
+        "logs that nothing tells any more",
+    )
     if (out / MADE_FROM).is_file():
         made = read_json(_MadeFrom, out / MADE_FROM, UsageError, f"delete it and {data}")
         where = f"{made['logs']}"
     if not data.exists():
-        return _MadeFrom(logs="", files={}, done={line: on for line, on in made["done"].items() if on == ROBOT})
+        return _MadeFrom(
+            logs="", files={}, options="", done={line: on for line, on in made["done"].items() if on == ROBOT}
+        )
     other = [name for name, digest in made["files"].items() if files.get(name) != digest]
     if made["logs"] and not other:
         return made

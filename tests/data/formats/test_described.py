@@ -90,7 +90,7 @@ def test_strange_joints_are_all_named_at_once_and_ignored_where_that_is_said(tmp
 
 
 def test_names_that_are_all_another_robots_say_whose(arm, so101):
-    with pytest.raises(JointMismatchError, match="no joint of robot 'arm', all of --robot so101"):
+    with pytest.raises(JointMismatchError, match="no joint of robot 'arm', all of robot 'so101': give that one"):
         resolve_all(so101.operated, arm, "a.csv", None)
 
 

@@ -100,6 +100,8 @@ def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_fr
     assert ran[6:] == []
     capsys.readouterr()
     before = {file: file.read_bytes() for file in Path("started").rglob("*") if file.is_file()}
+    assert main(["start", "arm.xml", "logs", "--cut", "3"]) == 2
+    assert "started/data was imported with --robot started/robot" in capsys.readouterr().err
     Path("other/swing_3.csv").write_text(Path("logs/swing_4.csv").read_text())
     Path("logs/swing_3.csv").unlink()
     for logs, more in (("other", []), ("other", ["--dry-run"]), ("logs", [])):

@@ -32,7 +32,8 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
     kin = [] if found or joint_map else [name for name in available() if _all_of(name, names)]
     if strange and kin:
         raise JointMismatchError(
-            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of --robot {kin[0]}"
+            f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of robot '{kin[0]}': "
+            f"give that one (import --robot {kin[0]}; start {kin[0]} LOGS)"
         )
     if strange:
         free = [j for j in robot.joint_names if j not in found]
