@@ -149,8 +149,11 @@ def start(
         lines = [shlex.join(["gaponet", *words]) for words in todo]
         said = shlex.join(next(words for words in todo if words[0] == "import")[2:])
         if made["options"] not in ("", said):
-            raise UsageError(f"{out / 'data'} was imported with {made['options']}, not with {said}. Give another --out, "
-                             f"or the same options again; or delete {out / 'data'}, and it is made anew")  # fmt: skip
+            data = out / "data"
+            raise UsageError(
+                f"{data} was imported with {made['options']}, not with {said}. Give another --out, or the same options "
+                f"again; or delete {data}, and it is made anew"
+            )
         if dry_run:
             for line in lines:
                 screen.say(line, "  ")
@@ -292,7 +295,7 @@ def _earlier(out: Path, logs: Path, files: dict[str, str]) -> _MadeFrom:
     data, made, where = (
         out / "data",
         _MadeFrom(logs="", files={}, options="", done={}),
-        "logs that nothing tells any more",
+        "logs that no file names",
     )
     if (out / MADE_FROM).is_file():
         made = read_json(_MadeFrom, out / MADE_FROM, UsageError, f"delete it and {data}")
