@@ -85,6 +85,29 @@ def test_a_missing_extra_is_one_line_with_the_command(missing, monkeypatch, caps
     assert capsys.readouterr().err == f"Missing: {missing} is not installed; run: pip install 'gaponet[{extra}]'\n"
 
 
+def test_completion_knows_every_command_where_no_extra_is_installed():
+    code = """
+import sys
+from gaponet.cli.main import main
+from gaponet.errors import EXTRAS
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in EXTRAS:
+            raise ModuleNotFoundError(name, name=name)
+
+sys.meta_path.insert(0, Hidden())
+try:
+    code = main(["--tyro-print-completion", "bash"])
+except SystemExit as end:
+    code = end.code
+sys.exit(code)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "experiment" in run.stdout
+
+
 @pytest.mark.parametrize("words", [["doctor"], ["doctor", "--json"], ["--help"]])
 def test_a_closed_pipe_is_no_traceback(place, words):
     words = [words[0], f"{place}/set", "--robot", f"{place}/arm", *words[1:]] if words[0] == "doctor" else words

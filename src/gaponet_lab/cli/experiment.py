@@ -15,7 +15,6 @@ from gaponet.data.store import open_dataset
 from gaponet.errors import ModelError, UsageError
 from gaponet.progress import bar, bars
 from gaponet.training.config import TrainConfig
-from gaponet_lab.cli.show import show_result
 from gaponet_lab.study.compare import Compare, identified
 from gaponet_lab.study.data import Data
 from gaponet_lab.study.found import Question, answer, train_all
@@ -40,6 +39,8 @@ DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 def _carry_out(question: Question, study: Study, json: bool) -> None:
     """Say how long it will take, train, and show what came out."""
+    from gaponet_lab.cli.show import show_result  # needs an extra, whose lack is told before anything is trained
+
     screen, cells = Out(json), question.cells(study)
     with _trainings(cells, study, screen) as show:
         result = answer(question, study, show)
@@ -84,6 +85,8 @@ def _prepared(question: Compare, study: Study) -> Study:
 
 def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
     """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
+    from gaponet_lab.cli.show import show_result
+
     data.require_robot(robot)
     question.require(data)
     screen, runs, part = Out(options.json), question.runs, data
