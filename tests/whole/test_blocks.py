@@ -35,11 +35,14 @@ from gaponet.sim.model import build_model
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in ("log.md", "results.md"))]
 PATHS = {page.name: page for page in PAGES}
-NEWCOMERS = ("README.md", "newcomer.md", "ten-minutes.md", "index.md", "install.md", "logs.md", "first-ten-minutes.md",
-             "api.md", "deploy.md")  # fmt: skip
+WITH_PYTHON = (
+    "README.md",
+    "index.md",
+    "api.md",
+    "deploy.md",
+)  # newcomer.md shows a piece of servo.py: test_newcomer.py
 # A part of a block → why it is not run here.
 NOT_RUN = {
-    "def resting_friction": "a piece of servo.py, compared with it in tests/examples/test_newcomer.py",
     "from gaponet_action import": "needs mjlab; make engines",
     "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
     "mujoco_servos.Servos": "needs an exported folder; tests/interop/engine plays it",
@@ -190,11 +193,10 @@ def names_of_a_reader(page: str, folder: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("page", NEWCOMERS)
+@pytest.mark.parametrize("page", WITH_PYTHON)
 def test_the_python_blocks_of_a_page_run(page, place, quick, tmp_path, monkeypatch):
     found = [b for b in blocks(PATHS[page], "python") if not any(part in b for part in NOT_RUN)]
-    if not found:
-        pytest.skip("no Python")
+    assert found
     in_copy(place, tmp_path)
     monkeypatch.chdir(tmp_path)
     names = {"__name__": page, **names_of_a_reader(page, tmp_path)}
