@@ -41,7 +41,7 @@ def train(
 
     Args:
         recipe: labels: a supervised start, then PPO. paper: PPO from an untrained network, with settings for that;
-            fields of --ppo that are given stay.
+            PPO options that are given keep their values.
         fast: PPO with one pass over each batch and a smaller critic, whatever the fields below say.
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         config: Everything else.

@@ -430,7 +430,7 @@ def test_a_computer_that_was_suspended_sends_no_command_afterwards(arm, at, duri
         return motion(k, state)
 
     driver = Suspended(arm, clock)
-    recording = Controller(driver, arm, QUICK, clock=clock).run(policy)
+    recording = Controller(driver, arm, config=QUICK, clock=clock).run(policy)
     assert recording.fault.kind == "suspend"
     assert "the computer was suspended for 600.0 s" in recording.fault.text
     after = [ctrl for t, ctrl in driver.sent if t >= suspended[0]]
@@ -460,7 +460,7 @@ def test_time_that_the_computer_was_suspended_is_what_boottime_went_on_by(monkey
 @pytest.mark.parametrize("trouble", ["the watchdog ended", "the watchdog does not answer"])
 def test_a_watchdog_that_is_of_no_use_any_more_ends_the_run_damped(arm, trouble):
     driver = Tampered(arm, SimulatedClock())
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     controller._watchdog = SimpleNamespace(
         trouble=lambda: trouble if driver.clock.now() >= 0.9 else "", fired=lambda: False, beat=lambda weight: True
     )
@@ -565,7 +565,7 @@ def test_no_command_leaves_once_the_watchdog_has_damped_the_robot(arm):
             fired.append(driver.clock.now())
         return motion(k, state)
 
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     controller._watchdog = SimpleNamespace(
         trouble=lambda: "", fired=lambda: bool(fired), beat=lambda weight: True, release=lambda loose: None
     )
@@ -578,7 +578,7 @@ def test_no_command_leaves_once_the_watchdog_has_damped_the_robot(arm):
 def test_a_plan_counts_only_where_the_robot_still_is_where_it_was_found(arm, moved, kind):
     driver = Tampered(arm, SimulatedClock())
     driver.connect()
-    controller = Controller(driver, arm, QUICK, clock=driver.clock)
+    controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     found = driver.read().qpos + np.array([0.0, moved])
     controller.plan = Plan(found, Way.along(np.stack([found, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION)
     recording = controller.run()

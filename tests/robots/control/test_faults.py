@@ -334,7 +334,7 @@ def test_a_watchdog_that_hangs_for_five_periods_ends_the_run_damped(served):
                 os.kill(controller._watchdog._process.pid, signal.SIGSTOP)
             return swing(k)
 
-        controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, SLOW, SAFETY)
+        controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=SAFETY)
         return controller.run(policy)
 
     recording = steady(served, attempt, "stop")

@@ -68,7 +68,7 @@ def terminal(monkeypatch) -> Iterator[Terminal]:
 
 @pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
 def test_every_key_stops_a_motion_in_the_next_period_and_the_terminal_is_as_before(arm, terminal, key):
-    controller = Controller(driver := Arm(arm), arm, QUICK, clock=driver.clock)
+    controller = Controller(driver := Arm(arm), arm, config=QUICK, clock=driver.clock)
     motion = play(MOTION, 0.02)
 
     def policy(k, state):
@@ -86,7 +86,7 @@ def test_every_key_stops_a_motion_in_the_next_period_and_the_terminal_is_as_befo
 def test_a_key_between_consent_and_first_command_leaves_the_robot_uncommanded(arm, terminal):
     driver = Arm(arm)
     controller = Controller(
-        driver, arm, QUICK, clock=driver.clock, on_connect=lambda _: os.write(terminal.master, b"x")
+        driver, arm, config=QUICK, clock=driver.clock, on_connect=lambda _: os.write(terminal.master, b"x")
     )
     recording = controller.run(play(MOTION, 0.02), keys=True)
     assert "key 'x'; nothing was commanded" in recording.fault.text
@@ -100,7 +100,7 @@ def test_who_refuses_a_connected_robot_leaves_it_uncommanded_and_held(arm, termi
 
     driver = Arm(arm)
     with pytest.raises(UsageError, match="no"):
-        Controller(driver, arm, QUICK, clock=driver.clock, on_connect=refuse).run(play(MOTION, 0.02), keys=True)
+        Controller(driver, arm, config=QUICK, clock=driver.clock, on_connect=refuse).run(play(MOTION, 0.02), keys=True)
     assert driver.commands == 0
     assert driver.held is True
     assert termios.tcgetattr(terminal.slave) == terminal.before
@@ -119,7 +119,9 @@ def test_a_terminal_that_ends_stops(terminal):
 def test_a_policy_that_raises_leaves_the_terminal_as_before(arm, terminal):
     driver = Arm(arm)
     with pytest.raises(ZeroDivisionError):
-        Controller(driver, arm, QUICK, clock=driver.clock).run(lambda k, state: np.zeros(2) / (k // k), keys=True)
+        Controller(driver, arm, config=QUICK, clock=driver.clock).run(
+            lambda k, state: np.zeros(2) / (k // k), keys=True
+        )
     assert termios.tcgetattr(terminal.slave) == terminal.before
 
 
