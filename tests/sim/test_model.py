@@ -1,5 +1,7 @@
 """The nominal simulator: joints that hold still, payloads that weigh, robots a user brings along."""
 
+import re
+
 import mujoco
 import numpy as np
 import pytest
@@ -223,3 +225,18 @@ def test_another_gain_is_another_simulator(tmp_path):
     assert model_hash(one) == model_hash(write_arm(tmp_path / "c"))
     assert model_hash(one) != model_hash(other)
     assert len(model_hash(one)) == 12
+
+
+def test_a_model_in_degrees_moves_as_the_same_one_in_radians(tmp_path):
+    degrees = lambda m: 'range="' + " ".join(f"{np.degrees(float(x)):.12g}" for x in m[1].split()) + '"'  # noqa: E731
+    xml = re.sub(r'range="([^"]*)"', degrees, XML.replace('angle="radian"', 'angle="degree"'))
+    assert xml != XML
+    models = []
+    for name, text in (("radians", XML), ("degrees", xml)):
+        robot = write_arm(tmp_path / name, TOML, text)
+        stops = {"stop_low": -0.3, "stop_high": 0.4}
+        known = robot.with_servos({"shoulder": {"zero": 0.1} | stops, "elbow": {"zero": -0.2}})
+        models += [build_model(known), build_model(known, locked=("elbow",))]
+    for ours, theirs in zip(models[:2], models[2:], strict=True):
+        for field in ("jnt_range", "qpos0", "body_quat", "body_pos"):
+            np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), atol=1e-9)

@@ -174,14 +174,20 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             value = getattr(robot, field)[i]
             if np.isfinite(value):
                 setattr(joint, field, value)
-        joint.ref -= robot.zero[i]
-        stops = robot.stop_low[i], robot.stop_high[i]
+        unit = _units_per_si(spec, joint)
+        joint.ref -= unit * robot.zero[i]
+        stops = unit * robot.stop_low[i], unit * robot.stop_high[i]
         if np.isfinite(stops).any():
             low, high = joint.range if joint.range[0] < joint.range[1] else (-np.inf, np.inf)
             joint.range = [np.fmax(low, stops[0]), np.fmin(high, stops[1])]  # a stop only narrows the range
             joint.limited = True
         if np.isfinite(robot.damping[i]):
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
+
+
+def _units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
+    """Return how many of the specification's units are one rad or m of a joint: an MJCF may hold degrees."""
+    return math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
 
 
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
@@ -195,7 +201,7 @@ def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
     Raises:
         RobotError: Another joint of its body comes before it, and it is not clamped at its reference.
     """
-    body, move = joint.parent, value - joint.ref
+    body, move = joint.parent, value - joint.ref / _units_per_si(spec, joint)
     if move and body.joints[0].name != joint.name:
         raise RobotError(f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both")
     turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)

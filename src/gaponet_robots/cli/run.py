@@ -228,7 +228,7 @@ def perform(
         _report_dry(screen, recording, controller)
     else:
         _report(screen, recording)
-    return recording, controller.plan.motion if controller.plan else None, spec
+    return recording, controller.plan.motion if controller.plan else None, identified
 
 
 def listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import RobotError
-from gaponet.robot import BUILTIN, RobotSpec, load_robot
+from gaponet.robot import BUILTIN, SERVO, RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 from gaponet_robots.motion.collision import read_shapes
 
@@ -23,7 +23,7 @@ KP_RATIO_BOUNDS = (0.25, 4.0)  # identified kp over nominal kp
 RELATIVE_TOLERANCE = 1e-6  # between values of two files
 MAX_KP = 300.0  # N·m/rad that a driver sends to any joint; the H1-2's legs have 200
 MAX_KD = 10.0  # N·m·s/rad
-BEYOND_RANGE_RAD = 0.05  # a joint may be found this far outside its range, and its first command is where it is
+BEYOND_RANGE_RAD = 0.051  # a joint may be found 0.05 rad outside its range, and its first command is where it is
 
 
 def known_robot(driver: str, limits_from: str | None) -> RobotSpec:
@@ -45,8 +45,9 @@ def for_hardware(robot: RobotSpec, known: RobotSpec) -> RobotSpec:
     if robot.folder.resolve() != known.folder.resolve():
         _require_equal(robot.before_identification, known)
     require_plausible(robot)
-    own = known if robot.nominal else None
-    return replace(robot, folder=known.folder, mjcf=known.mjcf, nominal=own)
+    if robot.nominal is None:
+        return known
+    return replace(known, **{name: getattr(robot, name) for name in SERVO}, nominal=known)
 
 
 def robot_hash(robot: RobotSpec) -> str:
@@ -99,40 +100,39 @@ def require_plausible(robot: RobotSpec) -> None:
             )
 
 
-class CommandBounds:
-    """Last bounds of a driver, independent of the controller: gains, effort limits and positions of a known robot."""
+def require_motor_limits(robot: RobotSpec, packaged: str) -> None:
+    """Refuse gains and effort limits beyond what the motors of a packaged robot may get.
 
-    def __init__(self, robot: RobotSpec, packaged: str) -> None:
-        """
-        Args:
-            robot: The robot that the driver was given.
-            packaged: Name of the package's robot whose motors these are.
+    Args:
+        robot: The robot that a driver was given.
+        packaged: Name of the package's robot whose motors these are.
 
-        Raises:
-            RobotError: A gain or an effort limit is beyond what the motors of this robot may get.
-        """
-        nominal, motors = robot.before_identification, load_robot(BUILTIN / packaged)
-        effort = motors.effort_limit[motors.index(robot.joint_names)]
-        for name, values, most in (
-            ("kp", nominal.kp, np.full(len(effort), MAX_KP)),
-            ("kd", nominal.kd, np.full(len(effort), MAX_KD)),
-            ("effort_limit", nominal.effort_limit, effort * (1 + RELATIVE_TOLERANCE)),
-        ):
-            if not (values <= most).all():
-                i = int(np.argmax(~(values <= most)))
-                raise RobotError(
-                    f"{robot.folder}: {name} of {robot.joint_names[i]} is {values[i]:g}; the driver of "
-                    f"{packaged} takes at most {most[i]:g}"
-                )
-        self.joint_names = robot.joint_names
-        self.low, self.high = nominal.qpos_range.T + np.array([[-BEYOND_RANGE_RAD], [BEYOND_RANGE_RAD]]) * 1.01
+    Raises:
+        RobotError: With the folder, the joint and the bound.
+    """
+    nominal, motors = robot.before_identification, load_robot(BUILTIN / packaged)
+    effort = motors.effort_limit[motors.index(robot.joint_names)]
+    for name, values, most in (
+        ("kp", nominal.kp, np.full(len(effort), MAX_KP)),
+        ("kd", nominal.kd, np.full(len(effort), MAX_KD)),
+        ("effort_limit", nominal.effort_limit, effort * (1 + RELATIVE_TOLERANCE)),
+    ):
+        if not (values <= most).all():
+            i = int(np.argmax(~(values <= most)))
+            raise RobotError(
+                f"{robot.folder}: {name} of {robot.joint_names[i]} is {values[i]:g}; the driver of {packaged} takes at "
+                f"most {most[i]:g}"
+            )
 
-    def problem(self, ctrl: Array, at: Array) -> str:
-        """Why a position command (n) rad must not be written for the joints `at`, in words; empty if it may."""
-        wrong = ~((ctrl >= self.low) & (ctrl <= self.high))[at]
-        if not wrong.any():
-            return ""
-        i = int(at[wrong.argmax()])
-        return (
-            f"command {ctrl[i]:g} rad to {self.joint_names[i]} is outside {self.low[i]:.2f} to {self.high[i]:.2f} rad"
-        )
+
+def outside_range(robot: RobotSpec, ctrl: Array, joints: Array) -> str:
+    """Return why a position command (n) rad must not be written for `joints` (indices), or "" if it may.
+
+    The range is the nominal one, widened by BEYOND_RANGE_RAD.
+    """
+    low, high = robot.before_identification.qpos_range.T
+    wrong = ~((ctrl >= low - BEYOND_RANGE_RAD) & (ctrl <= high + BEYOND_RANGE_RAD))[joints]
+    if not wrong.any():
+        return ""
+    i = int(joints[wrong.argmax()])
+    return f"command {ctrl[i]:g} rad to {robot.joint_names[i]} is outside its range, {low[i]:.2f} to {high[i]:.2f} rad"

@@ -25,7 +25,7 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet_robots.control.driver import DriverError, End, Fault, State
-from gaponet_robots.control.hardware import CommandBounds
+from gaponet_robots.control.hardware import require_motor_limits
 from gaponet_robots.drivers import feetech as reg
 from gaponet_robots.drivers.so101_calibration import SPEAK, STEP, ServoRow, numbered, read_calibration, settle
 
@@ -88,7 +88,7 @@ class SO101Driver:
         """
         if set(robot.joint_names) != set(SPEAK):
             raise UsageError(f"the so101 driver is for the joints {', '.join(SPEAK)}; {robot.name} has others")
-        CommandBounds(robot, "so101")  # goals are clipped to the calibrated range below
+        require_motor_limits(robot, "so101")
         self.robot, self.port, self.calibration = robot, port, calibration
         self.timeout, self.silent = timeout, silent
         self.address = port

@@ -23,7 +23,7 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet_robots.control.driver import DriverError, End, Fault, State
-from gaponet_robots.control.hardware import CommandBounds
+from gaponet_robots.control.hardware import outside_range, require_motor_limits
 from gaponet_robots.control.safety import damping
 from gaponet_robots.drivers import hg
 
@@ -84,7 +84,7 @@ class UnitreeDriver:
             raise UsageError(f"the unitree driver is for the 27 joints of h1_2; {robot.name} has others")
         if joints == "all" and topic != "lowcmd":
             raise UsageError("rt/arm_sdk does not take the legs; use joints arms or upper_body, or topic lowcmd")
-        self._bounds = CommandBounds(robot, "h1_2")
+        require_motor_limits(robot, "h1_2")
         first = {"arms": 13, "upper_body": 12, "all": 0}[joints]
         self.robot, self.topic, self.joints = robot, topic, joints
         self.kp, self.kd = (robot.nominal or robot).kp, (robot.nominal or robot).kd
@@ -222,7 +222,7 @@ class UnitreeDriver:
 
         There the torso is held where it was found at the first command, if it is not commanded.
         """
-        if problem := self._bounds.problem(ctrl, self._at):
+        if problem := outside_range(self.robot, ctrl, self._at):
             raise DriverError(f"{problem}; it was not sent")
         self._send(ctrl, self.kp, self.kd, weight)
 

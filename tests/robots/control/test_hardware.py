@@ -79,6 +79,18 @@ def test_a_folder_supplies_identified_values_and_the_known_robot_its_limits(h1_2
     assert (limits.kp, limits.low, limits.high) == (100.0, -0.5, 0.5)
 
 
+def test_all_but_identified_values_is_the_known_robots(h1_2, tmp_path):
+    save_robot(h1_2.with_servos({JOINT: {"kp": 90.0}}), tmp_path / "identified")
+    file = tmp_path / "identified" / "robot.toml"
+    file.write_text(re.sub(r"home = [-\d.]+", "home = 0.3", file.read_text()))
+    sent = load_robot(tmp_path / "identified")
+    known = known_robot("unitree", None)
+    robot = for_hardware(sent, known)
+    assert not np.array_equal(sent.qpos_home, h1_2.qpos_home)
+    np.testing.assert_array_equal(robot.qpos_home, h1_2.qpos_home)
+    assert robot.nominal is known
+
+
 def test_an_identified_stop_does_not_widen_a_range(h1_2):
     wide = h1_2.with_servos({JOINT: {"stop_low": -50.0, "stop_high": 50.0}})
     np.testing.assert_array_equal(wide.qpos_range, h1_2.qpos_range)
@@ -109,7 +121,7 @@ def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
     for value in (np.nan, h1_2.qpos_range[13, 1] + 0.06):
         ctrl = h1_2.qpos_home.copy()
         ctrl[driver.joint_names.index(JOINT)] = value
-        with pytest.raises(DriverError, match=f"to {JOINT} is outside .*; it was not sent"):
+        with pytest.raises(DriverError, match=f"to {JOINT} is outside its range.*; it was not sent"):
             driver.write(ctrl)
 
 
