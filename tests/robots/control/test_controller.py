@@ -644,3 +644,12 @@ def test_the_watchdog_tries_again_until_it_has_damped(capsys):
     assert "could NOT be damped: switch the supply off (the cable is out); trying again" in said
     assert "(one servo does not answer)" in said
     assert said.endswith("watchdog: /dev/loose let go\n")
+
+
+def test_a_payload_that_torques_contradict_is_noted_two_seconds_into_the_run(arm):
+    compensator = SimpleNamespace(reset=lambda *_: None, step=lambda target, *_: target, doubt="0.4 kg were stated")
+    driver = Tampered(arm, SimulatedClock())
+    recording = run(arm, driver, Motion("sway", "whole_body", 0.02, commands(120, seed=1)), compensator=compensator)
+    started = next(event.time for event in recording.events if event.phase == "run")
+    noted = [event.time for event in recording.events if event.text == "compensation: 0.4 kg were stated"]
+    assert noted == [pytest.approx(started + 2.0, abs=0.021)]
