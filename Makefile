@@ -88,9 +88,9 @@ kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks --only kills
 
-# A worker killed in the middle of collect, gap and a study, on local processes, Ray, Dask and submitit: ten minutes.
+# A worker killed in the middle of collect, gap and a study, on local processes and Ray: less than ten minutes.
 workers: setup
-	$(BIN)/pip install -q -e ".[dev,ray,dask,submitit]"
+	$(BIN)/pip install -q -e ".[dev,ray]"
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kill_workers.py workers_work
 
 # LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.

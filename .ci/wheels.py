@@ -38,7 +38,7 @@ TRIES = {
     "gym": [GYM],
     "ros": ["data export data --to mcap --out bags", "import bags --robot so101 --out again"],
     "hdf5": ["formats"],
-    "dask": ["collect --robot so101 --recipe recipe.toml --out data2 --nproc 1 --executor dask"],
+    "ray": ["collect --robot so101 --recipe recipe.toml --out data2 --nproc 1 --executor ray"],
     "deploy,view": ["view data --model run --duration 1 --render film.gif"],
 }  # fmt: skip
 

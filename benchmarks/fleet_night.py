@@ -110,7 +110,7 @@ def day(work: Path, robots: int, executor: str, kill: bool) -> None:
     shutil.rmtree(work / "data", ignore_errors=True)
     os.environ[SIGN] = sign = str(os.getpid())
     took, killed, began = dict[str, dict[str, float]](), 0, time.monotonic()
-    with opened(executor, 0, 1, work) as pool:
+    with opened(executor, 0, 1) as pool:
         ready = time.monotonic()
         victim = lambda: busiest(sign, os.getpid()) if kill and not killed and len(took) > robots / 3 else None  # noqa: E731
         for outcome in pool.run(partial(_night, work), named):

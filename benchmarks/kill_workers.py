@@ -1,6 +1,6 @@
 """Proof that a worker killed with kill -9 changes no result: collect, gap and a study, on each executor.
 
-    python benchmarks/kill_workers.py WORK [--executors local ray dask submitit] [--only collect gap study] [--seed 0]
+    python benchmarks/kill_workers.py WORK [--executors local ray] [--only collect gap study] [--seed 0]
 
 Collects a small VIRTUAL SO-101 set, pairs it and trains two cells of a study, undisturbed on local processes, then on
 each executor with kill -9 of a worker in the middle of its job. Compared are hashes of the recordings and twins, hashes
@@ -62,7 +62,7 @@ def busiest(sign: str, command: int) -> int | None:
             try:
                 if int(place.name) != command and f"{SIGN}={sign}".encode() in (place / "environ").read_bytes():
                     line = (place / "cmdline").read_bytes()
-                    if b"spawn_main" in line or b"submitit.core._submit" in line or line.startswith(b"ray::_call"):
+                    if b"spawn_main" in line or line.startswith(b"ray::_call"):
                         calling.update({int(place.name)} if line.startswith(b"ray") else ())
                         found[int(place.name)] = int((place / "stat").read_text().rpartition(")")[2].split()[11])
             except OSError:
@@ -85,11 +85,10 @@ def playing(out: Path, sign: str, command: int) -> int | None:
 
 
 def pairing(out: Path, sign: str, command: int) -> int | None:
-    """A worker that replays: one of Ray's that says so, or another's once some twins were written. Before that Dask may
-    still be starting its workers, and waits for ever for one that is killed then."""
+    """A worker of Ray that replays: its process is named after its task."""
     found = busiest(sign, command)
     says = found is not None and Path(f"/proc/{found}/cmdline").read_bytes().startswith(b"ray")
-    return found if says or any(out.rglob("twins/**/*.parquet")) else None
+    return found if says else None
 
 
 def training(out: Path, sign: str, command: int) -> int | None:
@@ -147,7 +146,7 @@ def disturbed(
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("work", type=Path)
-    parser.add_argument("--executors", nargs="+", default=["local", "ray", "dask", "submitit"])
+    parser.add_argument("--executors", nargs="+", default=["local", "ray"])
     parser.add_argument("--only", nargs="+", default=["collect", "gap", "study"])
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     args = parser.parse_args()

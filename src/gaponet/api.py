@@ -109,7 +109,7 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, execu
     Args:
         dataset: Recordings.
         robot: Another robot than the one that the dataset keeps.
-        executor: Where they are replayed: local, ray, dask or submitit (docs/scale.md), or one of concurrent.futures.
+        executor: Where they are replayed: local, ray or ray:ADDRESS (docs/scale.md), or one of concurrent.futures.
 
     Returns:
         How many twins were made.

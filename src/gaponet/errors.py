@@ -65,8 +65,7 @@ EXTRAS = {
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
     "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
     "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "tensorboard": "tensorboard", "wandb": "wandb",
-    "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp",
-    "ray": "ray", "distributed": "dask", "dask": "dask", "submitit": "submitit",
+    "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
 }  # fmt: skip
 
 

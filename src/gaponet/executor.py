@@ -7,7 +7,6 @@ gone): the job is given to another worker, RETRIES times. Libraries are loaded o
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import threading
 import time
@@ -19,11 +18,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from gaponet.errors import UsageError, WorkerError
-from gaponet.files import MARK
 from gaponet.process.child import SAFE
 
 Job = TypeVar("Job")
@@ -32,10 +29,7 @@ Result = TypeVar("Result")
 LOCAL = "local"
 RETRIES = 2
 BEAT = 0.3  # s between two looks at what is going on
-POLL = 1.0  # s between two looks at submitit's jobs, which are files
 MOST_WORKERS = 1024
-LOOPBACK = "127.0.0.1"
-DAY = 24 * 60  # min; submitit's own limit is minutes
 POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -138,27 +132,29 @@ def _second(work: Callable[[Job], Result], job: tuple[int, Job]) -> Result:
 
 
 @contextmanager
-def opened(where: str | Executor, workers: int, threads: int, folder: Path) -> Iterator[Pool]:
+def opened(where: str | Executor, workers: int, threads: int) -> Iterator[Pool]:
     """Start what jobs run on, or reach it; what was started here ends with the block.
 
     Args:
-        where: local; ray or dask, with :ADDRESS of a cluster; submitit, with :KEY=VALUE,… for it; or an executor.
+        where: local; ray, with :ADDRESS of a cluster; or an executor.
         workers: Jobs at a time; 0 for as many as there are cores.
         threads: How many one job takes.
-        folder: A folder of the user's, seen by all workers, for submitit's files.
 
     Raises:
         UsageError: No such executor, or no cluster there.
     """
-    if isinstance(where, Executor):
-        yield Pool(where, workers or Pool.cores(threads), threads)
-        return
-    kind, _, at = where.partition(":")
-    if kind not in KINDS or (at and kind == LOCAL):
-        raise UsageError(f"--executor {where}: choose local, ray, dask or submitit; the last three with :ADDRESS")
     with ExitStack() as stack:
-        with _for_children(threads):
-            executor, size = KINDS[kind](stack, at, workers, threads, folder)
+        executor = stack.enter_context(_Processes()) if where == LOCAL else where
+        size = workers or Pool.cores(threads)
+        if not isinstance(executor, Executor):
+            kind, _, address = str(executor).partition(":")
+            if kind != "ray":
+                raise UsageError(
+                    f"--executor {where}: choose local, ray or ray:ADDRESS; "
+                    "from Python, give a concurrent.futures.Executor (docs/scale.md)"
+                )
+            with _for_children(threads):
+                executor, size = _ray(stack, address, workers, threads)
         yield Pool(executor, max(1, size), threads)
 
 
@@ -183,10 +179,6 @@ class _Processes(Executor):
             pool.shutdown(wait, cancel_futures=cancel_futures)
 
 
-def _local(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -> tuple[Executor, int]:
-    return stack.enter_context(_Processes()), workers or Pool.cores(threads)
-
-
 class _Ray(Executor):
     """Ray's tasks as futures; it has no executor of its own."""
 
@@ -202,9 +194,9 @@ def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     return fn(*args, **kwargs)
 
 
-def _ray(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -> tuple[Executor, int]:
+def _ray(stack: ExitStack, address: str, workers: int, threads: int) -> tuple[Executor, int]:
     """A cluster at an address or $RAY_ADDRESS, else a Ray of our own that nobody outside this machine can reach."""
-    address = at or os.environ.get("RAY_ADDRESS") or LOCAL
+    address = address or os.environ.get("RAY_ADDRESS") or LOCAL
     if address == LOCAL:
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # on every system: bind to loopback
     import ray
@@ -220,77 +212,6 @@ def _ray(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) ->
     there = int(ray.cluster_resources().get("CPU", 1))
     call = ray.remote(num_cpus=min(threads, there), max_retries=0)(_call)
     return _Ray(call), workers or there // threads
-
-
-def _dask(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -> tuple[Executor, int]:
-    """A scheduler at an address or $DASK_SCHEDULER_ADDRESS, else processes of this machine."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    retried_here = {"distributed.scheduler.allowed-failures": 0, "distributed.scheduler.worker-saturation": 1.0}
-    stack.enter_context(dask.config.set(retried_here))
-    address = at or os.environ.get("DASK_SCHEDULER_ADDRESS")
-    try:
-        here = {"n_workers": workers or Pool.cores(threads), "threads_per_worker": 1, "memory_limit": 0}
-        cluster = address or stack.enter_context(LocalCluster(host=LOOPBACK, dashboard_address=f"{LOOPBACK}:0", **here))
-        client = stack.enter_context(Client(cluster))
-    except (OSError, ValueError) as error:
-        raise UsageError(f"--executor dask: no scheduler at {address}: {error}") from None
-    return client.get_executor(pure=False), workers or sum(client.nthreads().values())
-
-
-class _Submitit(Executor):
-    """submitit's jobs as futures: one thread looks after all of them."""
-
-    def __init__(self, auto: Any) -> None:
-        self.auto, self.jobs, self.closed = auto, list[tuple[Any, Future[Any]]](), False
-        self.thread = threading.Thread(target=self._look, daemon=True)
-        self.thread.start()
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        self.jobs.append((self.auto.submit(fn, *args, **kwargs), future))
-        return future
-
-    def _look(self) -> None:
-        while not self.closed:
-            for job, future in list(self.jobs):
-                if future.cancelled():
-                    job.cancel(check=False)
-                elif not job.done():
-                    continue
-                elif (error := job.exception()) is not None:
-                    future.set_exception(error)
-                else:
-                    future.set_result(job.result())
-                self.jobs.remove((job, future))
-            time.sleep(POLL)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        self.closed = True
-        self.thread.join()
-        for job, _ in self.jobs:
-            job.cancel(check=False)
-
-
-def _submitit(stack: ExitStack, at: str, workers: int, threads: int, folder: Path) -> tuple[Executor, int]:
-    """SLURM where there is sbatch, else processes of this machine; KEY=VALUE,… are submitit's parameters."""
-    import submitit
-
-    given = dict(word.partition("=")[::2] for word in at.split(",") if word)
-    place = folder.absolute() / f"{MARK}-{os.getpid()}-submitit"
-    stack.callback(shutil.rmtree, place, ignore_errors=True)
-    try:
-        auto = submitit.AutoExecutor(place, given.pop("cluster", None))
-        asked = {key: int(value) if value.isdigit() else value for key, value in given.items()}
-        auto.update_parameters(**({"timeout_min": DAY, "cpus_per_task": threads} | asked))
-    except (ValueError, TypeError, NameError, RuntimeError) as error:
-        raise UsageError(f"--executor submitit:{at}: {error}") from None
-    usual = Pool.cores(threads) if auto.cluster == LOCAL else MOST_WORKERS
-    return stack.enter_context(_Submitit(auto)), workers or usual
-
-
-KINDS = {LOCAL: _local, "ray": _ray, "dask": _dask, "submitit": _submitit}
 
 
 @contextmanager

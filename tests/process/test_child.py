@@ -51,7 +51,7 @@ if __name__ == "__main__":
     watchdog.wait_ready()
     watchdog.release()
     print("watched")
-    with opened("local", 1, 1, Path(".")) as pool:
+    with opened("local", 1, 1) as pool:
         print(*pool.map(abs, [-3]), "computed")
     try:
         in_own_process(Path("set"), 1, 1)

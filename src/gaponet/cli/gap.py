@@ -30,7 +30,7 @@ def gap(
     Sequences without a twin are replayed in the nominal simulator first, and the twins kept.
 
     Args:
-        executor: Where they are replayed: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md).
+        executor: Where they are replayed: local, ray or ray:ADDRESS (docs/scale.md).
     """
     out = Out(json)
     data, spec = open_dataset(dataset, robot, run)

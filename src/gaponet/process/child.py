@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
 
 SAFE = "PYTHONSAFEPATH"  # what Python asks, from 3.11 on, before it puts the current folder first
 BEGIN = (
@@ -20,19 +19,19 @@ BEGIN = (
 
 def words(module: str, *given: str) -> list[str]:
     """The command line of a child that runs a module, as `python -m MODULE GIVEN …` would, and never the folder's."""
-    return [sys.executable, "-I", "-c", BEGIN, "\n".join(_paths(sys.path)), module, *given]
+    return [sys.executable, "-I", "-c", BEGIN, "\n".join(_paths()), module, *given]
 
 
-def _paths(known: Iterable[str]) -> list[str]:
+def _paths() -> list[str]:
     """Where modules may come from: absolute places, not the current folder, except where gaponet itself lies in it."""
     here, home = _real("."), os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    return [p for p in known if os.path.isabs(p) and (_real(p) != here or here == _real(home))]
+    return [p for p in sys.path if os.path.isabs(p) and (_real(p) != here or here == _real(home))]
 
 
 def leave_folder() -> None:
     """Look for no module in the current folder from now on, neither here nor in whatever Python this process starts."""
     os.environ[SAFE] = "1"
-    sys.path[:] = _paths(sys.path)
+    sys.path[:] = _paths()
 
 
 def _real(path: str) -> str:

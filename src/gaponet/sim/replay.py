@@ -238,7 +238,7 @@ def _pair(
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
-            pool = stack.enter_context(opened(executor, 0, 1, dataset.path))
+            pool = stack.enter_context(opened(executor, 0, 1))
             replayed = pool.map(partial(work, nthread=1), sequences)
         for part, twins in zip(parts, replayed, strict=True):
             for entry, twin in zip(part, twins, strict=True):

@@ -148,8 +148,7 @@ def fleet(
         night: Its name; default today.
         calibrate: Whether those that drifted are calibrated.
         payload_mass: kg in each hand, of logs whose format does not state it.
-        executor: Where: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md); folders are on a
-            disk that all machines see.
+        executor: Where: local, ray or ray:ADDRESS (docs/scale.md); folders are on a disk that all machines see.
         workers: Robots at a time; 0 for as many as there are cores.
     """
     from gaponet.progress import bar

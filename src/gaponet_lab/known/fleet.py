@@ -122,7 +122,7 @@ def night(
             jobs.append(
                 Job(f.name, f, logs if one else logs / f.name, f.name if one else "", name, place, payload_mass)
             )
-        with opened(executor, workers, 1, out) as pool:
+        with opened(executor, workers, 1) as pool:
             for outcome in pool.run(ask, jobs):
                 if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
                     raise outcome.error

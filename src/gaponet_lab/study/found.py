@@ -118,7 +118,7 @@ def train_all(cells: ListOf[Cell], study: Study, show: Show) -> list[str]:
     todo = [c for c in cells if not c.done]
     failed = dict[str, str]()
     if todo:
-        with opened(study.executor, study.workers, study.threads, study.out) as pool:
+        with opened(study.executor, study.workers, study.threads) as pool:
             failed = run_cells(todo, train_and_evaluate, pool, show)
     if not any(c.done for c in cells):
         raise ModelError(f"{study.out}: every training failed; the first: {next(iter(failed.values()))}")

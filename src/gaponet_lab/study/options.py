@@ -34,7 +34,7 @@ class Options:
     workers: int = 0
     """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
     executor: str = LOCAL
-    """Where they run: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md)."""
+    """Where they run: local, ray or ray:ADDRESS (docs/scale.md)."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """A rehearsal in minutes: a slice of the dataset, a budget that teaches nothing, numbers that mean nothing."""
     robot: str | None = None

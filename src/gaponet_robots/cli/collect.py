@@ -36,7 +36,7 @@ def collect(
         units: Units of the fleet instead of the recipe's.
         seed: Seed of motions, noise and start states.
         nproc: Processes, or jobs at a time; 0 for one per core.
-        executor: Where it is played: local, ray, dask or submitit, the last three with :ADDRESS (docs/scale.md).
+        executor: Where it is played: local, ray or ray:ADDRESS (docs/scale.md).
     """
     import gaponet_robots.virtual.collect as recording
     from gaponet.robot import load_robot

@@ -99,7 +99,7 @@ def collect(
         jobs = [Job(robot, fleet, recipe, files, seed, tuple(part)) for part in _parts(missing, nproc or Pool.cores(1))]
         if twins:
             pair_dataset(dataset, robot, lock_idle=True)  # those that a killed run had no time for
-        for sequence, twin in _record(jobs, nproc, twins, executor, dataset.path):
+        for sequence, twin in _record(jobs, nproc, twins, executor):
             entry = dataset.append(sequence)
             if twin is not None:
                 dataset.write_twin(entry, twin)
@@ -170,7 +170,7 @@ def _parts(missing: list[Take], nproc: int) -> Iterator[list[Take]]:
 
 
 def _record(
-    jobs: list[Job], nproc: int, twins: bool, executor: str | Executor, folder: Path
+    jobs: list[Job], nproc: int, twins: bool, executor: str | Executor
 ) -> Iterator[tuple[Sequence, Twin | None]]:
     """Sequences in the jobs' order, whichever worker is first."""
     work = partial(_played, twins=twins)
@@ -178,7 +178,7 @@ def _record(
         for job in jobs:
             yield from work(job)
         return
-    with opened(executor, nproc, 1, folder) as pool:
+    with opened(executor, nproc, 1) as pool:
         for played in pool.map(work, jobs):
             yield from played
 

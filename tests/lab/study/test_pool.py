@@ -24,7 +24,7 @@ SMALL = TrainConfig(
 
 @pytest.fixture
 def local(tmp_path):
-    with opened("local", 2, 1, tmp_path) as pool:
+    with opened("local", 2, 1) as pool:
         yield pool
 
 

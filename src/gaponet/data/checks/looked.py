@@ -102,7 +102,7 @@ class Looked:
         if executor == LOCAL and (len(parts) < 2 or sum(e.rows + OWN for e in todo) < MANY):
             yield from ((pair[0], self._find([pair])[0]) for part in read for pair in part)
             return
-        with opened(executor, 0, 1, self.dataset.path) as pool:
+        with opened(executor, 0, 1) as pool:
             for part, found in zip(parts, pool.map(self._find, map(list, read)), strict=True):
                 yield from zip(part, found, strict=True)
 
