@@ -9,6 +9,8 @@ program on libddsc 0.10, Unitree's SDK among them, with a null pointer in its di
 issue 1554; tests/robots/control/test_peers.py).
 """
 
+import atexit
+import threading
 import time
 from collections import defaultdict
 from dataclasses import dataclass
@@ -143,6 +145,23 @@ def _program(qos: Qos) -> str:
 
 
 _DOMAINS: dict[int, Domain] = {}  # a domain is configured once per process
+SHUTDOWN_S = 3.0  # longest wait for the deletion of the domains at the end of a process
+
+
+@atexit.register
+def _delete_domains() -> None:
+    """Delete the domains before the interpreter ends, or leave them to the operating system.
+
+    In some runs cyclonedds 11.0.1 waits for ever while it deletes a domain (ddsi_stop); a command would never return.
+    """
+
+    def delete() -> None:
+        for domain in _DOMAINS.values():
+            domain.__del__()
+
+    deleting = threading.Thread(target=delete, daemon=True)
+    deleting.start()
+    deleting.join(SHUTDOWN_S)
 
 
 def send(writer: DataWriter, kind: type[IdlStruct], data: Array | bytes) -> None:

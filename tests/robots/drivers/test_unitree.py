@@ -182,3 +182,18 @@ def test_a_program_that_is_made_to_use_multicast_on_loopback_is_found():
     finally:
         other.kill()
         other.wait()
+
+
+def test_a_process_ends_although_the_deletion_of_its_dds_domain_never_does():
+    program = (
+        "import threading\n"
+        "from gaponet_robots.drivers import dds\n"
+        "class Stuck:\n"
+        "    def __del__(self):\n"
+        "        if threading.current_thread() is not threading.main_thread():\n"
+        "            threading.Event().wait()\n"
+        "dds._DOMAINS[0] = Stuck()\n"
+        "print('done')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (0, "done\n"), ended.stderr
