@@ -33,7 +33,7 @@ STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
 LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
 FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *LAW)
-NEAREST = 3  # joints that are shown beside a name that is none
+MAX_SUGGESTIONS = 3  # similar joints that an error lists
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
 SIGNED = ("qpos_home", "offset", "zero", *STOPS)
@@ -251,8 +251,8 @@ class RobotSpec:
         return same[0]
 
     def _unknown(self, name: str, where: str) -> tuple[str, str]:
-        """What is wrong with a name, and the joint with the most similar one."""
-        near = difflib.get_close_matches(name, self.joint_names, n=NEAREST, cutoff=0.0)
+        """Return the error text for an unknown joint name, and the most similar joint."""
+        near = difflib.get_close_matches(name, self.joint_names, n=MAX_SUGGESTIONS, cutoff=0.0)
         said = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
         return said, near[0]
 

@@ -99,12 +99,12 @@ class ModelConfig:
 
     @property
     def holds(self) -> bool:
-        """Whether corrections or sensor values are held for several control periods."""
+        """True if corrections or sensor values are held for several control periods."""
         return self.delta_hold > 1 or self.sensor_hold > 1
 
     @property
     def asks_simulator(self) -> bool:
-        """Whether sensor values are the simulator's own answers, a part of x."""
+        """True if the simulator itself gives the sensor values; they are then a part of x."""
         return self.sensor_source == "fixed"
 
     def observation_dim(self, n: int) -> int:

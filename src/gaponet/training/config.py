@@ -155,7 +155,10 @@ class TrainConfig:
         return replace(self, ppo=replace(self.ppo, epochs=1, critic_hidden=(128,)))
 
     def paper_recipe(self) -> TrainConfig:
-        """The same with the paper's training: PPO from an untrained network. Fields of PPO that were changed stay."""
+        """Return this configuration with the paper's training, PPO from an untrained network.
+
+        PPO settings that differ from the defaults stay.
+        """
         usual = PPOConfig()
         mine = {f.name: value for f in fields(usual) if (value := getattr(self.ppo, f.name)) != getattr(usual, f.name)}
         return replace(self, ppo=replace(PAPER_PPO, **mine), warm_start=replace(self.warm_start, rounds=0))

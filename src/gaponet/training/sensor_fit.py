@@ -124,7 +124,7 @@ def _sensor_labels(
     seed: int,
     nthread: int = 0,
 ) -> _Answers:
-    """What the predictor sees, and oracle answers: at these states, near them, or anywhere.
+    """Return predictor inputs and the simulator's answers: at these states, near them, or anywhere.
 
     "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
     and inertia there are asked of the simulator, since no recorded motion needs to have been there.

@@ -198,8 +198,8 @@ def perform(
         if motion:
             plan = planner.plan(motion, robot.read().qpos)
             if compensator:
-                told = asked.payload_mass
-                masses = compensator.masses[[0, -1]].tolist() if told is None else [told]
+                stated = asked.payload_mass
+                masses = compensator.masses[[0, -1]].tolist() if stated is None else [stated]
                 plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
             controller.plan = plan
             _show(screen, controller.plan, spec, robot, limits.max_payload)

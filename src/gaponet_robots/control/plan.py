@@ -160,7 +160,7 @@ class Planner:
         return self._judged(Plan(found, into), near)
 
     def judge_commands(self, plan: Plan, compensator: Compensates, masses: tuple[float, ...]) -> Plan:
-        """The plan with what a compensator makes of it, for each payload (kg) that the compensator may assume.
+        """Return the plan with its largest correction and the clearance of the commands, for all `masses` (kg).
 
         The compensator is causal and is run without measured states. Its feedback is not included: that adds at most
         CompensatorConfig.feedback_limit.

@@ -66,7 +66,7 @@ class Watchdog:
             raise DriverError("the watchdog could not reach the robot; see its message above")
 
     def trouble(self) -> str:
-        """Why this watchdog is of no use any more: it ended, or does not answer; empty if it is well."""
+        """Return why this watchdog cannot damp the robot, that it ended or does not answer; empty if it can."""
         if self.fired() or self._process.poll() is not None:
             return "the watchdog ended"
         silent = self._answered is not None and time.monotonic() - self._answered > self._hang
