@@ -75,11 +75,13 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
     no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
     rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
     for run in part:
-        meta, whole = run.meta, _row(run)
+        meta = run.meta
+        whole = _row(run)
+        for row, arm in zip(whole, _row(run, no_wrist), strict=False):
+            row["mpjae_no_wrist"] = arm["mpjae"]
         names = {"": "", "motion": meta.motion, "payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
         for group, name in names.items():
             rows[group][name] += whole
-        rows["no_wrist"][""] += _row(run, no_wrist)
         for j, column in joints.items():
             rows["joint"][j] += _row(run, column)
         for horizon, error in _horizons(run).items():
@@ -87,7 +89,7 @@ def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
     held = [j for j in joints if rows["joint"][j]]
     order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
     order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
-    total = _mean(rows[""][""]) | {"mpjae_no_wrist": _mean(rows["no_wrist"][""]).get("mpjae", float("nan"))}
+    total = {"mpjae_no_wrist": float("nan")} | _mean(rows[""][""])
     return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}
 
 
@@ -103,7 +105,7 @@ def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, fl
 
 
 def _mean(rows: list[_Row]) -> _Row:
-    return {k: float(np.mean([row[k] for row in rows])) for k in rows[0]} if rows else {}
+    return {k: float(np.mean([row[k] for row in rows if k in row])) for k in dict.fromkeys(k for r in rows for k in r)}
 
 
 def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:

@@ -86,6 +86,10 @@ class PPOConfig:
     std: Annotated[float, Interval(gt=0, le=1e6)] = 0.0025
     """Exploration σ, rad. Beyond friction/kp (0.003 rad on the SO-101) noise shakes joints out of stiction,
     and the best noisy policy is not the best policy."""
+    std_half_life: Annotated[float, Interval(ge=0, le=1e9)] = 0.0
+    """Updates in which the exploration σ falls to half, down to std_end; 0 keeps it as it is."""
+    std_end: Annotated[float, Interval(gt=0, le=1e6)] = 0.0025
+    """Smallest exploration σ where it falls, rad."""
     noise_time: Annotated[float, Interval(ge=0, le=1e6)] = 0.2
     """Correlation time of the exploration, s; 0 for white noise."""
     noise_share: Annotated[float, Interval(gt=0, le=1)] = 0.5

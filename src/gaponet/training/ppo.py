@@ -81,9 +81,16 @@ class Learner:
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
         step = env.robot.dt * env.config.delta_hold
         self.kept = math.exp(-step / config.noise_time) if config.noise_time else 0.0
-        self.spread = config.std * math.sqrt(1 - self.kept**2)
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
         self.updates, self.ready, self.found = 0, False, Update()
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of what is new in the exploration of a decision, rad."""
+        config = self.config
+        halvings = self.updates / config.std_half_life if config.std_half_life else 0.0
+        std = max(config.std * 0.5**halvings, min(config.std, config.std_end))
+        return std * math.sqrt(1 - self.kept**2)
 
     def update(self) -> Update:
         """Run num_steps decisions in every environment, then learn from them."""

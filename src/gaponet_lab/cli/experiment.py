@@ -18,10 +18,12 @@ from gaponet.training.config import TrainConfig
 from gaponet_lab.study.compare import Compare, identified
 from gaponet_lab.study.data import Data
 from gaponet_lab.study.found import Question, answer, train_all
-from gaponet_lab.study.options import MODELS, Options
+from gaponet_lab.study.options import Options
 from gaponet_lab.study.played.delivery import Delivery
+from gaponet_lab.study.played.paper import Paper
 from gaponet_lab.study.played.session import Playing, Session, study_to_play
 from gaponet_lab.study.played.tracking import Tracking
+from gaponet_lab.study.pool import Cell
 from gaponet_lab.study.study import Study, expected_s
 from gaponet_lab.study.unit import Unit
 from gaponet_lab.study.variant import parse_variant
@@ -29,11 +31,10 @@ from gaponet_lab.study.variant import parse_variant
 if TYPE_CHECKING:
     from gaponet.data.store import Dataset
     from gaponet.robot import RobotSpec
-    from gaponet_lab.study.pool import Cell
 
 FLAT = tyro.conf.arg(name="")
 Shared = Annotated[Options, FLAT]
-PLAYED = (Tracking, Delivery)
+PLAYED = (Paper, Tracking, Delivery)
 DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
@@ -90,15 +91,17 @@ def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options
     data.require_robot(robot)
     question.require(data)
     screen, runs, part = Out(options.json), question.runs, data
+    study, cells = None, list[Cell]()
     if not runs:
         study = study_to_play(question, data, robot, out, options)
-        cells = study.cells(MODELS)
+        cells = question.cells(study)
         with _trainings(cells, study, screen) as show:
             failed = train_all(cells, study, show)
         if failed:
             raise UsageError(f"{failed[0]}; run it again to retry")
-        runs, part, out = tuple(c.folder for c in cells), study.data, study.out
-    session = Session.of(question, part, data, robot.nominal or robot, runs, out, options.quick)
+        runs, part, out = question.played(cells), study.data, study.out
+    how = out, options.quick, study, tuple(cells)
+    session = Session.of(question, part, data, robot.nominal or robot, runs, *how)
     with bar("playing") as update:
         result = question.play(session, lambda what, share: update(share, 1.0, what))
     show_result(result, out, screen)
@@ -126,7 +129,7 @@ def _command(kind: type[Any]) -> Any:
 
 
 def experiment(action: None) -> None:
-    """Run a study: compare models, leave units out, track, deliver."""
+    """Run a study: the paper's tables, comparisons, units left out."""
 
 
 # Each is run while the command line is parsed; what is left to call is nothing.

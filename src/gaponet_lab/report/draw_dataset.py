@@ -48,22 +48,28 @@ def draw_all(
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     with writing(out, "figures"):
-        written: list[Path] = []
-        left_out: dict[str, str] = {}
-        for i, (name, make) in enumerate(PICTURES.items()):
-            progress(i, len(PICTURES), name)
+        figures, left_out = pictures(dataset, robot, progress=progress)
+        return [file for name, fig in figures.items() for file in save(fig, out / name)], left_out
 
-            def tell(done: int, total: int, i: int = i, name: str = name) -> None:
-                progress(i + done / max(total, 1), len(PICTURES), f"{name}: replaying")
 
-            try:
-                fig = make(dataset, robot, tell)
-            except _Nothing as reason:
-                left_out[name] = str(reason)
-                continue
-            written += save(fig, out / name)
-        progress(len(PICTURES), len(PICTURES), "")
-        return written, left_out
+def pictures(
+    dataset: Dataset, robot: RobotSpec, names: tuple[str, ...] = (), progress: Progress = silent
+) -> tuple[dict[str, Figure], dict[str, str]]:
+    """The pictures of these names, all by default; and {picture: why it was left out}."""
+    figures, left_out = dict[str, Figure](), dict[str, str]()
+    names = names or tuple(PICTURES)
+    for i, name in enumerate(names):
+
+        def tell(done: int, total: int, i: int = i, name: str = name) -> None:
+            progress(i + done / max(total, 1), len(names), f"{name}: replaying")
+
+        progress(i, len(names), name)
+        try:
+            figures[name] = PICTURES[name](dataset, robot, tell)
+        except _Nothing as reason:
+            left_out[name] = str(reason)
+    progress(len(names), len(names), "")
+    return figures, left_out
 
 
 class _Nothing(Exception):  # noqa: N818

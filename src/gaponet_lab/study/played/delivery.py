@@ -73,7 +73,7 @@ class Delivery(Playing):
                 f"{data.path}: holds recordings of real robots; delivery plays a virtual unit, give its dataset"
             )
 
-    def play(self, session: Session, tell: Tell) -> Result:
+    def measured(self, session: Session, tell: Tell) -> Delivered:
         """Every goal with every payload by every method."""
         _, physics, payloads = session.cast
         tell("goals", 0.0)
@@ -81,7 +81,22 @@ class Delivery(Playing):
         each = STOPS * len(planner.arms)
         plans = planner.plans(QUICK_PLANS if session.quick else -(-self.goals // each))
         found = deliver(session.robot, physics, planner, plans, payloads, session.trained, tell, session.parts)
-        return result(session, *found, config=HOLD, goals_per_payload=len(plans) * each, hold_s=self.hold)
+        return Delivered(*found, {"goals_per_payload": len(plans) * each, "hold_s": self.hold})
+
+    def play(self, session: Session, tell: Tell) -> Result:
+        """Measure, and say what came out."""
+        found = self.measured(session, tell)
+        return result(session, found.placed, found.costs, found.example, config=HOLD, **found.facts)
+
+
+@dataclass(frozen=True)
+class Delivered:
+    """What was measured, and what it takes to repeat it."""
+
+    placed: list[Placed]
+    costs: list[Cost]
+    example: ShownHand
+    facts: dict[str, Any]
 
 
 def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example: ShownHand, **told: Any) -> Result:
@@ -125,8 +140,8 @@ def beside_paper(found: ListOf[Placed]) -> Table:
     for p in payloads(found):
         rows.append((f"{p:g} kg", *(_along("offset", a)(of(found, m, p)) for m in shown for a in range(3))))
         if p in TABLE_1:
-            printed = dict(zip(TABLE_1_METHODS, TABLE_1[p], strict=True))
-            rows.append((f"{p:g} kg, the paper", *(printed[m][a] for m in shown for a in range(3))))
+            printed = [TABLE_1[p][TABLE_1_METHODS[m]] for m in shown]
+            rows.append((f"{p:g} kg, the paper", *(offset for axes in printed for offset in axes)))
     caption = (
         "Mean |hand − goal| by axis, as Table 1 of the paper, and its numbers: a real H1-2, goals and heights that are "
         "not known here. Its third column is the simulator's output, sent as it is: raw targets here."

@@ -14,8 +14,9 @@ from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.robot import RobotSpec
 from gaponet.spread import Table
-from gaponet_lab.study.options import Options
+from gaponet_lab.study.options import MODELS, Options
 from gaponet_lab.study.played.trained import Trained, load_trained
+from gaponet_lab.study.pool import Cell
 from gaponet_lab.study.result import Result, facts
 from gaponet_lab.study.study import Study
 from gaponet_lab.whose import label
@@ -44,6 +45,14 @@ class Playing:
     def require(self, data: Dataset) -> None:
         """Refuse what cannot be played, before anything takes time."""
 
+    def cells(self, study: Study) -> list[Cell]:
+        """The trainings that are needed where no runs are given."""
+        return study.cells(MODELS)
+
+    def played(self, cells: ListOf[Cell]) -> tuple[Path, ...]:
+        """Which of them are played."""
+        return tuple(c.folder for c in cells)
+
     def play(self, session: Session, tell: Tell) -> Result:
         raise NotImplementedError
 
@@ -62,6 +71,7 @@ class Session:
     Attributes:
         data, whole: What the models were trained on; and what that was cut from, if it was.
         out: Folder of the results; what each method did is kept in its folder parts.
+        study, cells: What was trained here, where no runs were given.
     """
 
     asked: Playing
@@ -71,18 +81,20 @@ class Session:
     trained: list[Trained]
     out: Path
     quick: bool
+    study: Study | None = None
+    cells: tuple[Cell, ...] = ()
     began: float = field(default_factory=time.monotonic)
 
     @classmethod
     def of(
         cls, asked: Playing, data: Dataset, whole: Dataset, robot: RobotSpec, runs: tuple[Path, ...], out: Path,
-        quick: bool,
+        quick: bool, study: Study | None = None, cells: tuple[Cell, ...] = (),
     ) -> Session:  # fmt: skip
         """A session with the models of these runs; a rehearsal takes one seed."""
         trained = load_trained(runs, robot)
         if quick:
             trained = [t for t in trained if t.seed == trained[0].seed]
-        return cls(asked, data, whole, robot, trained, out, quick)
+        return cls(asked, data, whole, robot, trained, out, quick, study, cells)
 
     @property
     def parts(self) -> Path:

@@ -70,27 +70,41 @@ class Tracking(Playing):
     count: int = 10
     """How many motions are made for the experiment."""
 
-    def play(self, session: Session, tell: Tell) -> Result:
+    def measured(self, session: Session, tell: Tell) -> Tracked:
         """Play the motions on the unit; recordings of a real robot allow alignment alone."""
         robot, trained = session.robot, session.trained
         if not any(e.meta.virtual for e in session.data.entries):
             entries, unseen = choose([t.run for t in trained], session.data)
             sequences = session.data.sequences(entries)
             scores = align(lambda: sequences, ["recorded"] * len(entries), robot, trained, tell)
-            told: dict[str, Any] = {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen}
-            return result(session, scores, None, [], **told)
+            return Tracked(scores, None, [], {"test_motions": len({e.meta.motion for e in entries}), "unseen": unseen})
         who, physics, payloads = session.cast
         tell("motions", 0.0)
         motions = self._motions(session, max(payloads))
         scores, example = track(robot, physics, who, motions, payloads, trained, tell, session.parts)
         more: dict[str, Any] = {"unit_trained_on": True} if who in session.known_units else {}
-        return result(session, scores, example, motions, config=PLANNED, **more)
+        return Tracked(scores, example, motions, more | {"config": PLANNED})
+
+    def play(self, session: Session, tell: Tell) -> Result:
+        """Measure, and say what came out."""
+        found = self.measured(session, tell)
+        return result(session, found.scores, found.example, found.motions, **found.facts)
 
     def _motions(self, session: Session, heaviest: float) -> list[Unseen]:
         few = QUICK_MOTIONS if session.quick else None
         made = generated(session.robot, few or self.count, heaviest)
         made += from_files(session.robot, self.motions, heaviest)[:few] if self.motions else []
         return require_unseen(made, session.data, session.robot, session.trained, session.whole)
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What was measured, and what it takes to repeat it. Recordings of a real robot give no example and no motions."""
+
+    scores: list[Score]
+    example: ShownMotion | None
+    motions: list[Unseen]
+    facts: dict[str, Any]
 
 
 def result(
