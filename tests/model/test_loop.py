@@ -22,11 +22,16 @@ def corrector(infer, config, robot):
 
 
 @pytest.mark.parametrize(
-    "config", [ModelConfig(), ModelConfig(payload_input=False), ModelConfig(kind="paper", sensor_source="fixed")]
+    "config",
+    [
+        ModelConfig(),
+        ModelConfig(payload_input=False),
+        ModelConfig(kind="paper", sensor_source="fixed", real_state=True),
+    ],
 )
 def test_the_parts_of_x_touch_and_fill_it(config):
     layout = Layout(config, 3)
-    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors]
+    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors, layout.real]
     assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
 
 

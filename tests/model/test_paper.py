@@ -1,5 +1,6 @@
 """The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
 
+import copy
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -21,8 +22,11 @@ from gaponet.model.paper import released_inputs, released_network
 from gaponet.model.sensor import ProbeOracle
 from gaponet.sim.replay import replay
 from gaponet.training.budget import Budget
-from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.training.env import DeltaEnv
+from gaponet.training.ppo import Learner
 from gaponet.training.run import Trainer
+from gaponet.training.sensor_fit import fit_inputs
 
 PAPER = ModelConfig(kind="paper", num_probes=4, history=2)
 
@@ -70,9 +74,10 @@ def test_the_branch_sees_sensor_values_alone():
 def test_sensors_are_sampled_in_training_and_the_mean_otherwise():
     net, x = network(), torch.randn(1, PAPER.input_dim(2)).expand(4000, -1)
     with torch.inference_mode():
-        mean = net.sensors(x)
-        sample = net.train().sensors(x)
-        _, log_var = net.predictor(net.sensor_inputs(x))
+        z = net.sensor_inputs(x)
+        mean = net.sensors(x, z)
+        sample = net.train().sensors(x, z)
+        _, log_var = net.predictor(z)
     assert torch.equal(mean[0], mean[1])
     assert torch.allclose(sample.mean(0), mean[0], atol=0.1)
     assert torch.allclose(sample.var(0), log_var[0].exp(), rtol=0.15)
@@ -93,7 +98,8 @@ def test_the_limit_changes_no_correction_within_it():
 
 @pytest.mark.parametrize(
     "how",
-    [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2}],
+    [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2},
+     {"sensor_source": "learned"}, {"branch_observation": True, "real_state": True}],
 )  # fmt: skip
 def test_the_artifact_answers_as_the_network(tmp_path, how):
     config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
@@ -151,7 +157,7 @@ def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_h
     net = network(config)
     assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
     x = torch.randn(5, config.input_dim(2))
-    assert torch.equal(net.prepare(x)[:, :16], x[:, -16:])
+    assert torch.equal(net.prepare(x)[:, -16:], x[:, -16:])
     assert net.predictor is None
     export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net))
     model = GapModel.load(tmp_path / "run")
@@ -161,13 +167,92 @@ def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_h
     assert np.isfinite(twin.qpos).all()
 
 
+def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config).train(), torch.randn(9, config.input_dim(2))
+    start = (config.probe_limit * net.probes.tanh()).detach()
+    np.testing.assert_allclose(start, ProbeOracle.offsets_of(config, 2), atol=1e-6)
+    net.predictor.requires_grad_(False)
+    prepared = net.prepare(x)
+    assert not prepared.requires_grad
+    assert torch.equal(net.correct(prepared), net.correct(prepared))  # one sample per state
+    net.correct(prepared).sum().backward()
+    assert (net.probes.grad.abs().sum(1) > 0).all()
+
+
+def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config), torch.randn(9, config.input_dim(2))
+    z = net.sensor_inputs(x)
+    each = [net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes]
+    assert torch.allclose(net.probed(net.sensors(x, z)), torch.cat(each, dim=1), atol=1e-5)
+
+
+def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaponet.training.sensor_fit.STEPS", 200)
+    config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
+    net = network(config)
+    start, learner = net.probes.clone(), Learner(env, net, TRAINING.ppo)
+    assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
+    fitted = copy.deepcopy(net.predictor.state_dict())
+    learner.update()
+    assert not torch.isclose(net.probes, start).any()
+    assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
+
+
+def test_the_branch_sees_the_observation_where_it_is_told_to():
+    net = network(replace(PAPER, branch_observation=True))
+    x = torch.randn(5, net.config.input_dim(2))
+    seen = net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)]
+    assert torch.equal(seen, net.sensor_inputs(x))
+    assert net.branch[0].in_features == net.config.observation_dim(2) + 16
+
+
+def test_an_unknown_recorded_state_is_no_input_and_a_known_one_is():
+    net, plain = network(replace(PAPER, real_state=True)), network()
+    state = net.state_dict()
+    state["branch.0.weight"] = state["branch.0.weight"][:, 5:]
+    plain.load_state_dict(state)
+    x = torch.randn(5, PAPER.input_dim(2))
+    hidden, known = (torch.cat([x, part], dim=1) for part in (torch.zeros(5, 5), torch.ones(5, 5)))
+    assert torch.allclose(net(hidden), plain(x), atol=1e-6)
+    assert not torch.allclose(net(known), net(hidden), atol=1e-4)
+
+
+def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
+    config, robot = replace(PAPER, real_state=True), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1)
+    env.sim.qpos[:] -= 0.1
+    real = env.get_observations()["actor"][:, env.loop.layout.real]
+    shown = real[:, 4] == 1
+    assert 60 < shown.sum() < 140
+    assert not real[~shown].any()
+    assert torch.allclose(real[shown][:, :4], torch.tensor([0.1, 0.1, 0, 0]), atol=1e-6)
+    env.reset()
+    assert not torch.equal(env.get_observations()["actor"][:, -1] == 1, shown)
+
+
+def test_a_loop_shows_what_it_is_given_beside_the_observation_and_else_zeros():
+    seen = []
+    given = loop(
+        lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32), sensor_source="fixed", real_state=True
+    )
+    for width in (0, 16, 21):  # nothing, the simulator's answers, these and the recorded state
+        given.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
+        given.delta(*np.zeros((3, 2, 2)), 0.0)
+    assert np.array(seen).tolist() == [[1] * width + [0] * (21 - width) for width in (0, 16, 21)]
+
+
 def test_other_networks_refuse_the_paper_s_switches():
     for how in (
         {"delta_hold": 3},
         {"sensor_hold": 3},
         {"sensor_target": "absolute"},
         {"payload_trunk": False},
-        {"sensor_source": "fixed"},
+        {"sensor_source": "learned"},
+        {"branch_observation": True},
+        {"real_state": True},
     ):
         with pytest.raises(UsageError, match="use --model paper"):
             ModelConfig(**how)
@@ -201,18 +286,19 @@ def world(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "how",
-    [{}, {"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_source": "fixed", "sensor_hold": 3}],
-    ids=["plain", "action", "sensors", "fixed"],
-)
+    [{}, {"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_source": "fixed", "sensor_hold": 3},
+     {"sensor_source": "learned"}, {"branch_observation": True, "real_state": True}],
+    ids=["plain", "action", "sensors", "fixed", "learned", "beside"],
+)  # fmt: skip
 def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
     config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
     update = 8 * 8 * config.model.delta_hold
     run = tmp_path / "whole"
-    model = Trainer(*world, run, config, Budget(steps=6 * update)).run()
-    assert GapModel.how_trained(model.card) == "6 updates of PPO from the untrained network, no supervised start"
-    assert model.card["steps"] == 6 * update
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update)).run()
-    Trainer(*world, tmp_path / "parts", config, Budget(steps=6 * update), resume=True).run()
+    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
+    assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised start"
+    assert model.card["steps"] == 4 * update
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
     whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
     assert all(torch.equal(x, parts[name]) for name, x in whole.items())
     untrained = build_network(config.model, 2)

@@ -16,7 +16,9 @@ POSITIVE = (
     "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
     "transformer_width", "transformer_layers", "transformer_heads",
 )  # fmt: skip
-PAPER_ONLY = ("payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target")
+PAPER_ONLY = (
+    "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation", "real_state",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -43,13 +45,21 @@ class ModelConfig:
     """Largest correction, rad."""
     delta_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: control periods that a correction is held (action duration)."""
-    sensor_source: Literal["predicted", "fixed"] = "predicted"
-    """paper: who gives the sensor values. predicted: the sensor predictor. fixed: the simulator itself, stepped once
-    for each of the num_probes fixed probes; for training and gaponet eval alone, a robot has no simulator."""
+    sensor_source: Literal["predicted", "fixed", "learned"] = "predicted"
+    """paper: who gives the sensor values. predicted: the sensor predictor, for the num_probes fixed probes. fixed: the
+    simulator itself, stepped once for each fixed probe; for training and gaponet eval alone, a robot has no simulator.
+    learned: the sensor predictor, for probes that start at the fixed ones and that PPO trains."""
     sensor_hold: Annotated[int, Interval(ge=1, le=1000)] = 1
     """paper: control periods that the sensor values are held."""
     sensor_target: Literal["delta", "absolute"] = "delta"
     """paper: what a sensor value is. delta: the change of state, S(t+1) − S(t). absolute: the next state, S(t+1)."""
+    branch_observation: bool = False
+    """paper: whether the branch sees the observation, with its history, beside the sensor values. This is not the
+    paper's form. It shows what the paper's form lacks: the sensor values of the present state hold no history."""
+    real_state: bool = False
+    """paper: whether the branch sees the recorded state, relative to the simulated one, beside the sensor values.
+    Training hides it in half of the episodes. It is unknown in gaponet eval and wherever else no measured state is
+    given (DeltaLoop.extra)."""
     num_probes: Annotated[int, Interval(ge=1, le=1000)] = 20
     """m, how many targets the simulator is asked about."""
     probe_small: Annotated[float, Interval(ge=0, le=10)] = 0.05
@@ -111,10 +121,16 @@ class ModelConfig:
         """2n + 3nH (+ 1 with payload)."""
         return 2 * n + 3 * n * self.history + int(self.payload_input)
 
+    @property
+    def probe_limit(self) -> float:
+        """Largest offset of a learned probe, rad: twice that of the fixed probes."""
+        return 2 * max(self.probe_small, self.probe_large) or 1.0
+
     def sensor_dim(self, n: int) -> int:
         """m probes, each answered by n positions and n velocities."""
         return self.num_probes * 2 * n
 
     def input_dim(self, n: int) -> int:
-        """Numbers in x = [o_t | a_t], with the simulator's answers behind where it is asked."""
-        return self.observation_dim(n) + n + self.sensor_dim(n) * self.asks_simulator
+        """Numbers in x = [o_t | a_t], then the simulator's answers where it is asked, then real_state's 2n + 1."""
+        more = self.sensor_dim(n) * self.asks_simulator + (2 * n + 1) * self.real_state
+        return self.observation_dim(n) + n + more

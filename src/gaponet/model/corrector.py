@@ -30,7 +30,7 @@ class DeltaCorrector:
             from gaponet.sim.batch import Condition
 
             oracle = ProbeOracle(self.robot, self.config, [Condition.of(s, self.robot) for s in start])
-            self.loop.probe = lambda: oracle(*self.now).reshape(len(start), -1)
+            self.loop.extra = lambda: oracle(*self.now).reshape(len(start), -1)
 
     def correct(self, t: int, target: Array, qpos: Array, qvel: Array) -> Array:
         """Corrected targets, (k, n_all) rad."""

@@ -25,6 +25,8 @@ class DeltaLoop:
     Attributes:
         x: What the network is given, (num_envs, dim) float32; `observe` brings it up to date.
         applied: ctrl + Δa of the last period, within the joint limits, (num_envs, n) rad: send this.
+        extra: Returns what x holds behind [o_t | a_t] now, (num_envs, k): the simulator's answers, then real_state's
+            2n + 1 numbers (model/observation.py). What it leaves out stays zero; so does all of it where extra is None.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class DeltaLoop:
         self.applied: Any = zeros_like(self.x, num_envs, n)
         self.holds, self.age = config.holds, zeros_like(self.x, num_envs)  # control periods since the start
         self.held: Any = zeros_like(self.x, num_envs, n)  # the correction that is held
-        self.probe: Callable[[], Any] | None = None  # the simulator's answers now, (num_envs, 2nm), where x has them
+        self.extra: Callable[[], Any] | None = None
         self.fresh = np.ones(num_envs, bool)  # robots without a past
         self.any_fresh = True
 
@@ -108,8 +110,9 @@ class DeltaLoop:
             self.history.write(due)
         if self._most is not None:
             self._mass[...] = payload_mass / self._most
-        if self.probe is not None and (due := self._due(self.config.sensor_hold)).any():
-            self.x[due, self.layout.sensors] = self.probe()[due]
+        if self.extra is not None and (due := self._due(self.config.sensor_hold)).any():
+            extra, start = self.extra(), self.layout.query.stop
+            self.x[due, start : start + extra.shape[1]] = extra[due]
         return self.x
 
     def delta(self, qpos: Any, qvel: Any, ctrl: Any, payload_mass: Any) -> Any:

@@ -3,7 +3,8 @@
 o_t = [ q_t | q̇_t | h_{t-1} | … | h_{t-H} | (P / P_max) ],  h_s = [ q_s | q̇_s | u_s ],  u_s the target applied over
 [s, s+1), correction included. n operated joints; 2n + 3nH (+1) numbers. With a stride k, the frames are t-1, t-1-k, ….
 
-x = [ o_t | a_t ] is what a network is given; with fixed probes (model/paper.py) [ o_t | a_t | S_t ].
+x = [ o_t | a_t ] is what a network is given. The paper's network (model/paper.py) can have more: with fixed probes S_t,
+then with real_state [ q_real − q | q̇_real − q̇ | known ], known 1 or, with all else zero, 0.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ class Layout:
     def __init__(self, config: ModelConfig, n: int) -> None:
         self.n, self.history = n, config.history
         o = config.observation_dim(n)
-        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, config.input_dim(n) - o - n)
+        answers, real = config.sensor_dim(n) * config.asks_simulator, (2 * n + 1) * config.real_state
+        sizes = (n, n, 3 * n * config.history, int(config.payload_input), n, answers, real)
         places = (slice(a, b) for a, b in pairwise(accumulate(sizes, initial=0)))
-        self.q, self.v, self.past, self.payload, self.action, self.sensors = places
+        self.q, self.v, self.past, self.payload, self.action, self.sensors, self.real = places
         self.state, self.observation, self.query = slice(0, 2 * n), slice(0, o), slice(0, o + n)
         self.dim = config.input_dim(n)
 

@@ -12,9 +12,16 @@ numbers for n = 10, one more with the payload P. The joint index J is the place 
 joints.
 
 The paper also names the recorded state, Q_real and V_real, in (1). The critic of PPO sees both (training/env.py). The
-predictor does not: the simulator's answers do not depend on them.
+predictor does not: the simulator's answers do not depend on them. With `real_state` the branch sees them beside S.
 
-With `sensor_source = "fixed"` the simulator itself gives S, without a predictor: what a perfect one would be worth.
+The probe targets are q + e_k, k = 1 … m. `sensor_source` is one of:
+
+    predicted   e_k are fixed; one predictor gives the answers to all
+    fixed       e_k are fixed; the simulator itself gives S: what a perfect predictor would be worth
+    learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one e_k beside the state
+                and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass through it.
+
+With `branch_observation` the branch also sees the observation, and thus its history. The literal form lacks this.
 
 S is sampled in training and is the mean in evaluation and export. Δ_max is a safety limit: exact clipping, in
 evaluation and export; training reports the share of corrections at the limit.
@@ -31,8 +38,10 @@ from torch.nn.functional import linear
 from gaponet.arrays import Array
 from gaponet.model.config import ModelConfig
 from gaponet.model.layers import DeltaNet, Standardise, dense
+from gaponet.model.sensor import ProbeOracle
 
 PREDICTOR, BRANCH, TRUNK = (128, 128), (256, 256, 256), (128, 128, 128)  # widths of hidden layers
+REAL_UNITS = (0.05, 0.3)  # rad, rad/s: differences of recorded and simulated state that count as 1
 RELEASED_EPSILON = 0.01  # of the published network's normaliser, (x − mean) / (std + ε)
 
 
@@ -46,7 +55,12 @@ class SensorPredictor(nn.Module):
 
     def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
         """(B, inputs) → mean and log-variance, (B, sensors) each."""
-        mean, log_var = self.net(observed).chunk(2, dim=1)
+        return self.distribution(self.net(observed))
+
+    @staticmethod
+    def distribution(outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs of the net, (…, 2 sensors) → mean and log-variance, (…, sensors) each."""
+        mean, log_var = outputs.chunk(2, dim=-1)
         return mean, log_var.clamp(-10.0, 4.0)
 
     def mean(self, observed: Tensor) -> Tensor:
@@ -60,6 +74,9 @@ class PaperNet(DeltaNet):
     """Equations (1) to (4). Inputs are standardised and otherwise as they are: absolute positions and targets.
 
     `features` (relative to q, standardised) serve the critic of PPO alone.
+
+    Attributes:
+        probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
     """
 
     def __init__(self, config: ModelConfig, n: int) -> None:
@@ -70,11 +87,18 @@ class PaperNet(DeltaNet):
         self.query = slice(at.payload.start if config.payload_trunk else at.action.start, at.action.stop)
         asked = self.query.stop - self.query.start
         self.observed, self.asked = Standardise(self.seen.stop), Standardise(asked)
+        self.probes: nn.Parameter | None = None
         if config.asks_simulator:
             self.answers = Standardise(sensors)
+        elif config.sensor_source == "learned":
+            start = torch.from_numpy(ProbeOracle.offsets_of(config, n)).float() / config.probe_limit
+            self.probes = nn.Parameter(start.atanh())
+            self.predictor = SensorPredictor(self.seen.stop + n, PREDICTOR, 2 * n)
         else:
             self.predictor = SensorPredictor(self.seen.stop, PREDICTOR, sensors)
-        self.branch = nn.Sequential(*dense(sensors, BRANCH, outputs), nn.ELU())
+        self.real_units = [*(unit for unit in REAL_UNITS for _ in range(n)), 1.0]
+        self.beside = self.seen.stop * config.branch_observation + len(self.real_units) * config.real_state
+        self.branch = nn.Sequential(*dense(self.beside + sensors, BRANCH, outputs), nn.ELU())
         self.trunk = dense(asked, TRUNK, outputs, zero=True)
 
     def fit_inputs(self, x: Tensor) -> None:
@@ -88,24 +112,47 @@ class PaperNet(DeltaNet):
         z = self.observed(x[:, self.seen])
         return z + self.features.noise * torch.randn_like(z) if self.features.noise else z
 
-    def sensors(self, x: Tensor) -> Tensor:
-        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean; or the simulator's answers."""
+    def sensors(self, x: Tensor, z: Tensor) -> Tensor:
+        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean; or the simulator's answers.
+
+        Probes that are learned change after `prepare`. So this is then the input of `probed`: z = sensor_inputs(x) and,
+        in training, the noise of the sample.
+        """
         if self.config.asks_simulator:
             return self.answers(x[:, self.features.layout.sensors])
-        observed = self.sensor_inputs(x)
         if not self.training:
-            return self.predictor.mean(observed)
-        mean, log_var = self.predictor(observed)
-        return mean + torch.randn_like(mean) * (0.5 * log_var).exp()
+            return z if self.probes is not None else self.predictor.mean(z)
+        noise = torch.randn(len(z), self.config.sensor_dim(self.n), device=z.device)
+        if self.probes is not None:
+            return torch.cat([z, noise], dim=1)
+        mean, log_var = self.predictor(z)
+        return mean + noise * (0.5 * log_var).exp()
+
+    def probed(self, given: Tensor) -> Tensor:
+        """What `sensors` returns for learned probes → S, (B, 2nm)."""
+        assert self.probes is not None
+        seen, first = self.seen.stop, self.predictor.net[0]
+        of_state, of_probe = first.weight.split([seen, self.n], dim=1)
+        state, probes = linear(given[:, :seen], of_state), linear(self.probes.tanh(), of_probe, first.bias)
+        mean, log_var = SensorPredictor.distribution(self.predictor.net[1:](state.unsqueeze(1) + probes))  # (B, m, 2n)
+        if not self.training:
+            return mean.flatten(1)
+        return torch.addcmul(mean.flatten(1), given[:, seen:], (0.5 * log_var).exp().flatten(1))
 
     def prepare(self, x: Tensor) -> Tensor:
-        """[o_t | a_t] → [S | query]."""
-        return torch.cat([self.sensors(x), self.asked(x[:, self.query])], dim=1)
+        """x → [query | what the branch sees beside S | S]."""
+        z, config = self.sensor_inputs(x), self.config
+        beside = [z] if config.branch_observation else []
+        beside += [x[:, self.features.layout.real] / x.new_tensor(self.real_units)] if config.real_state else []
+        return torch.cat([self.asked(x[:, self.query]), *beside, self.sensors(x, z)], dim=1)
 
     def correct(self, prepared: Tensor) -> Tensor:
-        shape, sensors = (-1, self.config.num_basis, self.n), self.config.sensor_dim(self.n)
-        b = self.branch(prepared[:, :sensors]).reshape(shape)  # (2)
-        y = self.trunk(prepared[:, sensors:]).reshape(shape)  # (3)
+        shape, asked = (-1, self.config.num_basis, self.n), self.query.stop - self.query.start
+        seen = prepared[:, asked:]
+        if self.probes is not None:
+            seen = torch.cat([seen[:, : self.beside], self.probed(seen[:, self.beside :])], dim=1)
+        b = self.branch(seen).reshape(shape)  # (2)
+        y = self.trunk(prepared[:, :asked]).reshape(shape)  # (3)
         return self.bounded((b * y).sum(1))  # (4)
 
 

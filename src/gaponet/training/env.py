@@ -30,7 +30,8 @@ class DeltaEnv:
     """num_envs simulations, each following one recording from a random frame on.
 
     Observation groups: "actor" = x = [o_t | a_t]; "critic" = the recorded state now, recorded
-    positions and commands to come, payload, rate (training only: the recorded state never reaches the actor). An
+    positions and commands to come, payload, rate (training only). The recorded state reaches the actor with
+    model.real_state alone, in a random half of the episodes (`shown`). An
     environment keeps its payload, rate and gains for life, in proportion to the frames recorded under them. A motion's
     end is a time-out, not a failure.
     """
@@ -68,8 +69,9 @@ class DeltaEnv:
         if config.asks_simulator:
             if device != "cpu":
                 raise UsageError(f"--model.sensor-source fixed asks C MuJoCo: use --device cpu, not {device}")
-            oracle = ProbeOracle(robot, config, conditions, nthread, self.locked)
-            self.loop.probe = lambda: oracle(self.sim.qpos, self.sim.qvel).reshape(num_envs, -1)
+            self.oracle = ProbeOracle(robot, config, conditions, nthread, self.locked)
+        if config.asks_simulator or config.real_state:
+            self.loop.extra = self._extra
         shortest = min(c[2] for c in self.conditions)
         # Periods whose command a late servo has not met yet.
         under_way = 1 + int(np.ceil(self.sim.robot.delay.max() / shortest))
@@ -136,6 +138,7 @@ class DeltaEnv:
         self.here, self.until = (copy_of(place(x)) for x in (self.row, self.last))
         self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
+        self.shown = zeros_like(self.track, num, 1)  # 1 where the actor sees the recorded state
 
     def reset(self, ids: Any = slice(None)) -> None:
         """Put environments at uniformly drawn recorded frames, with the frames before as history; ids on the host."""
@@ -149,6 +152,8 @@ class DeltaEnv:
         t, last, before = (self.sim.array(x) for x in (t, last, before))
         ids = ids if isinstance(ids, slice) else self.sim.array(ids)
         self.here[ids], self.until[ids], self.now[ids] = t, last, self.track[t]
+        if self.config.real_state:
+            self.shown[ids] = self.sim.array((self.rng.random((len(group), 1)) < 0.5).astype(np.float32))
         self.sim.reset(ids, self.qpos[t], self.qvel[t], past=self.ctrl[before])
         before = before[:, : self.loop.history.depth]
         self.loop.begin(ids, *(x[before][..., self.at] for x in (self.qpos, self.qvel, self.ctrl)))
@@ -165,6 +170,16 @@ class DeltaEnv:
                 (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
         critic = _single(library(ahead).concatenate(seen, 1))
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
+
+    def _extra(self) -> Any:
+        """What x holds behind [o_t | a_t] (model/observation.py), (num_envs, …)."""
+        sim, join, parts = self.sim, library(self.now).concatenate, []
+        if self.config.asks_simulator:
+            parts.append(self.oracle(sim.qpos, sim.qvel).reshape(self.num_envs, -1))
+        if self.config.real_state:
+            state = join([sim.qpos[:, self.at], sim.qvel[:, self.at]], 1)
+            parts.append(join([self.now[:, : 2 * self.num_actions] - state, self.shown], 1) * self.shown)
+        return join(parts, 1)
 
     def step(self, delta: Any) -> tuple[Any, Any]:
         """Correct targets for delta_hold control periods, and compare each with the recording one row on.
@@ -230,6 +245,7 @@ class DeltaEnv:
     def state(self) -> dict[str, Any]:
         """Where every simulation stands in its motion, what its servos have still under way, and what comes next."""
         arrays = {name: getattr(self, name) for name in ROWS} | {"frames": self.loop.history.frames} | self.sim.state()
+        arrays |= {"shown": self.shown} if self.config.real_state else {}
         arrays |= {"age": self.loop.age, "x": self.loop.x} if self.loop.holds else {}
         return {
             "arrays": {name: torch.as_tensor(x).cpu().clone() for name, x in arrays.items()},
@@ -247,6 +263,8 @@ class DeltaEnv:
         self.loop.history.frames[:] = like(self.loop.history.frames, arrays["frames"])
         for name in ("age", "x") if self.loop.holds else ():
             getattr(self.loop, name)[:] = like(getattr(self.loop, name), arrays[name])
+        if self.config.real_state:
+            self.shown[:] = like(self.shown, arrays["shown"])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]
         self.rng_state = state["rng"]

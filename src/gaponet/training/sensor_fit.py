@@ -102,7 +102,7 @@ class _Answers:
 
     Attributes:
         seen: What the predictor is given, (k, …).
-        answers: (k, 2nm).
+        answers: (k, 2nm); where probes are learned, (k, 2n).
     """
 
     seen: Tensor
@@ -129,6 +129,8 @@ def _sensor_labels(
     "Anywhere" moves the whole frame, history and action included, to a random posture within the joint limits: gravity
     and inertia there are asked of the simulator, since no recorded motion needs to have been there.
 
+    Where probes are learned, each state is asked at random ones, and each of these is a row of the predictor's inputs.
+
     Args:
         net: Its config says the probes.
         x: What the network was given at those states, (k, dim).
@@ -147,10 +149,14 @@ def _sensor_labels(
     shift = rng.uniform(low, high, (len(far), n)) - q[np.ix_(far, op)]
     q[np.ix_(far, op)] += shift
     x[far] += at.shifted(shift)
-    answers = oracle(q, v)
     with torch.inference_mode():
         seen = net.sensor_inputs(torch.from_numpy(x.astype(np.float32)))
-    return _Answers(seen.clone(), torch.from_numpy(answers.reshape(len(q), -1)))
+    offsets, m = None, net.config.num_probes
+    if net.config.sensor_source == "learned":
+        probes = rng.uniform(-1, 1, (len(q), m, n)) * (rng.random((len(q), m, n)) < rng.random((len(q), m, 1)))
+        offsets = net.config.probe_limit * probes
+        seen = torch.cat([seen.repeat_interleave(m, 0), torch.from_numpy(probes).float().flatten(0, 1)], dim=1)
+    return _Answers(seen.clone(), torch.from_numpy(oracle(q, v, offsets).reshape(len(seen), -1)))
 
 
 def _fit_predictor(net: DeltaNet, asked: _Answers, joints: tuple[str, ...], seed: int, again: bool) -> Report:

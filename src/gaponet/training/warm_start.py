@@ -65,7 +65,7 @@ class WarmStart:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool_x: list[torch.Tensor] = []
         self.pool_y: list[torch.Tensor] = []
-        self.trained = [p for name, p in net.named_parameters() if not name.startswith("predictor")]
+        self.trained = [p for name, p in net.named_parameters() if not name.startswith(("predictor", "probes"))]
         self.optimiser = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
         self.done = 0
         self.rounds: list[dict[str, Any]] = []  # what the roll-outs of each round so far followed from

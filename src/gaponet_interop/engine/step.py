@@ -71,10 +71,12 @@ def delta_step(model: GapModel, run: Path) -> DeltaStep:
     """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz.
 
     Raises:
-        ModelError: The model holds corrections or sensors.
+        ModelError: The model holds corrections or sensors, or has an input for the recorded state.
     """
     if model.config.holds:
         raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
+    if model.config.real_state:
+        raise ModelError(f"{model.path}: real_state is an input that torch exports lack; train without")
     return DeltaStep(torch_network(model, run), model)
 
 

@@ -13,7 +13,9 @@ from arm import write_arm
 from runs import random_run
 
 from gaponet.cli.main import main
+from gaponet.errors import ModelError
 from gaponet.identity import lines
+from gaponet.model.config import ModelConfig
 from gaponet.robot import LAW, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
@@ -363,3 +365,10 @@ def test_a_network_without_a_fused_form_ships_too(tmp_path):
     model = random_run(tmp_path / "run", robot, kind="transformer")
     assert not (tmp_path / "run/model/weights.npz").exists()
     assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
+
+
+@pytest.mark.parametrize("how", [{"delta_hold": 2}, {"real_state": True}])
+def test_a_model_with_inputs_or_memory_that_a_program_lacks_is_refused(tmp_path, how):
+    model = SimpleNamespace(config=ModelConfig(kind="paper", **how), path=tmp_path)
+    with pytest.raises(ModelError, match="train without"):
+        delta_step(model, tmp_path)
