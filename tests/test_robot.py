@@ -119,6 +119,14 @@ def test_identified_values_survive_a_folder_and_the_nominal_robot_stays_known(tm
     assert load_robot(tmp_path / "again").nominal is None
 
 
+def test_scaled_gains_survive_a_folder_and_are_not_scaled_twice(tmp_path):
+    fitted = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 12.5}}).with_gain_scale(10.0)
+    save_robot(fitted, tmp_path / "firm")
+    back = load_robot(tmp_path / "firm").with_gain_scale(10.0)
+    assert model_hash(back) == model_hash(fitted)
+    assert (back.kp.tolist(), back.nominal.kp.tolist()) == ([200.0, 125.0], [200.0, 200.0])
+
+
 def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
     with pytest.raises(RobotError, match=r"identified\.wing"):
         write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")

@@ -72,6 +72,7 @@ class RobotSpec:
         servos: Type of each joint's servo, (n); None where robot.toml does not say.
         tips, table: What may touch a table, and the table; with one nothing else touches.
         carries_payload: Whether the simulator has the payload that the robot has.
+        gain_scale: kp and kd of operated joints over those of [[joint]]; they are in kp and kd.
         contacts: Whether links touch as the MJCF says. Off, nothing touches but tips a table: links welded to the world
             collide for ever with their neighbours, which shows as a gap.
         nominal: The robot before identification, where parameters were identified (sim/identify.py).
@@ -112,6 +113,7 @@ class RobotSpec:
     table: Table | None = None
     contacts: bool = False
     carries_payload: bool = True
+    gain_scale: float = 1.0
     nominal: RobotSpec | None = None
 
     def __post_init__(self) -> None:
@@ -199,6 +201,13 @@ class RobotSpec:
         nominal = dataclasses.replace(nominal, kp=known[0], kd=known[1])
         own = self.nominal and nominal
         return dataclasses.replace(self, kp=self.kp * stiffer, kd=known[1] * found, nominal=own)
+
+    def with_gain_scale(self, scale: float) -> RobotSpec:
+        """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""
+        ratio = np.ones(len(self.joint_names))
+        ratio[self.operated_index] = scale / self.gain_scale
+        nominal = self.nominal and self.nominal.with_gain_scale(scale)
+        return dataclasses.replace(self, kp=self.kp * ratio, kd=self.kd * ratio, gain_scale=scale, nominal=nominal)
 
     @functools.cached_property
     def qpos_range(self) -> Array:
@@ -352,7 +361,7 @@ def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
         table=table.table,
         contacts=table.contacts,
         carries_payload=table.carries_payload,
-    )
+    ).with_gain_scale(table.gain_scale)
     found = table.identified_table
     if (robot.table or found) and not robot.tips:
         raise RobotError("[table] is touched by nothing; name what may touch it in a [[tip]] with body, pos and radius")

@@ -39,8 +39,9 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
         raise UsageError(f"{folder}: is the robot's own folder; choose another")
     text = (robot.folder / "robot.toml").read_text(encoding="utf-8").split(IDENTIFIED_MARK)[0]
     text = IDENTIFIED_TABLES.sub("", re.sub(r"(?m)^mjcf\s*=.*\n", "", text)).rstrip() + "\n"
-    if not robot.carries_payload:
-        text = "carries_payload = false\n" + re.sub(r"(?m)^carries_payload\s*=.*\n", "", text)
+    for name, usual in (("carries_payload", True), ("gain_scale", 1.0)):
+        value, text = getattr(robot, name), re.sub(rf"(?m)^{name}\s*=.*\n", "", text)
+        text = text if value == usual else f"{name} = {str(value).lower()}\n{text}"
     if robot.nominal is not None:
         text += f"\n{IDENTIFIED_MARK}\n" + "".join(_servo(robot, joint) for joint in robot.operated)
         if robot.table is not None and robot.table != robot.nominal.table:

@@ -119,6 +119,7 @@ class RobotTable:
     table: Table | None = None
     contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
     carries_payload: bool = True  # false: the robot's payload is not in the simulator
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # kp and kd of operated joints over those of [[joint]]
     identified: dict[str, _Servo] = field(default_factory=dict)
     identified_table: Table | None = None
     identified_mount: dict[str, _Mount] = field(default_factory=dict)

@@ -29,7 +29,7 @@ def collect(
     Args:
         out: Dataset folder.
         robot: A robot of the package, or a folder with robot.toml.
-        fleet: Virtual units: hard, easy, shifted, unnamed, or a .toml file.
+        fleet: Virtual units: hard, easy, shifted, unnamed, firm (hard at nine times the gains), or a .toml file.
         recipe: demo (under a minute), small (about two), simlifter (30 h: a quarter of an hour), arm (any
             robot), or a .toml file.
         payloads: kg per hand instead of the recipe's.

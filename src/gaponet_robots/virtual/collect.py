@@ -63,7 +63,7 @@ def collect(
     twins: bool = True,
     executor: str | Executor = LOCAL,
 ) -> Collected:
-    """Record every take of a recipe that the dataset at `out` does not hold yet.
+    """Record every take of a recipe that the dataset at `out` does not hold yet, with the gains that the fleet sets.
 
     Args:
         seed: Seed of motions and of everything random in a take.
@@ -78,6 +78,7 @@ def collect(
         FolderError: `out` is something else, or another process writes into it.
     """
     start = time.monotonic()
+    robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)  # options may have changed it
     if not 0 <= nproc <= MOST_WORKERS or not 0 <= seed < 2**63:
         raise UsageError(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, NotRequired
+from typing import Annotated, Literal, NotRequired
 
 import numpy as np
 from annotated_types import Interval, Len
@@ -60,15 +60,25 @@ class FleetTable(TypedDict):
     robot: NotRequired[dict[str, Annotated[dict[Name, UnitTable], Len(1, 1000)]]]
 
 
+class Redriven(TypedDict):
+    """A fleet file of the same units as another fleet's, driven with other gains."""
+
+    like: Literal["easy", "hard", "shifted", "unnamed"]
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)]
+    name: NotRequired[Name]
+    virtual: NotRequired[bool]
+
+
 @dataclass(frozen=True)
 class Fleet:
-    """Virtual units of one robot type, by id."""
+    """Virtual units of one robot type, by id; gain_scale: what they are driven with, None for the robot's own."""
 
     name: str
     robot: str
     seed: int
     distributions: tuple[Distribution, ...]
     units: dict[str, Physics]
+    gain_scale: float | None = None
 
     def unit(self, unit_id: str) -> Physics:
         """One unit's hidden physics."""
@@ -93,6 +103,10 @@ def load_fleet(name_or_path: str | Path, robot: RobotSpec) -> Fleet:
         UsageError: No such fleet, or the file is not one; with the file and what is wrong.
     """
     path, loaded = load_toml("fleet", FLEETS, name_or_path)
+    if "like" in loaded:
+        file = validated(Redriven, loaded, path, UsageError)
+        name = file.get("name", path.stem)
+        return replace(load_fleet(FLEETS / f"{file['like']}.toml", robot), name=name, gain_scale=file["gain_scale"])
     table = validated(FleetTable, loaded, path, UsageError)
     seed, laws = table["seed"], known(table["distribution"], path)
     saved = table.get("robot", {}).get(robot.name)

@@ -179,6 +179,14 @@ def _wait_for_orphans(session):
     pytest.fail("workers of a killed collect are still alive after 300 s")
 
 
+def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, fleet, tmp_path):
+    firm, less = replace(fleet, gain_scale=3.0), replace(RECIPE, motions=("steps-elbow",), rates=(50.0,), repetitions=1)
+    collect(spec, firm, less, tmp_path, seed=5, nproc=1)
+    kept = load_robot(tmp_path / "robot")
+    assert kept.kp.tolist() == list(Dataset(tmp_path).entries[0].meta.kp) == [60.0, 60.0]
+    assert collect(kept, firm, less, tmp_path, seed=5, nproc=1).written == 0
+
+
 def test_what_something_else_collected_is_not_mixed(whole, spec):
     out, _ = whole
     with pytest.raises(DatasetError, match=r"was collected with seed 5, not 6 \(collect.json\); choose another folder"):

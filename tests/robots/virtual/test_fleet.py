@@ -6,9 +6,11 @@ import pytest
 
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
+from gaponet_lab.study.played.goals import Planner
 from gaponet_robots.virtual.draw import MARK
 from gaponet_robots.virtual.fleet import FLEETS, draw, load_fleet, to_toml
 from gaponet_robots.virtual.physics import EFFECTS, Physics, neutral
+from gaponet_robots.virtual.unit import VirtualRobot
 
 NAMES = ("easy", "hard", "shifted")
 
@@ -70,6 +72,19 @@ def test_units_of_the_hard_fleet_differ_as_motors_and_friction_do():
     assert 0.3 < spread(dry) < 0.5
 
 
+def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
+    robot = load_robot("h1_2")
+    fleet, planner = load_fleet("firm", robot), Planner(robot, 3.0, 0)
+    assert fleet.digest() == load_fleet("hard", robot).digest()
+    plans = planner.plans(3)
+    held = np.repeat([plan.ctrl[-1] for plan in plans], len(fleet.units), axis=0)
+    units = [*fleet.units.values()] * len(plans)
+    robots = VirtualRobot(robot.with_gain_scale(fleet.gain_scale), units, [(3.0, "both")] * len(units))
+    robots.reset(held, list(range(len(units))))
+    sag = (planner.places(held) - planner.places(robots.true_qpos()))[..., 2]
+    assert 0.015 < sag.mean() < 0.025
+
+
 def test_a_robot_that_the_file_does_not_hold_is_drawn_from_the_same_distributions(arm):
     a, b = load_fleet("easy", arm), load_fleet("easy", arm)
     assert a.digest() == b.digest()
@@ -99,7 +114,8 @@ def test_a_fleet_can_be_written_and_read(arm, tmp_path):
 
 def test_errors_say_what_there_is(arm, tmp_path):
     with pytest.raises(
-        UsageError, match=r"no fleet 'lab': in the package are easy, hard, shifted, unnamed; or give a \.toml file"
+        UsageError,
+        match=r"no fleet 'lab': in the package are easy, firm, hard, shifted, unnamed; or give a \.toml file",
     ):
         load_fleet("lab", arm)
     with pytest.raises(UsageError, match="fleet 'easy' has no unit 'robot-7'; it has virtual-1, virtual-2"):

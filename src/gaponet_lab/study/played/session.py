@@ -12,6 +12,7 @@ from typing import Any
 
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
+from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.spread import Table
 from gaponet_lab.study.options import MODELS, Options
@@ -38,7 +39,7 @@ class Playing:
     unit: str = ""
     """Unit of the fleet that plays; by default one that no model was trained on."""
     fleet: str = ""
-    """Virtual units: hard, easy, shifted, unnamed, or a .toml file; by default the fleet that was recorded."""
+    """Virtual units: hard, easy, shifted, unnamed, firm, or a .toml file; by default the fleet that was recorded."""
     payloads: tuple[float, ...] = ()
     """kg in each hand; default those trained on, with --quick the lightest and the heaviest of them."""
 
@@ -115,6 +116,11 @@ class Session:
     def cast(self) -> tuple[str, Physics, tuple[float, ...]]:
         """Name and physics of the unit, and payloads, kg."""
         fleet, asked = load_fleet(self.fleet, self.robot), self.asked
+        if fleet.gain_scale not in (None, self.robot.gain_scale):
+            raise UsageError(
+                f"fleet '{fleet.name}' is driven with gain_scale {fleet.gain_scale:g}, the robot of the dataset with "
+                f"{self.robot.gain_scale:g}: train on a dataset of gaponet collect --fleet {self.fleet}"
+            )
         who = asked.unit or next((u for u in reversed(fleet.units) if u not in self.known_units), list(fleet.units)[-1])
         seen = sorted({float(p) for t in self.trained for p in t.model.card["payload_seen"]})
         return who, fleet.unit(who), asked.payloads or tuple({seen[0]: 0, seen[-1]: 0} if self.quick else seen)

@@ -5,9 +5,11 @@ import pytest
 from arm import write_arm
 from weak_arm import session, trained, weak_unit
 
+from gaponet.errors import UsageError
 from gaponet_lab.study.played.deliver import Placed, deliver
-from gaponet_lab.study.played.delivery import offsets, result, sentences
+from gaponet_lab.study.played.delivery import Delivery, offsets, result, sentences
 from gaponet_lab.study.played.goals import Planner
+from gaponet_lab.study.played.session import Session
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +31,12 @@ def test_a_loaded_hand_comes_nearer_to_its_goal(delivered):
     }
     assert off["gaponet"] < 0.2 * off["raw"]
     assert off["mlp"] < off["raw"]
+
+
+def test_a_fleet_driven_with_other_gains_than_the_dataset_is_refused(robot):
+    session = Session(Delivery(fleet="firm"), None, None, robot, [], None, False)
+    with pytest.raises(UsageError, match=r"fleet 'firm' is driven with gain_scale 9, the robot of the dataset with 1:"):
+        session.cast  # noqa: B018
 
 
 def test_without_zero_errors_encoders_tell_the_truth(delivered):
