@@ -255,7 +255,7 @@ def test_other_networks_refuse_the_paper_s_switches():
         {"real_state": True},
     ):
         with pytest.raises(UsageError, match="use --model paper"):
-            ModelConfig(**how)
+            build_network(ModelConfig(**how), 2)
     with pytest.raises(UsageError, match="hold one of them"):
         replace(PAPER, delta_hold=3, sensor_hold=3)
 

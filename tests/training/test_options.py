@@ -34,7 +34,13 @@ def test_a_gpu_has_simulations_of_its_own_number_unless_told():
 
 
 @pytest.mark.parametrize(
-    "config", [TrainConfig(), CHANGED, TrainConfig().paper_recipe(), replace(TrainConfig(), seed=9).fast()]
+    "config",
+    [
+        TrainConfig(),
+        CHANGED,
+        TrainConfig(ModelConfig(kind="paper", delta_hold=3)).paper_recipe(),
+        replace(TrainConfig(), seed=9).fast(),
+    ],
 )
 def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
     heard = []

@@ -96,9 +96,6 @@ class ModelConfig:
             raise UsageError(
                 "mlp_match or shared_mlp without mlp_hidden: give the proportions of the hidden layers, e.g. 4 2 1"
             )
-        for name in PAPER_ONLY if self.kind != "paper" else ():
-            if (value := getattr(self, name)) != getattr(ModelConfig, name):
-                raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
         if self.delta_hold > 1 and self.sensor_hold > 1:
             raise UsageError(f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them")
         if self.transformer_width % self.transformer_heads:
@@ -106,6 +103,12 @@ class ModelConfig:
                 f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
                 "make it a multiple of transformer_heads"
             )
+
+    def require_kind(self) -> None:
+        """Refuse switches of the paper's network in another. The command line sets the kind after the switches."""
+        for name in PAPER_ONLY if self.kind != "paper" else ():
+            if (value := getattr(self, name)) != getattr(ModelConfig, name):
+                raise UsageError(f"{name} {value}: model {self.kind} has no such switch; use --model paper")
 
     @property
     def holds(self) -> bool:

@@ -95,6 +95,7 @@ class SharedMLP(OperatorNet):
 
 def build_network(config: ModelConfig, n: int) -> DeltaNet:
     """The network a config describes, for n operated joints."""
+    config.require_kind()
     if config.kind == "gaponet":
         return OperatorNet(config, n)
     if config.kind == "paper":
