@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from gaponet.model.export import drawn_states, export
 from gaponet.model.loop import DeltaLoop
 from gaponet.model.paper import released_inputs, released_network
 from gaponet.model.sensor import ProbeOracle
+from gaponet.robot import load_robot
 from gaponet.sim.replay import replay
 from gaponet.training.budget import Budget
 from gaponet.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
@@ -59,6 +61,18 @@ def test_the_published_weights_give_the_published_outputs(paper_network):
         delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
     assert np.abs(delta - pairs["delta"]).max() < 1e-6
     assert np.abs(pairs["delta"]).max() > 0.1
+
+
+def test_the_published_predictor_answers_the_probes_in_one_order_of_joints(paper_network, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    import released_network as benchmark
+
+    monkeypatch.setattr(benchmark, "STATES", 20)
+    net, robot = released_network(dict(np.load(paper_network / "weights.npz"))), load_robot("h1_2")
+    order, _ = benchmark.inferred_order(net, *benchmark.random_states(net, robot, 0.02))
+    left, right = (robot.operated[5 * arm :][:5] for arm in (0, 1))
+    arms = [arm[i] for arm in (left, right) for i in (0, 2, 1, 3)]  # pitch, yaw, roll, elbow
+    assert [robot.operated[j] for j in order] == [*arms, left[4], right[4]]
 
 
 def test_the_branch_sees_sensor_values_alone():
