@@ -15,7 +15,6 @@ from gaponet.errors import UsageError
 from gaponet.methods import title
 from gaponet.robot import RobotSpec
 from gaponet.spread import Spread, Table
-from gaponet_lab.report.draw_dataset import pictures
 from gaponet_lab.study.found import Found, spread
 from gaponet_lab.study.options import MODELS
 from gaponet_lab.study.paper import CARD, CLAIMS, PAYLOADS, TABLE_1, TABLE_1_METHODS, TABLE_2, Printed
@@ -85,6 +84,8 @@ class Paper(Playing):
 
     def play(self, session: Session, tell: Tell) -> Result:
         """Everything, in the paper's order."""
+        from gaponet_lab.report.draw_dataset import pictures  # needs the extra "report"
+
         assert session.study is not None
         study, data, robot = session.study, session.data, session.robot
         figures, _ = pictures(data, robot, FIGURE_2)
