@@ -102,8 +102,9 @@ class PPOConfig:
 
 # The paper's training: PPO from an untrained network. Step size and exploration suit a start from nothing.
 PAPER_PPO = PPOConfig(
-    learning_rate=3e-4, desired_kl=0.01, critic_warmup=4, explained=0.2, std=0.02, noise_share=1.0, refit_sensors=50
-)
+    learning_rate=3e-4, desired_kl=0.01, critic_warmup=4, explained=0.2, std=0.02, std_half_life=20.0, noise_share=1.0,
+    refit_sensors=50,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
