@@ -113,7 +113,7 @@ def test_the_limit_changes_no_correction_within_it():
 @pytest.mark.parametrize(
     "how",
     [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2},
-     {"sensor_source": "learned"}, {"branch_observation": True, "real_state": True}],
+     {"sensor_source": "learned"}, {"branch_observation": True, "relative_action": True, "real_state": True}],
 )  # fmt: skip
 def test_the_artifact_answers_as_the_network(tmp_path, how):
     config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
@@ -215,11 +215,12 @@ def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp
     assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
 
 
-def test_the_branch_sees_the_observation_where_it_is_told_to():
-    net = network(replace(PAPER, branch_observation=True))
+def test_the_branch_sees_the_observation_and_the_trunk_the_lag_where_switches_say_so():
+    net = network(replace(PAPER, branch_observation=True, relative_action=True))
     x = torch.randn(5, net.config.input_dim(2))
-    seen = net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)]
-    assert torch.equal(seen, net.sensor_inputs(x))
+    relative = net.features(x)
+    assert torch.equal(net.prepare(x)[:, :3], relative[:, -3:])  # payload and A − q
+    assert torch.equal(net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)], relative[:, : net.seen.stop])
     assert net.branch[0].in_features == net.config.observation_dim(2) + 16
 
 
@@ -266,6 +267,7 @@ def test_other_networks_refuse_the_paper_s_switches():
         {"payload_trunk": False},
         {"sensor_source": "learned"},
         {"branch_observation": True},
+        {"relative_action": True},
         {"real_state": True},
     ):
         with pytest.raises(UsageError, match="use --model paper"):

@@ -17,7 +17,8 @@ POSITIVE = (
     "transformer_width", "transformer_layers", "transformer_heads",
 )  # fmt: skip
 PAPER_ONLY = (
-    "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation", "real_state",
+    "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
+    "relative_action", "real_state",
 )  # fmt: skip
 
 
@@ -54,8 +55,11 @@ class ModelConfig:
     sensor_target: Literal["delta", "absolute"] = "delta"
     """paper: what a sensor value is. delta: the change of state, S(t+1) − S(t). absolute: the next state, S(t+1)."""
     branch_observation: bool = False
-    """paper: whether the branch sees the observation, with its history, beside the sensor values. This is not the
-    paper's form. It shows what the paper's form lacks: the sensor values of the present state hold no history."""
+    """paper: whether the branch sees the observation, with its history and relative to the present position, beside the
+    sensor values. This is not the paper's form: the sensor values of the present state hold no history."""
+    relative_action: bool = False
+    """paper: whether the trunk sees the action minus the present position. This is not the paper's form: a lag of
+    10 mrad is hard to see in angles that span a radian."""
     real_state: bool = False
     """paper: whether the branch sees the recorded state, relative to the simulated one, beside the sensor values.
     Training hides it in half of the episodes. It is unknown in gaponet eval and wherever else no measured state is

@@ -21,7 +21,8 @@ The probe targets are q + e_k, k = 1 … m. `sensor_source` is one of:
     learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one e_k beside the state
                 and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass through it.
 
-With `branch_observation` the branch also sees the observation, and thus its history. The literal form lacks this.
+The literal form lacks two inputs of the default network. With `branch_observation` the branch also sees the
+observation, and thus its history, relative to q. With `relative_action` the trunk sees A − q instead of A.
 
 S is sampled in training and is the mean in evaluation and export. Δ_max is a safety limit: exact clipping, in
 evaluation and export; training reports the share of corrections at the limit.
@@ -73,7 +74,7 @@ class SensorPredictor(nn.Module):
 class PaperNet(DeltaNet):
     """Equations (1) to (4). Inputs are standardised and otherwise as they are: absolute positions and targets.
 
-    `features` (relative to q, standardised) serve the critic of PPO alone.
+    `features` (relative to q, standardised) serve the critic of PPO, branch_observation and relative_action.
 
     Attributes:
         probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
@@ -142,9 +143,11 @@ class PaperNet(DeltaNet):
     def prepare(self, x: Tensor) -> Tensor:
         """x → [query | what the branch sees beside S | S]."""
         z, config = self.sensor_inputs(x), self.config
-        beside = [z] if config.branch_observation else []
+        relative = self.features(x) if config.branch_observation or config.relative_action else x
+        beside = [relative[:, self.seen]] if config.branch_observation else []
         beside += [x[:, self.features.layout.real] / x.new_tensor(self.real_units)] if config.real_state else []
-        return torch.cat([self.asked(x[:, self.query]), *beside, self.sensors(x, z)], dim=1)
+        query = relative[:, self.query] if config.relative_action else self.asked(x[:, self.query])
+        return torch.cat([query, *beside, self.sensors(x, z)], dim=1)
 
     def correct(self, prepared: Tensor) -> Tensor:
         shape, asked = (-1, self.config.num_basis, self.n), self.query.stop - self.query.start
