@@ -32,6 +32,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,11 @@ class Reading:
     def corrector(self, net: PaperNet, robot: RobotSpec) -> DeltaCorrector:
         network = FunctionNetwork(lambda x: self.sign * self.outputs(net, x)[:, 0], 15 * JOINTS, JOINTS)
         return DeltaCorrector(network, net.config, robot)
+
+
+def predicted_sensors(net: PaperNet, x: torch.Tensor) -> torch.Tensor:
+    """The sensor values that the network's predictor gives, (B, 400)."""
+    return net.sensors(x, net.sensor_inputs(x))
 
 
 def readings(order: Array) -> list[Reading]:
@@ -146,7 +152,9 @@ def inferred_order(net: PaperNet, x: Array, answers: Array) -> tuple[Array, Arra
     """Joint of each column, by its mean answers to the probes, and their correlations (column, joint)."""
     order = np.arange(JOINTS)
     for _ in range(JOINTS):  # the answers also depend on the order of the inputs
-        columns = Reading("", order).outputs(net.sensors, x).mean(0)[::2, order]  # positions, of all probes
+        columns = (
+            Reading("", order).outputs(partial(predicted_sensors, net), x).mean(0)[::2, order]
+        )  # positions, of all probes
         match = np.corrcoef(columns.T, answers.mean(0)[::2].T)[:JOINTS, JOINTS:]
         order = linear_sum_assignment(-match)[1]
     return order, match
@@ -179,7 +187,7 @@ def on_logs(net: PaperNet, logs: Path) -> None:
     print(f"|---|---|---|---|---|---|\n| nominal | – | – | {shown(nominal)} | – | – |")
     for reading in readings(order):
         x, answers = states[reading.dt]
-        predicted, score = reading.outputs(net.sensors, x), "– | – | –"
+        predicted, score = reading.outputs(partial(predicted_sensors, net), x), "– | – | –"
         if reading.dt == robot.dt:
             error = errors(Answer(robot, reading.corrector(net, robot)))
             score = f"{shown(error)} | {shown(error - nominal)} | {(error < nominal).sum()}"
