@@ -61,9 +61,6 @@ def test_words_for_fractions_are_the_code_s_too():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_source_file_that_a_page_names_is_there(page):
-    """The log may name what was there on its day."""
-    if page.name == "log.md":
-        pytest.skip("history")
     for name in re.findall(rf"`((?:{'|'.join(FOLDERS)})/[a-z0-9_/]*(?:\.py)?)`", page.read_text(encoding="utf-8")):
         assert any((part / name).exists() for part in SOURCES), f"{page.name}: {name}"
 

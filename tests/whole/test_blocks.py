@@ -33,7 +33,7 @@ from gaponet.robot_folder import save_robot
 from gaponet.sim.model import build_model
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in ("log.md", "results.md"))]
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name != "results.md")]
 PATHS = {page.name: page for page in PAGES}
 WITH_PYTHON = (
     "README.md",

@@ -10,7 +10,7 @@ like the shadow that is given u + G(u); so u + G(u) = a′ is solved, by u ← u
 
 G is asked at the shadow's state and history, not at the robot's. If the compensation is right they are the same; and
 what is sent does not depend on what is measured: there is no loop that could become unstable, and noise does not reach
-the servos. (Asked at the measured state it was no nearer and four times rougher, docs/log.md.)
+the servos. (Evaluated at the measured state, the error was no smaller and the commands four times rougher.)
 
 What is then still missing is integrated, slowly and low-passed: a loaded arm swings on its servo with little damping
 (3 kg on H1-2's shoulder yaw: 10 rad/s, damping ratio 0.1), and an integrator alone is unstable there above 2ζω, 2 1/s.

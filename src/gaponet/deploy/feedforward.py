@@ -1,5 +1,5 @@
 """What moving asks for beyond holding: inertia, damping and friction (by the servo's law where it was identified), at
-the targets' velocity and acceleration. A late servo's delay is not led: that overshoots (docs/log.md).
+the targets' velocity and acceleration. The delay of a servo is not compensated: that overshoots.
 
 Both come from the last targets, so this is causal; a noise of the targets is amplified by inertia / (kp dt²), which the
 low-pass of the acceleration lessens.

@@ -164,7 +164,7 @@ class TransferCorrector:
 
 
 def _require_measured(inverse: ClosedForm | Probed, reference: ClosedForm, joints: tuple[str, ...]) -> None:
-    """Refuse a target further from the reference than those that docs/results/simulators.md has."""
+    """Refuse a target outside the range that transfer was measured in: LATER, GAINS, BAND, STEP."""
     periods = (inverse.ahead - reference.ahead) * reference.dt
     later = periods if isinstance(inverse, Probed) else inverse.delay - reference.delay
     if later.max() > LATER:

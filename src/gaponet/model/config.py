@@ -80,7 +80,7 @@ class ModelConfig:
     trunk_hidden: Layers = (32, 32)
     """Hidden layers of the trunk net."""
     sensor_hidden: Layers = (128, 64)
-    """Hidden layers of the sensor predictor; 256 256 predict no better (docs/log.md)."""
+    """Hidden layers of the sensor predictor; 256 256 predict no better."""
     mlp_hidden: Layers = (512, 256, 128)
     """Hidden layers of the MLP baseline (ASAP's size)."""
     mlp_match: bool = False

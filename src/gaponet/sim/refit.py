@@ -26,7 +26,7 @@ from gaponet.sim.replay import Corrector, whole_errors
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
-PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together (docs/log.md, 2026-11-21)
+PRIOR = 0.3  # rad per scale of a joint alone, a twentieth of it for all together
 TOGETHER = 0.05  # of it, where all joints leave their values by the same share: a cold day, a slow bus …
 COMMON = ("damping", "frictionloss", "delay")  # … which does not turn zeros, nor soften gains
 ITERATIONS, ENOUGH = 4, 1e-3  # at most, and the share of the cost by which it falls in one that is not the last

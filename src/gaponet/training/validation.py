@@ -2,7 +2,7 @@
 
 A correction learnt from an hour of one robot is partly noise. Where little is left to correct, as after identification,
 half of it can be better than all of it. One number for all joints: chosen joint by joint it fits the few validation
-motions rather than the robot (docs/log.md).
+motions rather than the robot.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Cells of a comparison: every (model, seed) a job, as many at once as there are cores, or on a cluster.
 
 Each cell simulates and learns on one thread. Cells that share a thread pool wait for each other: two trainings at once
-with two threads each took three times as long as one after the other (docs/log.md).
+with two threads each took three times as long as one after the other.
 """
 
 from __future__ import annotations

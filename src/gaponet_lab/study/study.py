@@ -30,7 +30,7 @@ from gaponet_lab.study.rehearsal import rehearsal, take
 from gaponet_lab.study.variant import Variant, parse_variant
 from gaponet_lab.whose import who
 
-# s on one core of the machine of docs/results.md, virtual H1-2: whatever the budget, and per control step.
+# s on one core, virtual H1-2: whatever the budget, and per control step.
 FIXED_S, STEP_S = 50.0, 6e-4
 REHEARSAL = 0.25  # of FIXED_S, on a slice
 

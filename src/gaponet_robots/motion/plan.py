@@ -1,7 +1,7 @@
 """Which motions to play on a robot of which there is no data yet, how long, and the sheet to fill in.
 
-Sized by docs/results/data.md (virtual H1-2): with 9 minutes of recordings a third of the simulator's error was left, 41
-came within a tenth of what 73 gave. Identification needs the first few minutes (docs/results/identify_so101.md).
+Sized for a network (virtual H1-2): after 9 minutes of recordings a third of the nominal error was left, and 41 minutes
+came within a tenth of 73. Identification needs the first few minutes.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def test_the_loaded_hand_is_off_by_centimetres(played):
 
 
 def four_numbers(robot):
-    """What benchmarks/virtual_h1_2.py fits to the hard fleet, the same for all joints."""
+    """One kp ratio, friction, damping and delay for all joints, fitted to the fleet `hard`."""
     return robot.with_servos(
         {
             j: {"kp": 0.79 * kp, "frictionloss": 1.74, "damping": 1.007, "delay": 0.011}
