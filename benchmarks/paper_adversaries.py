@@ -2,7 +2,7 @@
 
     python benchmarks/paper_adversaries.py DATASET WORK [--budget 1000000] [--unit virtual-4]
 
-Trains the paper's network (payload as an input) in six ways and measures the test motions, of the units that were
+Trains the paper's network (payload as an input) in six ways and measures the test motions of the units that were
 trained on and of one that was not:
 
     as it is          gaponet train --model paper --recipe paper
