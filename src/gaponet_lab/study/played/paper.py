@@ -141,7 +141,7 @@ def card(data: Dataset, robot: RobotSpec) -> Table:
     entries = data.entries
     here = count(entries) | {
         "units": len({e.meta.unit_id for e in entries}), "joints": len(robot.operated),
-        "repetitions": max(e.meta.repetition for e in entries),
+        "repetitions": len({e.meta.repetition for e in entries}),
         "signals": len({c for e in entries for c in e.channels}),
     }  # fmt: skip
     rows: list[tuple[Any, ...]] = [(name, printed, here[name]) for name, printed in CARD.items()]
