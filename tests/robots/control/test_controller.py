@@ -20,7 +20,7 @@ from gaponet.robot import RobotSpec
 from gaponet_robots.control.clock import MonotonicClock, SimulatedClock
 from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import DriverError, Fault
-from gaponet_robots.control.phases import COMMANDING, NEXT, ControlConfig, Phase
+from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.plan import Plan
 from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Recording
@@ -169,7 +169,7 @@ def test_no_command_sent_around_a_fault_is_outside_the_limits(arm, kind, at):
 
 
 def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
-    monkeypatch.setattr("gaponet_robots.control.controller.PATIENCE", 0.3)
+    monkeypatch.setattr("gaponet_robots.control.target.PATIENCE_S", 0.3)
     driver = Tampered(arm, SimulatedClock(), at=0.0, kind="hot")
     recording = run(arm, driver)
     assert phases(recording) == ["idle", "stopped"]
@@ -255,12 +255,6 @@ def test_a_stop_is_latched(arm):
 def test_times_that_no_run_can_have_are_refused(field, value):
     with pytest.raises(UsageError, match=f"{field} is {value:g}"):
         ControlConfig(**{field: value})
-
-
-def test_from_damp_the_only_way_is_to_stopped():
-    assert NEXT[Phase.DAMP] == (Phase.STOPPED,)
-    assert NEXT[Phase.STOPPED] == ()
-    assert all(Phase.DAMP in NEXT[p] for p in COMMANDING)
 
 
 def test_a_policy_that_gives_nan_or_crashes_leaves_the_robot_damped(arm):
@@ -461,7 +455,7 @@ def test_time_that_the_computer_was_suspended_is_what_boottime_went_on_by(monkey
 def test_a_watchdog_that_is_of_no_use_any_more_ends_the_run_damped(arm, trouble):
     driver = Tampered(arm, SimulatedClock())
     controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
-    controller._watchdog = SimpleNamespace(
+    controller.output.watchdog = SimpleNamespace(
         trouble=lambda: trouble if driver.clock.now() >= 0.9 else "", fired=lambda: False, beat=lambda weight: True
     )
     recording = controller.run(play(MOTION, 0.02))
@@ -521,7 +515,7 @@ def test_a_slow_start_of_the_compensator_is_not_taken_for_a_hang(arm):
     clock, watchdog = SimulatedClock(), Watchdog()
     driver = Tampered(arm, clock)
     controller = Controller(driver, arm, config=QUICK, compensator=Slow(), clock=clock)
-    controller._watchdog = watchdog
+    controller.output.watchdog = watchdog
     recording = controller.run(play(MOTION, controller.dt))
     assert recording.fault is None
     assert watchdog.beats > 40
@@ -566,7 +560,7 @@ def test_no_command_leaves_once_the_watchdog_has_damped_the_robot(arm):
         return motion(k, state)
 
     controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
-    controller._watchdog = SimpleNamespace(
+    controller.output.watchdog = SimpleNamespace(
         trouble=lambda: "", fired=lambda: bool(fired), beat=lambda weight: True, release=lambda loose: None
     )
     recording = controller.run(policy)
@@ -589,7 +583,7 @@ def test_a_plan_counts_only_where_the_robot_still_is_where_it_was_found(arm, mov
 
 
 def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
-    monkeypatch.setattr("gaponet_robots.control.controller.PATIENCE", 0.3)
+    monkeypatch.setattr("gaponet_robots.control.target.PATIENCE_S", 0.3)
     recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))
     with pytest.raises(LogError, match="0 periods of phase 'run'"):
         recording.log()

@@ -348,7 +348,7 @@ def test_a_watchdog_that_hangs_for_five_periods_ends_the_run_damped(served):
         def policy(k, state):
             if k == AT:
                 injected.append(time.monotonic())
-                os.kill(controller._watchdog._process.pid, signal.SIGSTOP)
+                os.kill(controller.output.watchdog._process.pid, signal.SIGSTOP)
             return swing(k)
 
         controller = Controller(UnitreeDriver(ROBOT, domain=DOMAIN), ROBOT, config=SLOW, safety=SAFETY)

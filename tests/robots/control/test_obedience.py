@@ -123,7 +123,7 @@ def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch
     arm.close()
 
 
-def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched: object = None) -> Recording:
+def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watchdog: bool = False) -> Recording:
     """One and a half second in which all joints swing."""
     from gaponet_robots.drivers.so101 import SO101Driver
 
@@ -132,10 +132,8 @@ def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched:
             controller.stop("the operator")
         return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
 
-    controller = Controller(SO101Driver(so101, timeout=0.001), so101, config=QUICK, clock=clock, watchdog=False)
-    if watched:
-        controller._watchdog = watched
-        controller._start_watchdog = lambda lock, stack: stack.callback(lambda: watched.release(controller._loose))
+    driver = SO101Driver(so101, timeout=0.001)
+    controller = Controller(driver, so101, config=QUICK, clock=clock, watchdog=watchdog)
     return controller.run(policy)
 
 
@@ -225,14 +223,16 @@ def test_a_servo_in_error_is_let_go_at_once(so101, clock, bus):
     assert told(bus, reg.TORQUE_LIMIT)[0][0] > off
 
 
-def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus):
+def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus, monkeypatch):
     ends: list[bool] = []
-    bus.way, bus.at = "lost", 1.0
-    recording = play(
-        so101,
-        clock,
-        watched=SimpleNamespace(trouble=lambda: "", fired=lambda: False, beat=lambda weight: True, release=ends.append),
+    monkeypatch.setattr(
+        "gaponet_robots.control.controller.Watchdog",
+        lambda *_: SimpleNamespace(
+            trouble=str, fired=bool, beat=lambda weight: True, release=ends.append, wait_ready=lambda: None
+        ),
     )
+    bus.way, bus.at = "lost", 1.0
+    recording = play(so101, clock, watchdog=True)
     assert recording.fault.kind == "driver"
     last = recording.events[-1]
     assert (last.phase, last.kind) == ("stopped", "driver")
