@@ -287,7 +287,7 @@ class Controller:
         elif output.watchdog and output.watchdog.fired():
             trigger, text = Trigger.FAULT_AFTER_WATCHDOG, f"{text}; the watchdog has damped the robot"
         elif fault.kind == "obedience" and self.driver.at_end == "hand_over":
-            trigger = Trigger.DISOBEYED
+            trigger = Trigger.NOT_FOLLOWING
         self._fire(trigger, text, fault.kind)
 
     def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:

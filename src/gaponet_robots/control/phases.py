@@ -33,7 +33,7 @@ class Trigger(Enum):
     DAMP = "the run is over without fault, on rt/lowcmd"
     RELEASED = "weight 0 was sent"
     DAMPED = "the time for damping (`--damp`) is over"
-    DISOBEYED = "joints do not follow, on rt/arm_sdk, after the first command"
+    NOT_FOLLOWING = "a joint does not follow its commands, on rt/arm_sdk"
     FAULT = "any other fault, key, signal or call, after the first command"
     FAULT_BEFORE_COMMAND = "any fault, key, signal or call, before the first command"
     FAULT_AFTER_WATCHDOG = "any fault, key, signal or call, after the watchdog began to damp the robot"
@@ -42,27 +42,27 @@ class Trigger(Enum):
 class Action(Enum):
     """What a controller does in a transition and until the next one."""
 
-    READ = "read states, send nothing"
-    BLEND_IN = "positions, from where the robot is to the first target; weight 0 → 1 on rt/arm_sdk"
-    PLAY = "positions of the motion, corrected where a model is given"
-    GO_BACK = "positions, back to where the robot was found"
-    RELEASE = "the last position; weight 1 → 0"
-    RELEASE_HERE = "the measured position; weight → 0"
-    DAMP = "no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off (SO-101)"
-    HOLD = "nothing: servos hold the last position"
-    SEND_NOTHING = "nothing"
-    CONFIRM = "nothing; report what the robot says"
-    IGNORE = "no change"
-    RAISE = "an error of this program, which counts as a fault"
+    READ = "read states; send nothing"
+    BLEND_IN = "send positions, from the measured one to the first target; weight 0 → 1 on rt/arm_sdk"
+    PLAY = "send the positions of the motion, corrected where a model is given"
+    GO_BACK = "send positions, back to where the robot was at the start"
+    RELEASE = "send the last position; weight 1 → 0"
+    RELEASE_HERE = "send the measured position; weight → 0"
+    DAMP = "send no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off (SO-101)"
+    HOLD = "send nothing; servos hold the last position"
+    SEND_NOTHING = "send nothing"
+    CONFIRM = "send nothing; report what the robot itself says"
+    IGNORE = "none"
+    RAISE = "raise an error of this program, which then is a fault"
 
 
 MOVING = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT)
 COMMANDING = (*MOVING, Phase.RELEASE)
 ENDED = (Phase.DAMP, Phase.STOPPED)
 _WAITING = (Phase.CONNECT, Phase.IDLE)
-_FAULTS = (Trigger.FAULT, Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG, Trigger.DISOBEYED)
+_FAULTS = (Trigger.FAULT, Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG, Trigger.NOT_FOLLOWING)
 
-# Phases, triggers, next phase (None: the same one), action. The first row that has a phase and a trigger counts.
+# Phases, triggers, next phase (None: the same one), action. All triggers: those that no row above has for the phase.
 TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, Action], ...] = (
     ((Phase.CONNECT,), (Trigger.CONSENT,), Phase.IDLE, Action.READ),
     ((Phase.IDLE,), (Trigger.READY,), Phase.BLEND_IN, Action.BLEND_IN),
@@ -72,8 +72,9 @@ TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, A
     ((Phase.RUN, Phase.BLEND_OUT), (Trigger.HOLD,), Phase.STOPPED, Action.HOLD),
     ((Phase.RUN, Phase.BLEND_OUT), (Trigger.DAMP,), Phase.DAMP, Action.DAMP),
     ((Phase.RELEASE,), (Trigger.RELEASED,), Phase.STOPPED, Action.SEND_NOTHING),
-    (MOVING, (Trigger.DISOBEYED,), Phase.RELEASE, Action.RELEASE_HERE),
-    (COMMANDING, (Trigger.FAULT, Trigger.DISOBEYED), Phase.DAMP, Action.DAMP),
+    (MOVING, (Trigger.NOT_FOLLOWING,), Phase.RELEASE, Action.RELEASE_HERE),
+    ((Phase.RELEASE,), (Trigger.NOT_FOLLOWING,), Phase.DAMP, Action.DAMP),
+    (COMMANDING, (Trigger.FAULT,), Phase.DAMP, Action.DAMP),
     (COMMANDING, (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG), Phase.STOPPED, Action.SEND_NOTHING),
     (_WAITING, _FAULTS, Phase.STOPPED, Action.SEND_NOTHING),
     ((Phase.DAMP,), (Trigger.DAMPED,), Phase.STOPPED, Action.CONFIRM),

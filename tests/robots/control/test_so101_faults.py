@@ -20,7 +20,6 @@ pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 from gaponet.errors import UsageError
 from gaponet.robot import load_robot
 from gaponet_robots.control.controller import ControlConfig, Controller
-from gaponet_robots.control.driver import DriverError
 from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Recording
 from gaponet_robots.control.safety import SafetyConfig
@@ -113,19 +112,6 @@ def test_a_bus_that_loses_or_damages_a_reply_now_and_then_goes_on_and_ends_held(
     assert servos.ask()["torque"] == [1] * 6
 
 
-def test_a_cable_that_is_pulled_ends_the_run(servos):
-    driver = SO101Driver(ROBOT, servos.port, timeout=TIMEOUT)
-
-    def policy(k: int, state: object) -> np.ndarray | None:
-        if k == AT:
-            servos.process.kill()
-            servos.process.wait()
-        return None if k > 12 else np.zeros(6)
-
-    recording = Controller(driver, ROBOT, config=SLOW, safety=CALM, watchdog=False).run(policy)
-    assert recording.fault.kind in ("driver", "stale", "overrun")
-
-
 def let_go(port: str) -> None:
     """Wait until the watchdog has damped: it holds the robot's lock as long."""
     deadline = time.monotonic() + 30
@@ -164,11 +150,3 @@ def test_the_watchdog_switches_the_torque_off_when_the_controller_is_no_more(ser
         controller.kill()
         controller.wait()
         let_go(servos.port)
-
-
-def test_a_servo_in_error_is_refused_and_nothing_is_sent(servos):
-    servos.tell("overheat")
-    time.sleep(0.2)
-    with pytest.raises(DriverError, match="overheat"):
-        move(servos, "none")
-    assert servos.ask()["goals"] == 0
