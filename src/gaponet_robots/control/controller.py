@@ -15,10 +15,9 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet_robots.control.clock import Clock, MonotonicClock, uncollected
-from gaponet_robots.control.context import Context
 from gaponet_robots.control.driver import Driver, DriverError, Fault, State
 from gaponet_robots.control.following import Following
-from gaponet_robots.control.output import Output
+from gaponet_robots.control.output import Context, Output
 from gaponet_robots.control.phases import COMMANDING, ENDED, MOVING, TABLE, Action, ControlConfig, Phase, Trigger
 from gaponet_robots.control.plan import Compensates, Plan, Planner
 from gaponet_robots.control.publisher import sole_publisher
@@ -34,13 +33,7 @@ HANG_PERIODS = 5.0  # control periods without a sign of life after which the wat
 
 
 class Controller:
-    """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end.
-
-    Attributes:
-        phase: Where it is.
-        stop: Call it, from any thread, to stop the robot.
-        recording: What it did so far.
-    """
+    """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end."""
 
     def __init__(
         self,
@@ -166,7 +159,7 @@ class Controller:
         self._fire(Trigger.CONSENT, "waiting for fresh states")
         for remark in self.driver.facts.get("remarks", ()):
             self._note(remark)
-        self.output.begin_run()
+        self.output.suspended_before = self.clock.suspended()
         while self.phase is not Phase.STOPPED:
             self._now = self.clock.wait_until(start + self._k * self.dt)
             self.output.due = start + due * self.dt

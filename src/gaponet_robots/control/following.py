@@ -7,9 +7,8 @@ import numpy as np
 from gaponet.arrays import Array
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
-from gaponet_robots.control.context import Context
 from gaponet_robots.control.driver import Fault, State
-from gaponet_robots.control.output import Output
+from gaponet_robots.control.output import Context, Output
 
 LAG = 0.15  # s: time constant of a servo that is slower than any here; joints are compared with what it would do
 STRIDE = 0.05  # rad of that slow servo's way on which a joint must have moved along

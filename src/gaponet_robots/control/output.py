@@ -1,16 +1,18 @@
-"""Output: commands to a robot within its limits, and damping."""
+"""Output: commands to a robot within its limits, and damping; and what all parts of a controller share."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet_robots.control.context import Context
-from gaponet_robots.control.driver import DriverError, Fault, State
-from gaponet_robots.control.plan import MOVED
-from gaponet_robots.control.safety import Limits, Watch, limit_command, limit_delta
+from gaponet.robot import RobotSpec
+from gaponet_robots.control.clock import Clock
+from gaponet_robots.control.driver import Driver, DriverError, Fault, State
+from gaponet_robots.control.phases import ControlConfig
+from gaponet_robots.control.plan import MOVED, Compensates, Planner
+from gaponet_robots.control.safety import Limits, SafetyConfig, Watch, limit_command, limit_delta
 from gaponet_robots.control.watchdog import Watchdog
 
 MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
@@ -18,12 +20,28 @@ MAX_SEND_DELAY_S = 0.001  # between the last look at the clock and a command's l
 MAX_SUSPENDED_S = 0.05  # less than any suspend, more than two clocks that are read in turn differ by
 
 
+@dataclass(frozen=True)
+class Context:
+    """Robot, settings and clock of one controller; indices of the commanded joints; control period, s."""
+
+    driver: Driver
+    robot: RobotSpec
+    config: ControlConfig
+    safety: SafetyConfig
+    compensator: Compensates | None
+    clock: Clock
+    planner: Planner | None
+    payload_mass: float | None
+    joints: Array
+    dt: float
+
+
 class Output:
     """Corrects, limits and sends commands to one robot, and damps it. Arrays are of the commanded joints.
 
     Attributes:
-        watchdog: The process that hears of every command; None without one.
         due: When the present period should have begun, s.
+        suspended_before: s for which the computer was suspended before the run.
         ctrl: The command in force, rad; None before the first one, and while the robot is damped.
         weight: Weight of the last command; None if nothing was ever commanded.
         damping_since: s of the clock; None if the robot was not damped.
@@ -34,7 +52,7 @@ class Output:
         self.context, self.watch = context, watch
         self.watchdog: Watchdog | None = None
         self.limits = self.servo_limits()
-        self.due = self._suspended_before = 0.0
+        self.due = self.suspended_before = 0.0
         self._start = self._requested = self._delta = np.zeros(len(context.joints))
         self.ctrl: Array | None = None
         self.weight: float | None = None
@@ -47,13 +65,9 @@ class Output:
         gains = (driver.kp, driver.kd)
         return Limits.of(self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range)
 
-    def begin_run(self) -> None:
-        """Forget how long the computer was suspended before."""
-        self._suspended_before = self.context.clock.suspended()
-
     def suspended(self) -> Fault | None:
         """Return a fault if the computer was suspended: time stood still for this process, not for the robot."""
-        duration = self.context.clock.suspended() - self._suspended_before
+        duration = self.context.clock.suspended() - self.suspended_before
         if duration <= MAX_SUSPENDED_S:
             return None
         return Fault("suspend", f"the computer was suspended for {duration:.1f} s; keep it awake while a robot moves")

@@ -263,10 +263,9 @@ class Planner:
                 f"the plan asks {demand.worst_joint} for {demand.torque:.2f} of the torque that may be used; go slower "
                 "(--blend-speed), or from a posture that is easier to hold"
             )
-        return Plan(
-            plan.found, plan.into, plan.motion, plan.back, float(free.min(initial=np.inf)),
-            self.collision.nearest(free) if len(free) else "", demand.torque, demand.worst_joint, plan.changed,
-        )  # fmt: skip
+        nearest = self.collision.nearest(free) if len(free) else ""
+        clearance = float(free.min(initial=np.inf))
+        return replace(plan, clearance=clearance, nearest=nearest, torque=demand.torque, joint=demand.worst_joint)
 
 
 def advance(search: Search[_T], clock: Clock, seconds: float) -> _T | None:

@@ -8,10 +8,9 @@ import numpy as np
 
 from gaponet.arrays import Array
 from gaponet.errors import UsageError
-from gaponet_robots.control.context import Context
 from gaponet_robots.control.driver import Fault, State
 from gaponet_robots.control.following import Following
-from gaponet_robots.control.output import Output
+from gaponet_robots.control.output import Context, Output
 from gaponet_robots.control.phases import Phase, Trigger
 from gaponet_robots.control.plan import MOVED, SLOW, Fence, Plan, advance
 from gaponet_robots.motion.minjerk import blend
@@ -112,13 +111,7 @@ class TargetGenerator:
     """
 
     def __init__(self, context: Context, following: Following, plan: Plan | None, state: State, first: Array) -> None:
-        """
-        Args:
-            following: Says whether a joint has followed.
-            plan: With the way to the first target and, for a motion, the way back; None: straight ways.
-            state: Where the robot is.
-            first: The first target, (n) rad.
-        """
+        """Begin where the robot is and go to the first target, (n) rad: by the ways of a plan, or straight."""
         self.context, self.following, self.plan = context, following, plan
         self.start = self._last = self._origin = state.qpos[context.joints]
         self.way = plan.into if plan else self._straight(self.start, first[context.joints], state)
@@ -182,7 +175,7 @@ class TargetGenerator:
         return self._last
 
     def _run(self, n: int, state: State, policy: Policy) -> Array | Change | Fault:
-        target = policy(n, state)
+        target, self.weight = policy(n, state), 1.0
         if isinstance(target, Fault):
             return target
         if not self._checked_payload and n * self.context.dt >= PAYLOAD_CHECK_S:
@@ -190,7 +183,7 @@ class TargetGenerator:
             if doubt := getattr(self.context.compensator, "doubt", ""):  # not every compensator weighs
                 self.remarks.append(f"compensation: {doubt}")
         if target is not None:
-            self._last, self.weight = np.array(target[self.context.joints], float), 1.0
+            self._last = np.array(target[self.context.joints], float)
             return self._last
         if self.context.config.blend_out:
             return Change(Trigger.RETURN, "end of the motion", "end")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -30,6 +31,13 @@ serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 QUICK = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.1, damp=2.0)
 ELBOW, ROLL = 3, 5  # servos
 WHOLE = reg.Register(0, 128)
+
+RNG = random.Random(1)
+SPOILT = {  # what reaches the driver of what servos say
+    "mute": lambda said: b"", "corrupt": lambda said: said[:-1] + bytes(b ^ 255 for b in said[-1:]),
+    "babble": lambda said: RNG.randbytes(600), "lossy": lambda said: said if RNG.random() > 0.03 else b"",
+    "noisy": lambda said: said if RNG.random() > 0.03 else RNG.randbytes(len(said)),
+}  # fmt: skip
 
 
 class Bus:
@@ -70,7 +78,7 @@ class Bus:
             elbow, roll = (bytes(self.arm.memory[servo - 1][42:44]) for servo in (ELBOW, ROLL))
             self.arm.memory[ELBOW - 1][42:44], self.arm.memory[ROLL - 1][42:44] = roll, elbow
             self.arm._apply()
-        self.buffer += (data if self.echo else b"") + out
+        self.buffer += (data if self.echo else b"") + (SPOILT[self.way](out) if wrong and self.way in SPOILT else out)
         return len(data)
 
     def _go_wrong(self) -> None:
@@ -248,6 +256,20 @@ def test_one_servo_that_says_nothing_more_is_named_and_the_others_are_lowered(so
     assert told(bus, reg.TORQUE_LIMIT)
     assert "could NOT be damped: switch the supply off" in recording.events[-1].text
     assert "servo 4 (wrist_flex)" in recording.events[-1].text
+
+
+@pytest.mark.parametrize("way", ["mute", "corrupt", "babble"])
+def test_a_bus_that_says_nothing_true_any_more_carries_at_most_two_more_goals(so101, clock, bus, way):
+    bus.way, bus.at = way, 1.0
+    assert play(so101, clock).fault.kind in ("stale", "checksum")
+    assert sum(time >= bus.first + bus.at for time, _ in told(bus, reg.GOAL_POSITION)) <= 1 + 2
+    assert bus.get(reg.TORQUE_ENABLE) == [0] * 6
+
+
+@pytest.mark.parametrize("way", ["lossy", "noisy"])
+def test_a_bus_that_loses_or_damages_a_reply_now_and_then_goes_on(so101, clock, bus, way):
+    bus.way, bus.at = way, 0.0
+    assert play(so101, clock).fault is None
 
 
 def test_an_adapter_that_echoes_is_understood(so101, clock, bus):
