@@ -36,7 +36,6 @@ class Feedforward:
         self.damping = robot.kd[op] + model.dof_damping[at]
         self.friction, self.law = model.dof_frictionloss[at], present({name: getattr(robot, name)[op] for name in LAW})
         self.inertia = Inertia(sim.batch, model, at)
-        self.target = self.qvel = self.qacc = np.zeros((0, len(at)))
 
     def reset(self, target: Array) -> None:
         """At rest at targets (num, n operated), rad."""

@@ -38,13 +38,11 @@ class PayloadEstimate:
         self.heaviest = float(sorted(c[0] for c in sim.models)[-1])
         self.bias: Array = sim.batch.bind("qfrc_bias")
         self.home = robot.qpos_home[robot.index(sim.joint_names)]
-        self.mass, self.top, self.weight, self.energy, self.guess = np.zeros((5, 0))
-        self.certain = np.zeros(0, bool)
 
     def reset(self, num: int) -> None:
         """Nothing in the hands of num robots."""
-        self.mass, self.top, self.weight, self.energy, self.guess = np.zeros((5, num))
-        self.certain = np.zeros(num, bool)
+        self.mass, self.top, self.weight, self.energy = (np.zeros(num) for _ in range(4))
+        self.guess, self.certain = np.zeros(num), np.zeros(num, bool)
 
     def update(self, qpos: Array, qvel: Array, sent: Array, tau: Array | None, seen: Array) -> Array:
         """Take in one control period; all (num, n operated). Returns kg per robot, (num,).

@@ -106,7 +106,7 @@ class TargetGenerator:
     """Generates the targets of one run. Arrays are of the commanded joints, rad.
 
     Attributes:
-        weight: With which the last target is to be sent: how far the robot is handed over.
+        weight: Weight of the last target: how far the robot is handed over.
         remarks: Sentences for the recording; whoever records them takes them out.
     """
 

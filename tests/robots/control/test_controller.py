@@ -22,7 +22,6 @@ from gaponet_robots.control.controller import Controller
 from gaponet_robots.control.driver import DriverError, Fault
 from gaponet_robots.control.phases import COMMANDING, ControlConfig
 from gaponet_robots.control.plan import Plan
-from gaponet_robots.control.publisher import sole_publisher
 from gaponet_robots.control.recording import Recording
 from gaponet_robots.control.safety import SafetyConfig
 from gaponet_robots.drivers.virtual import VirtualDriver
@@ -160,8 +159,9 @@ def test_a_robot_that_is_never_well_is_never_commanded(arm, monkeypatch):
     driver = Tampered(arm, SimulatedClock(), at=0.0, kind="hot")
     recording = run(arm, driver)
     assert phases(recording) == ["idle", "stopped"]
-    assert "never ready" in recording.fault.text
     assert driver.sent == []
+    with pytest.raises(LogError, match="0 periods of phase 'run', nothing to learn from; it ended with: never ready"):
+        recording.log()
 
 
 def test_a_robot_is_commanded_after_five_good_states_in_a_row(arm):
@@ -444,13 +444,6 @@ def test_a_watchdog_that_is_of_no_use_any_more_ends_the_run_damped(arm, trouble)
     assert 0.9 <= damped <= 0.92
 
 
-def test_two_controllers_cannot_command_one_robot(arm):
-    driver = Tampered(arm, SimulatedClock())
-    with sole_publisher(driver.address), pytest.raises(UsageError, match="another process commands this robot"):
-        run(arm, driver)
-    assert driver.sent == []
-
-
 def test_a_compensator_acts_within_its_bounds(arm):
     class Greedy:
         def reset(self, target, payload_mass=None):
@@ -532,13 +525,6 @@ def test_a_plan_counts_only_where_the_robot_still_is_where_it_was_found(arm, mov
     if kind:
         assert "elbow moved by" in recording.fault.text
         assert driver.sent == []
-
-
-def test_a_log_of_a_run_that_never_began_says_why(arm, monkeypatch):
-    monkeypatch.setattr("gaponet_robots.control.target.PATIENCE_S", 0.3)
-    recording = run(arm, Tampered(arm, SimulatedClock(), at=0.0, kind="nan"))
-    with pytest.raises(LogError, match="0 periods of phase 'run'"):
-        recording.log()
 
 
 def test_damping_takes_the_stiffness_away_and_brakes(arm):

@@ -197,7 +197,7 @@ def test_a_stop_before_the_start_and_a_robot_that_is_never_ready_send_nothing(se
     assert served.ask("heard")["time"] == []
 
 
-PREPARING = """
+CONTROLLER = """
 import sys, time
 from robots.control.test_faults import ROBOT, SAFETY, SLOW, swing
 from gaponet_robots.control.controller import Controller
@@ -206,8 +206,8 @@ class Slow:
     def reset(self, target, payload_mass=None):
         print("preparing", flush=True)
         time.sleep(60)
-driver = UnitreeDriver(ROBOT, domain=int(sys.argv[1]))
-Controller(driver, ROBOT, config=SLOW, safety=SAFETY, compensator=Slow()).run(lambda k, state: swing(k))
+driver, slow = UnitreeDriver(ROBOT, domain=int(sys.argv[1])), Slow() if "slow" in sys.argv else None
+Controller(driver, ROBOT, config=SLOW, safety=SAFETY, compensator=slow).run(lambda k, state: swing(k))
 """
 
 
@@ -215,7 +215,7 @@ def test_a_controller_killed_while_its_compensator_prepares_has_sent_nothing_and
     served.ask("clear")
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(["tests", *sys.path])}
     process = subprocess.Popen(
-        [sys.executable, "-c", PREPARING, str(DOMAIN)], env=environment, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", CONTROLLER, str(DOMAIN), "slow"], env=environment, stdout=subprocess.PIPE, text=True
     )
     assert process.stdout
     assert process.stdout.readline() == "preparing\n"
@@ -223,16 +223,6 @@ def test_a_controller_killed_while_its_compensator_prepares_has_sent_nothing_and
     process.wait()
     time.sleep(1.5)
     assert served.ask("heard")["time"] == []
-
-
-CONTROLLER = """
-import sys
-from robots.control.test_faults import ROBOT, SAFETY, SLOW, swing
-from gaponet_robots.control.controller import Controller
-from gaponet_robots.drivers.unitree import UnitreeDriver
-driver = UnitreeDriver(ROBOT, domain=int(sys.argv[1]))
-Controller(driver, ROBOT, config=SLOW, safety=SAFETY).run(lambda k, state: swing(k))
-"""
 
 
 BUSY_S = 0.4  # by which what happens on a machine that runs tests may be later than promised
