@@ -144,6 +144,10 @@ class Compensator:
         self.moving = Feedforward(self.shadow, self.at, robot, self.dt, self.config.acceleration_time)
         self.estimate = PayloadEstimate(self.shadow, self.at, robot, len(self.masses), self.dt)
         self._carried = np.full(num, -1)
+        self.payload_mass, self.announced, self.periods = np.zeros(num), False, 0
+        self.offset, self.integral, self.missing, self.sent, self.saturated = np.zeros((5, num, len(self.op)))
+        self._target: Array | None = None  # the last one that was a number; None before `reset`
+        self._aimed: list[Array] = []  # newest last
 
     # ---- use
 
@@ -187,18 +191,17 @@ class Compensator:
         a = self._all(target)
         if not np.isfinite(a).all():
             raise UsageError("compensator: the target to begin at is not a number")
-        self._asked = a
+        self._target, self.sent, self.periods = a, a[:, self.op], 0
         if self.loop is not None:
             self.loop.reset()
-        self.offset = np.zeros((self.num_envs, len(self.op)))
-        self.integral, self.missing, self.sent = np.zeros_like(self.offset), np.zeros_like(self.offset), a[:, self.op]
-        self.periods = 0
-        self.moving.reset(a[:, self.op])
+        self.offset, self.integral, self.missing = np.zeros((3, *self.sent.shape))
+        self.moving.reset(self.sent)
         rest = np.clip(a[:, self.free], *self.shadow.range.T)
-        self._shadow_reset(rest)
+        self.shadow.reset(self.ids, rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
+        self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
         for _ in range(SETTLE):
             self._shadow_step(rest, self._wanted(rest[:, self.at]))
-        self._aimed = [self._shadow_qpos()] * (self.config.lead + 1)  # newest last
+        self._aimed = [self._shadow_qpos()] * (self.config.lead + 1)
 
     def set_payload(self, payload_mass: Array | float) -> None:
         """A payload was picked up or put down, kg, one number or (num_envs,); errors as of `reset`."""
@@ -240,10 +243,10 @@ class Compensator:
         Raises:
             UsageError: `reset` was not called before.
         """
-        if not hasattr(self, "_asked"):
+        if self._target is None:
             raise UsageError("compensator: step before reset; call reset(target) once, then step every control period")
-        told = self._all(target)
-        self._asked = a_all = np.where(np.isfinite(told), told, self._asked)
+        given = self._all(target)
+        self._target = a_all = np.where(np.isfinite(given), given, self._target)
         a = a_all[:, self.op]
         self._aimed = [*self._aimed[1:], self._shadow_qpos()]
         if qpos is not None:
@@ -265,7 +268,7 @@ class Compensator:
 
     @property
     def doubt(self) -> str:
-        """That one robot holds another payload than was told, by what its servos have given of late; or nothing."""
+        """That one robot holds another payload than was stated, by what its servos have given of late; or nothing."""
         return self.estimate.contradicts(float(self.payload_mass[0])) if self.announced and self.single else ""
 
     @property
@@ -286,11 +289,10 @@ class Compensator:
 
     def _solve(self, wanted: Array) -> Array:
         """u with u + G(u) = wanted, G at the shadow; wanted itself without a model."""
-        loop, gain, self.wanted = self.loop, self.config.gain, wanted
-        if loop is None:
+        if self.loop is None:
             return wanted
-        q, v = (x[: self.num_envs, self.at] for x in (self.shadow.qpos, self.shadow.qvel))
-        return loop.solve(q, v, wanted, self.payload_mass, self.offset, gain, self.config.iterations)
+        q, v, config = *(x[: self.num_envs, self.at] for x in (self.shadow.qpos, self.shadow.qvel)), self.config
+        return self.loop.solve(q, v, wanted, self.payload_mass, self.offset, config.gain, config.iterations)
 
     def _observe(self, q: Array, v: Array | None, tau: Array | None) -> None:
         """Integrate what is missing; anti-windup: not further where the command is at a limit."""
@@ -313,10 +315,6 @@ class Compensator:
 
     def _shadow_qpos(self) -> Array:
         return self.shadow.qpos[: self.num_envs, self.at]
-
-    def _shadow_reset(self, rest: Array) -> None:
-        self.shadow.reset(self.ids, rest, 0.0, past=rest[:, None])  # type: ignore[arg-type]
-        self.shadow.batch.forward(self.ids, stage=mujoco.mjtStage.mjSTAGE_VEL.value)
 
     def _shadow_step(self, targets: Array, wanted: Array) -> None:
         full = np.zeros((self.shadow.num_envs, self.shadow.n))

@@ -202,7 +202,7 @@ def perform(
                 masses = compensator.masses[[0, -1]].tolist() if stated is None else [stated]
                 plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
             controller.plan = plan
-            _show(screen, controller.plan, spec, robot, limits.max_payload)
+            _show(screen, plan, spec, robot, limits.max_payload)
         if asks:
             how = f"as {asked.targets} says" if motion is None else "as planned"
             require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")

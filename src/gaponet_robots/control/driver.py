@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import numpy as np
+
 from gaponet.arrays import Array
 from gaponet.errors import GAPONetError
 
@@ -43,6 +45,12 @@ class State:
     refused: int = 0
     tilt: float = 0.0
     fault: Fault | None = None
+
+    def qpos_with(self, joints: Array, values: Array) -> Array:
+        """Return the measured position, (n) rad, with other values at some joints."""
+        out = np.array(self.qpos, float)
+        out[joints] = values
+        return out
 
 
 class Driver(Protocol):

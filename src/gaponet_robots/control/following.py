@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from gaponet.arrays import Array
-from gaponet_robots.control.driver import Fault
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model
+from gaponet_robots.control.driver import Fault, State
+from gaponet_robots.control.output import Context, Output
 
 LAG = 0.15  # s: time constant of a servo that is slower than any here; joints are compared with what it would do
 STRIDE = 0.05  # rad of that slow servo's way on which a joint must have moved along
@@ -20,40 +21,35 @@ class Following:
     """Watches the joints of one robot, stride by stride; what is sent to it does not depend on what is found.
 
     Attributes:
+        share: The share of a stride that a joint must go along; 0: nothing is watched.
         shown: Joints (n) that have followed at least once.
     """
 
-    def __init__(self, names: tuple[str, ...], dt: float, share: float) -> None:
-        """
-        Args:
-            names: The commanded joints', (n).
-            dt: Control period, s.
-            share: The share of a stride that a joint must go along; 0: nothing is watched.
-        """
-        self.names, self.dt, self.share = names, dt, share
-        self.shown = np.zeros(len(names), bool)
+    def __init__(self, context: Context) -> None:
+        robot, self.context = context.robot.before_identification, context
+        self.share = 0.0 if context.driver.reads_back else context.safety.following
+        self.shown = np.zeros(len(context.joints), bool)
+        self._model = build_model(robot, context.payload_mass or 0.0) if self.share else None
         self._slow: Array | None = None
+        self._low, self._high, self._least, self._most, self._at_low, self._at_high = np.zeros((6, len(self.shown)))
+        self._state_time = -np.inf
 
-    def rest(self) -> None:
-        """Nothing is commanded that joints could follow."""
-        self._slow = None
-
-    def check(self, command: Array, qpos: Array, effort: Array, load: Callable[[], Array]) -> Fault | None:
+    def check(self, state: State, output: Output) -> Fault | None:
         """Take in one period; the joint that has not followed for long.
 
-        Args:
-            command: Where the robot is asked to be, (n) rad, as far as it was handed over. Not what was sent: that
-                never goes further from a joint than its torque allows, and so goes with one that hangs.
-            qpos: Measured, (n) rad.
-            effort: Measured torque as a share of the effort limit, (n).
-            load: Gravity's torque as a share of it, (n), asked where a joint pushes: one that pushes as hard as it can
-                against a load that it was told of obeys, though it does not move; one that is held does not.
+        A joint that pushes as hard as it can against a load that the payload explains obeys, though it does not move;
+        one that is held does not.
         """
+        if self._model is None or state.time <= self._state_time:
+            return None
+        self._state_time, joints = state.time, self.context.joints
+        limit = output.limits.effort / self.context.safety.torque_share
+        command, qpos = output.expected(), state.qpos[joints]
         if self._slow is None:
             self._slow = command.copy()
             self._low, self._high, self._least, self._most = (command.copy() for _ in range(4))
             self._at_low, self._at_high = qpos.copy(), qpos.copy()
-        slow = self._slow = self._slow + (command - self._slow) * min(1.0, self.dt / LAG)
+        slow = self._slow = self._slow + (command - self._slow) * min(1.0, self.context.dt / LAG)
         lower, higher = slow < self._low, slow > self._high
         self._low, self._at_low = np.where(lower, slow, self._low), np.where(lower, qpos, self._at_low)
         self._high, self._at_high = np.where(higher, slow, self._high), np.where(higher, qpos, self._at_high)
@@ -61,9 +57,10 @@ class Following:
         went = np.where(up, qpos - self._at_low, self._at_high - qpos)
         done = up | down
         side = np.sign(command - qpos)
-        pushes = effort * side >= STRAINED
+        pushes = state.tau[joints] / limit * side >= STRAINED
         if (done & pushes).any():
-            pushes &= load() * side >= LADEN * STRAINED
+            load = static_torque(self._model, state.qpos[None])[0, joints] / limit
+            pushes &= load * side >= LADEN * STRAINED
         follows = done & ((went >= self.share * STRIDE) | pushes)
         self.shown |= follows & ~pushes
         self._least = np.where(follows, slow, np.minimum(self._least, slow))
@@ -77,7 +74,5 @@ class Following:
 
     def blame(self, joint: int) -> Fault:
         """The fault of a joint that does not follow."""
-        return Fault(
-            "obedience", f"{self.names[joint]} does not follow: blocked, limp or not listening (in a mode that ignores "
-            "commands, or to another joint's)"
-        )  # fmt: skip
+        name, ways = self.context.driver.commanded[joint], "in a mode that ignores commands, or to another joint's"
+        return Fault("obedience", f"{name} does not follow: blocked, limp or not listening ({ways})")

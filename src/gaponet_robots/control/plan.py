@@ -10,7 +10,7 @@ clearance may go away from it, but no nearer.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -18,11 +18,14 @@ from gaponet.arrays import Array
 from gaponet.errors import UsageError
 from gaponet.robot import RobotSpec
 from gaponet.sim.dynamics import static_torque
+from gaponet_robots.control.clock import Clock
 from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.safety import Limits, SafetyConfig, limit_delta
 from gaponet_robots.motion.feasible import STILL_SHARE, Feasibility, stretch
 from gaponet_robots.motion.motion import GRID, Motion
 from gaponet_robots.motion.way import Search, Way, ended, find_points
+
+_T = TypeVar("_T")
 
 MOVED = 0.02  # rad by which the robot may have moved since the plan was made
 TOUCH = 0.001  # m by which what was found near may come nearer
@@ -260,10 +263,20 @@ class Planner:
                 f"the plan asks {demand.worst_joint} for {demand.torque:.2f} of the torque that may be used; go slower "
                 "(--blend-speed), or from a posture that is easier to hold"
             )
-        return Plan(
-            plan.found, plan.into, plan.motion, plan.back, float(free.min(initial=np.inf)),
-            self.collision.nearest(free) if len(free) else "", demand.torque, demand.worst_joint, plan.changed,
-        )  # fmt: skip
+        nearest = self.collision.nearest(free) if len(free) else ""
+        clearance = float(free.min(initial=np.inf))
+        return replace(plan, clearance=clearance, nearest=nearest, torque=demand.torque, joint=demand.worst_joint)
+
+
+def advance(search: Search[_T], clock: Clock, seconds: float) -> _T | None:
+    """Continue a search for some seconds; its result, or None where it is not over. UsageError: there is none."""
+    until = clock.now() + seconds
+    try:
+        while clock.now() <= until:
+            next(search)
+    except StopIteration as end:
+        return end.value
+    return None
 
 
 class Fence:
@@ -286,7 +299,7 @@ class Fence:
         self.at = np.array(posture, float)
         self._free = self._found = self.collision.along(self.at[None])
         self._keep = np.full_like(self._free, self.collision.clearance)
-        self.near, self._held, self._calm, self._sagging = "", False, CALM, 1.0
+        self.near, self._held, self._calm, self._sagging, self._sag = "", False, CALM, 1.0, np.zeros_like(self._free)
 
     def homeward(self) -> None:
         """From now on it goes back slowly: it may come as near to everything as it was where it began."""

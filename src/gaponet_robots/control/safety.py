@@ -185,33 +185,10 @@ def damping(kd: Array, qvel: Array, effort: Array) -> Array:
     return np.minimum(kd, effort / np.maximum(speed, 1e-6))
 
 
-FAULTS = {
-    "stale": "no new state for more than `stale` periods, whether none came or all came late",
-    "frozen": "new messages with the same readings",
-    "nan": "a reading is not a number",
-    "jump": "a joint moved faster than it can",
-    "temperature": "a motor is too hot",
-    "overrun": "the loop itself was late",
-    "suspend": "the computer was suspended, while the robot was not",
-    "tracking": "a joint does not follow",
-    "checksum": "too many messages with a wrong checksum",
-    "torque": "no position command is within range, rate and torque",
-    "target": "the motion or the model gave something that is not a number",
-    "plan": "there is no clear way from where the robot was found, or it was found where it cannot be",
-    "silence": "no live target that could be taken for a while",
-    "driver": "the bus failed",
-    "obedience": "the robot does not do what it was told: it ignores commands, reset itself, or its settings changed",
-    "robot": "the robot itself reports an error, or is not the one that was connected",
-    "tilt": "the robot leans too far: it falls",
-    "error": "the motion, the model or this program failed",
-    "stop": "asked for: key, signal, call or the robot's remote",
-}
-
-
-# What is no fault of the robot itself: a robot that cannot brake is lowered then, instead of let fall at once.
+# Kinds of faults, which docs/deploy-safety.md explains. SOFT: no fault of the robot itself; one that cannot brake is
+# lowered then, instead of let fall at once. ASTRAY: a joint did not go where it was sent; what was recorded is no data.
 SOFT = ("stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop")
-
-# A joint did not do what it was told: what was recorded up to then is no data.
+FAULTS = (*SOFT, "frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt")
 ASTRAY = ("obedience", "frozen", "jump", "tracking")
 
 

@@ -55,6 +55,7 @@ class Keys:
     def __init__(self, stop: StopRequest) -> None:
         self.stop = stop
         self._before: list[Any] | None = None
+        self._terminal = -1
 
     def __enter__(self) -> Keys:
         if sys.stdin is not None and sys.stdin.isatty():

@@ -216,7 +216,6 @@ def episode(robot: RobotSpec, rng: np.random.Generator, count: Count) -> None:
     controller = Controller(
         driver, robot, config=QUICK, safety=SAFETY, compensator=Wild(rng, clock), clock=clock, unchecked=True
     )
-    controller.dt = DT
     with contextlib.suppress(RuntimeError):
         controller.run(policy)
     fault = controller.recording.fault

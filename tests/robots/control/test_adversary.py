@@ -4,7 +4,7 @@ import pytest
 from robots.control import adversary
 
 from gaponet.robot import load_robot
-from gaponet_robots.control import controller
+from gaponet_robots.control import output
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +21,6 @@ def test_no_command_leaves_the_limits_of_the_true_state_whatever_happens(robot):
 
 
 def test_a_controller_that_takes_old_states_for_new_would_be_found_out(robot, monkeypatch):
-    real = controller.limit_command
-    monkeypatch.setattr(controller, "limit_command", lambda *a: real(*a[:6]))
+    real = output.limit_command
+    monkeypatch.setattr(output, "limit_command", lambda *a: real(*a[:6]))
     assert adversary.attack(robot, 1500, seed=7).wrong["torque"]

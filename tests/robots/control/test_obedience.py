@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import re
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -30,6 +31,13 @@ serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
 QUICK = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.1, damp=2.0)
 ELBOW, ROLL = 3, 5  # servos
 WHOLE = reg.Register(0, 128)
+
+RNG = random.Random(1)
+SPOILT = {  # what reaches the driver of what servos say
+    "mute": lambda said: b"", "corrupt": lambda said: said[:-1] + bytes(b ^ 255 for b in said[-1:]),
+    "babble": lambda said: RNG.randbytes(600), "lossy": lambda said: said if RNG.random() > 0.03 else b"",
+    "noisy": lambda said: said if RNG.random() > 0.03 else RNG.randbytes(len(said)),
+}  # fmt: skip
 
 
 class Bus:
@@ -70,7 +78,7 @@ class Bus:
             elbow, roll = (bytes(self.arm.memory[servo - 1][42:44]) for servo in (ELBOW, ROLL))
             self.arm.memory[ELBOW - 1][42:44], self.arm.memory[ROLL - 1][42:44] = roll, elbow
             self.arm._apply()
-        self.buffer += (data if self.echo else b"") + out
+        self.buffer += (data if self.echo else b"") + (SPOILT[self.way](out) if wrong and self.way in SPOILT else out)
         return len(data)
 
     def _go_wrong(self) -> None:
@@ -123,7 +131,7 @@ def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch
     arm.close()
 
 
-def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched: object = None) -> Recording:
+def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watchdog: bool = False) -> Recording:
     """One and a half second in which all joints swing."""
     from gaponet_robots.drivers.so101 import SO101Driver
 
@@ -132,10 +140,8 @@ def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watched:
             controller.stop("the operator")
         return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
 
-    controller = Controller(SO101Driver(so101, timeout=0.001), so101, config=QUICK, clock=clock, watchdog=False)
-    if watched:
-        controller._watchdog = watched
-        controller._start_watchdog = lambda lock, stack: stack.callback(lambda: watched.release(controller._loose))
+    driver = SO101Driver(so101, timeout=0.001)
+    controller = Controller(driver, so101, config=QUICK, clock=clock, watchdog=watchdog)
     return controller.run(policy)
 
 
@@ -225,14 +231,16 @@ def test_a_servo_in_error_is_let_go_at_once(so101, clock, bus):
     assert told(bus, reg.TORQUE_LIMIT)[0][0] > off
 
 
-def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus):
+def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus, monkeypatch):
     ends: list[bool] = []
-    bus.way, bus.at = "lost", 1.0
-    recording = play(
-        so101,
-        clock,
-        watched=SimpleNamespace(trouble=lambda: "", fired=lambda: False, beat=lambda weight: True, release=ends.append),
+    monkeypatch.setattr(
+        "gaponet_robots.control.controller.Watchdog",
+        lambda *_: SimpleNamespace(
+            trouble=str, fired=bool, beat=lambda weight: True, release=ends.append, wait_ready=lambda: None
+        ),
     )
+    bus.way, bus.at = "lost", 1.0
+    recording = play(so101, clock, watchdog=True)
     assert recording.fault.kind == "driver"
     last = recording.events[-1]
     assert (last.phase, last.kind) == ("stopped", "driver")
@@ -248,6 +256,20 @@ def test_one_servo_that_says_nothing_more_is_named_and_the_others_are_lowered(so
     assert told(bus, reg.TORQUE_LIMIT)
     assert "could NOT be damped: switch the supply off" in recording.events[-1].text
     assert "servo 4 (wrist_flex)" in recording.events[-1].text
+
+
+@pytest.mark.parametrize("way", ["mute", "corrupt", "babble"])
+def test_a_bus_that_says_nothing_true_any_more_carries_at_most_two_more_goals(so101, clock, bus, way):
+    bus.way, bus.at = way, 1.0
+    assert play(so101, clock).fault.kind in ("stale", "checksum")
+    assert sum(time >= bus.first + bus.at for time, _ in told(bus, reg.GOAL_POSITION)) <= 1 + 2
+    assert bus.get(reg.TORQUE_ENABLE) == [0] * 6
+
+
+@pytest.mark.parametrize("way", ["lossy", "noisy"])
+def test_a_bus_that_loses_or_damages_a_reply_now_and_then_goes_on(so101, clock, bus, way):
+    bus.way, bus.at = way, 0.0
+    assert play(so101, clock).fault is None
 
 
 def test_an_adapter_that_echoes_is_understood(so101, clock, bus):

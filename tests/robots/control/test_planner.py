@@ -15,7 +15,7 @@ from gaponet.robot import RobotSpec, load_robot
 from gaponet.robot_folder import save_robot
 from gaponet_robots.control.clock import SimulatedClock
 from gaponet_robots.control.controller import Controller
-from gaponet_robots.control.driver import State
+from gaponet_robots.control.driver import Fault, State
 from gaponet_robots.control.phases import ControlConfig
 from gaponet_robots.control.plan import Fence, Planner
 from gaponet_robots.control.safety import SafetyConfig
@@ -162,25 +162,30 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
 
 
-@pytest.mark.parametrize("way", ["by way of home", "none"])
+@pytest.mark.parametrize("way", ["by way of home", "none", "none for a robot that does not obey"])
 def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(way, monkeypatch):
     robot = load_robot("h1_2")
     judge, found, far = Contacts(robot), robot.qpos_home.copy(), robot.qpos_home.copy()
     at = robot.index(robot.operated)
     found[at], far[at] = HERE, ACROSS
     controller, sent = virtual(robot, found)
-    driver = controller.driver
-    driver.read = lambda: State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))))
-    controller.watch.noisy = False
+    driver, hears = controller.driver, way in ("by way of home", "none")
+    driver.at_end = "hold" if hears else "hand_over"
+
+    def read():
+        fault = None if hears or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
+        return State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault)
+
+    driver.read, controller.watch.noisy = read, False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = [found, robot.qpos_home, far]
     rows = np.concatenate([Way.along(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)])
 
     def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
-        for _ in find_points(*given) if way != "none" else range(50):
+        for _ in find_points(*given) if way == "by way of home" else range(50):
             controller.clock._now += 0.001
             yield
-        return None if way == "none" else ended(find_points(*given))
+        return ended(find_points(*given)) if way == "by way of home" else None
 
     def policy(k, state):
         if k:
@@ -188,8 +193,12 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
         return rows[k] if k < len(rows) else None
 
     recording = controller.run(policy)
-    assert recording.fault is None, recording.fault
     last = recording.events[-1].text
+    assert (recording.fault is None) == hears, recording.fault
+    if not hears:
+        assert [e.phase for e in recording.events][-3:] == ["blend_out", "release", "stopped"]
+        assert last == "let go; the robot did not obey"
+        return
     assert judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0] == 0
     back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
     if way == "none":

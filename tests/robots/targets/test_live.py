@@ -301,7 +301,7 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
     targets = LiveTargets(wire, so101, so101.joint_names, clock, DT, 5.0)
     driver = VirtualDriver(so101, load_fleet("easy", so101).unit("virtual-1"), clock)
     controller = Controller(driver, so101, config=config, clock=clock)
-    begin = controller._planner.begin
+    begin = controller.readiness.context.planner.begin
 
     def slow(first, found):
         for _ in range(400):
@@ -309,7 +309,7 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
             yield
         return (yield from begin(first, found))
 
-    controller._planner.begin = slow
+    controller.readiness.context.planner.begin = slow
     recording = controller.run(lambda k, state: targets(k, state) if k < 20 else None)
     assert recording.fault is None, recording.fault
     assert [e.phase for e in recording.events] == ["idle", "blend_in", "run", "blend_out", "stopped"]
