@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels parts ends site clean
+.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -37,36 +37,36 @@ slow: setup
 
 # Faults injected over a real bus between processes: minutes, on a machine that is otherwise idle.
 faults: setup
-	$(BIN)/python -m pytest -m faults -rP tests/robots
+	$(BIN)/python -m pytest -m faults -rP tests/hw
 
 # Live targets for ten minutes, from a sender that stalls, floods and dies. LIVE=--realtime, as root, on a busy machine.
 live: setup
-	$(BIN)/python tests/robots/control/live.py --minutes 10 $(LIVE)
+	$(BIN)/python tests/hw/control/live.py --minutes 10 $(LIVE)
 
 # At the other end, in environments of their own in ~/.cache/gaponet: programs on the DDS version of Unitree's SDK (Python
 # 3.10), rclpy of ROS 2 Jazzy and Kilted (Python 3.12): five minutes.
 peers: setup
-	$(BIN)/python -m pytest -m peers -s tests/robots
+	$(BIN)/python -m pytest -m peers -s tests/hw
 
 # MuJoCo, MJX, mjlab, Isaac Lab, Newton and Drake (environments of their own in ~/.cache/gaponet, 14 GB) play exports beside ours,
 # and mjlab and Isaac Lab train in one: half an hour.
 engines: setup
-	$(BIN)/python -m pytest -m peers -s tests/interop/engine
+	$(BIN)/python -m pytest -m peers -s tests/export
 
 # SeaweedFS (S3) and a stand-in of GCS (in an environment of their own in ~/.cache/gaponet) take pushes and pulls: minutes.
 buckets: setup
-	$(BIN)/python -m pytest -m peers -s tests/interop/share
+	$(BIN)/python -m pytest -m peers -s tests/share
 
 # Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.
 browser: setup
 	$(BIN)/pip install -q -e ".[dev,view]"
-	$(BIN)/python -m pytest -m browser -s tests/lab/view
+	$(BIN)/python -m pytest -m browser -s tests/report/view
 
 # A million random and adversarial states through controller and limits, in simulated time; then found poses against plans and
 # hostile live targets against the fence, judged by MuJoCo: minutes, then half an hour; counts as JSON.
 adversary: setup
-	OMP_NUM_THREADS=1 $(BIN)/python tests/robots/control/adversary.py --states 1000000
-	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/robots/control/plan_adversary.py --poses 1000 --seconds 60
+	OMP_NUM_THREADS=1 $(BIN)/python tests/hw/control/adversary.py --states 1000000
+	OMP_NUM_THREADS=1 PYTHONPATH=tests $(BIN)/python tests/hw/control/plan_adversary.py --poses 1000 --seconds 60
 
 # Ten small robots that nobody tuned on, beside the plain script: minutes, resumable; exit code 1 where one loses.
 tournament: setup
@@ -80,7 +80,7 @@ fuzz: setup
 
 # Files of some bytes that ask for gigabytes or for ever, each opened by its command: five minutes, on Linux.
 hostile: setup
-	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m process.hostile
+	OMP_NUM_THREADS=1 PYTHONPATH=src:tests $(BIN)/python -m base.hostile
 
 # Every command that writes, killed, on full and read-only disks, twice at once: half an hour; disks need root. Then ranks
 # of torchrun killed and frozen: five minutes.
@@ -113,7 +113,7 @@ check: setup
 
 # What is promised on Windows: from logs to a report.
 windows: setup
-	$(BIN)/python -m pytest tests/test_api.py tests/test_files.py tests/whole/test_windows.py tests/data tests/sim tests/model tests/training tests/eval
+	$(BIN)/python -m pytest tests/test_api.py tests/base/test_files.py tests/whole/test_windows.py tests/data tests/sim tests/sysid/test_*.py tests/nn $(wildcard tests/report/test_*.py)
 
 # These three need the package index, and uv from it in .tools.
 .tools/.done:
@@ -128,10 +128,6 @@ resolve: .tools/.done
 # Wheel and sdist, tried in clean environments outside of the checkout, one for each extra.
 wheels: .tools/.done
 	$(TOOLS) $(PYTHON) .ci/wheels.py
-
-# The core alone, then each other part on it: wheels of their own in clean environments, with their tests: half an hour.
-parts: .tools/.done
-	$(TOOLS) $(PYTHON) .ci/parts.py $(PARTS)
 
 # The tests with the lowest versions that pyproject.toml allows, and with the newest.
 TESTS ?= tests

@@ -24,7 +24,7 @@ variants = 3
 SMALL = "--warm-start.rounds 2 --warm-start.num-envs 16 --warm-start.steps 60 --warm-start.sensor-states 64"
 GYM = """
 import gaponet as gp, numpy as np
-from gaponet_interop.gym import TrackingEnv
+from gaponet.deploy.gym import TrackingEnv
 env = TrackingEnv(gp.AlignedSim(gp.load_robot("so101"), gp.GapModel.load("run")), [np.zeros((50, 6))])
 env.reset(seed=0)
 print("reward", env.step(env.action_space.sample())[1])

@@ -17,10 +17,10 @@ import numpy as np
 
 import gaponet as gp
 from gaponet.data.sequence import Sequence
-from gaponet.metrics import standard_error
-from gaponet.robot import SERVO, RobotSpec, load_robot
-from gaponet.sim.identify import identify
+from gaponet.robot.spec import SERVO, RobotSpec, load_robot
+from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
+from gaponet.sysid.identify import identify
 
 LAWS = {
     "classic": ("limit",),

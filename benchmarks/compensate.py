@@ -14,11 +14,11 @@ import tyro
 
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
-from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import idle_joints
-from gaponet_robots.virtual.fleet import load_fleet
-from gaponet_robots.virtual.unit import VirtualRobot
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.unit import VirtualRobot
 
 Array = np.ndarray
 WARMTH = 12.0  # K above ambient

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 from strangers import Recording, Stranger, draw
 
-from gaponet.data.checks.finding import Finding
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.data.store import Dataset
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding
+from gaponet.robot.new import Wanted, new_robot
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import gravity_of
-from gaponet_interop.setup.new import Wanted, new_robot
 
 MOTIONS, SECONDS = 8, 18.0
 Logs = list[Recording]

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import tyro
 
-from gaponet.data.store import Dataset
-from gaponet.eval.candidate import read_origin
-from gaponet.files import write_text
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
-from gaponet_interop.engine import folder as exporting
-from gaponet_interop.engine.forms import comparable, left, plain_form, recordings_of
-from gaponet_interop.engine.mujoco_servos import read
+from gaponet.base.files import write_text
+from gaponet.export import folder as exporting
+from gaponet.export.forms import comparable, left, plain_form, recordings_of
+from gaponet.export.mujoco_servos import read
+from gaponet.report.candidate import read_origin
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.share.reading import opened
 
 CACHE = Path.home() / ".cache" / "gaponet"
 CHECKS = {  # environment → export, check, what runs in it
@@ -62,7 +62,7 @@ def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> No
     """Print what each form leaves of the test motions that the robot's own folder names."""
     origin = read_origin(robot)
     assert origin is not None
-    dataset = Dataset.opened(str(robot / origin["dataset"]))
+    dataset = opened(str(robot / origin["dataset"]))
     hashes = set(origin["parts"]["test"].values())
     motions = comparable(dataset.sequences([e for e in dataset.entries if e.hash in hashes]), spec, 0.0)
     facts = read(exported / "facts.json")

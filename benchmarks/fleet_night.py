@@ -30,18 +30,18 @@ import known as days
 import numpy as np
 from kill_workers import SIGN, busiest
 
+from gaponet.base.executor import opened
+from gaponet.base.progress import silent
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
-from gaponet.executor import opened
-from gaponet.progress import silent
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
-from gaponet.sim.axes import CLASSIC, Bounds
-from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import Clock, Fit
-from gaponet.sim.joint_runs import JointRuns
-from gaponet_lab.known.evidence import known
-from gaponet_robots.virtual.fleet import draw, load_fleet
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.axes import CLASSIC, Bounds
+from gaponet.sysid.evidence import known
+from gaponet.sysid.fit import Clock, Fit
+from gaponet.sysid.free_runs import cut
+from gaponet.sysid.joint_runs import JointRuns
+from gaponet.testing.fleet import draw, load_fleet
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import write_arm
@@ -143,7 +143,7 @@ def _write(folder: Path, logs: list[Sequence]) -> None:
 def _night(work: Path, name: str) -> dict[str, float]:
     """One robot's, in a worker: seconds of processor by step."""
     import gaponet as gp
-    from gaponet_lab.known.fleet import Job, ask
+    from gaponet.fleet import Job, ask
 
     took, data, spent = dict[str, float](), work / "data" / name, lambda: sum(os.times()[:4])  # with its own children
     shutil.rmtree(data, ignore_errors=True)  # of a worker that was killed

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 import warp
 
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.warp import WarpSim
 

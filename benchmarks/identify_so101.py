@@ -22,12 +22,13 @@ import numpy as np
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.metrics import runs, standard_error, summary
-from gaponet.robot import RobotSpec, Table, load_robot
-from gaponet.robot_folder import save_robot
-from gaponet.sim.identify import Identified, identify
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, Table, load_robot
+from gaponet.sim.metrics import runs, standard_error, summary
 from gaponet.sim.replay import replay
-from gaponet.sim.touching import tip_heights
+from gaponet.sysid.fit import Identified
+from gaponet.sysid.identify import identify
+from gaponet.sysid.touching import tip_heights
 
 KNOWN = {"kp": 15.0, "damping": 1.1, "frictionloss": 0.1, "armature": 0.028, "delay": 0.006, "stribeck": 0.1,
          "stribeck_speed": 0.08, "friction_motor": 0.1}  # fmt: skip

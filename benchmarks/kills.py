@@ -35,11 +35,11 @@ from typing import Any
 
 import numpy as np
 
-import gaponet.model.export  # what a child needs is there before it is forked
-import gaponet.training.run  # noqa: F401
+import gaponet.nn.onnx_export  # what a child needs is there before it is forked
+import gaponet.nn.training.run  # noqa: F401
+from gaponet.base.files import MARK
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
-from gaponet.files import MARK
 
 TRAIN = ["--model.history", "2", "--warm-start.num-envs", "16", "--warm-start.steps", "40", "--warm-start.rounds", "3",
          "--ppo.num-envs", "16", "--ppo.num-steps", "16", "--validate-every", "2"]  # fmt: skip

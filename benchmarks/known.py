@@ -23,25 +23,26 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.base.progress import silent
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.eval.knowledge import Knowledge
-from gaponet.progress import silent
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
-from gaponet.sim.axes import CLASSIC, Bounds, first_values
-from gaponet.sim.free_runs import cut
-from gaponet.sim.identify import Clock, Fit, identify
-from gaponet.sim.joint_runs import JointRuns
+from gaponet.export.ranges import ranges
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
-from gaponet.sim.touching import tip_heights, touching_below
-from gaponet_interop.engine.ranges import ranges
-from gaponet_lab.known.drift import drift
-from gaponet_lab.known.evidence import WINDOWS, known
-from gaponet_robots.virtual.fleet import draw, load_fleet
-from gaponet_robots.virtual.physics import Physics
-from gaponet_robots.virtual.unit import VirtualRobot
+from gaponet.sysid.axes import CLASSIC, Bounds, first_values
+from gaponet.sysid.drift import drift
+from gaponet.sysid.evidence import WINDOWS, known
+from gaponet.sysid.fit import Clock, Fit
+from gaponet.sysid.free_runs import cut
+from gaponet.sysid.identify import identify
+from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.touching import tip_heights, touching_below
+from gaponet.testing.fleet import draw, load_fleet
+from gaponet.testing.physics import Physics
+from gaponet.testing.unit import VirtualRobot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import write_arm

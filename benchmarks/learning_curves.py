@@ -13,8 +13,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from gaponet.training.kept import PROGRESS
-from gaponet_lab.plot.style import figure, legend, save, styled
+from gaponet.nn.training.kept import PROGRESS
+from gaponet.report.figures.style import figure, legend, save, styled
 
 COLOURS = ("#c8102e", "#d99000", "#8e1b3a", "#3b7dd8", "#2a9d6f", "#7a8fe0")
 TICKS = (0.1, 0.3, 1, 3, 10)  # millions

@@ -26,7 +26,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import tyro
 
-from gaponet.robot import load_robot
+from gaponet.robot.spec import load_robot
 
 GAPONET = [sys.executable, "-m", "gaponet"]
 WAYS: dict[str, dict[str, bool] | None] = {"uncorrected": None, "corrected": {}, "dynamics": {"dynamics": True}}

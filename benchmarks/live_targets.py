@@ -15,8 +15,8 @@ import tyro
 from compensate import AT_ONCE, SKIP, _motions, play
 
 from gaponet.data.store import Dataset
-from gaponet.model.artifact import GapModel
-from gaponet.robot import load_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import load_robot
 
 Array = np.ndarray
 STREAMS = {  # mean jitter, s; share of messages that are lost

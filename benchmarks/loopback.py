@@ -17,11 +17,11 @@ from dataclasses import replace
 import numpy as np
 import tyro
 
-from gaponet.robot import load_robot
-from gaponet_robots.control.controller import Controller
-from gaponet_robots.control.phases import ControlConfig
-from gaponet_robots.control.safety import SafetyConfig
-from gaponet_robots.drivers.unitree import UnitreeDriver
+from gaponet.hw.control.controller import Controller
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.safety import SafetyConfig
+from gaponet.hw.drivers.unitree import UnitreeDriver
+from gaponet.robot.spec import load_robot
 
 
 def main(

@@ -24,26 +24,26 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.progress import silent
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.eval.knowledge import Knowledge, seen
-from gaponet.progress import silent
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
-from gaponet.sim.axes import CLASSIC, Axes, Bounds, first_values
-from gaponet.sim.free_runs import FreeRuns, cut
-from gaponet.sim.identify import Clock, Fit
-from gaponet.sim.joint_runs import JointRuns
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
-from gaponet.sim.touching import tip_heights, touching_below
-from gaponet_lab.known.evidence import known
-from gaponet_robots.motion.library import Library
-from gaponet_robots.motion.motion import Motion
-from gaponet_robots.motion.telling import Telling, candidates, expected, open_gains
-from gaponet_robots.virtual.fleet import draw, load_fleet
-from gaponet_robots.virtual.physics import Physics
-from gaponet_robots.virtual.unit import VirtualRobot
+from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
+from gaponet.sysid.evidence import known
+from gaponet.sysid.fit import Clock, Fit
+from gaponet.sysid.free_runs import FreeRuns, cut
+from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.knowledge import Knowledge, seen
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.motion import Motion
+from gaponet.sysid.motion.telling import Telling, candidates, expected, open_gains
+from gaponet.sysid.touching import tip_heights, touching_below
+from gaponet.testing.fleet import draw, load_fleet
+from gaponet.testing.physics import Physics
+from gaponet.testing.unit import VirtualRobot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from arm import TOML, XML, write_arm

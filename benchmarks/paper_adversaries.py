@@ -25,14 +25,14 @@ import torch
 from torch import Tensor
 from virtual_h1_2 import run
 
+from gaponet.base.spread import Table
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.metrics import metrics, runs
-from gaponet.model.artifact import GapModel
-from gaponet.model.paper import PaperNet
-from gaponet.robot import load_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.paper import PaperNet
+from gaponet.robot.spec import load_robot
+from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.replay import Corrector, replay
-from gaponet.spread import Table
 
 PAPER = ("--model", "paper", "--recipe", "paper")
 START_STEPS = 3 * 256 * 400  # control steps of the three rounds of the supervised start

@@ -20,9 +20,9 @@ from scipy.optimize import least_squares
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
-from gaponet.data.store import open_dataset
-from gaponet.robot import RobotSpec
-from gaponet.robot_folder import save_robot
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec
+from gaponet.share.reading import open_dataset
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 

@@ -23,12 +23,12 @@ from finetune_policy import Task, TrackingEnv, Unit, follow, make_runner, motion
 from policy_transfer import LEARN_SEED, TRY_SEED, Several
 
 from gaponet.cli.main import main as gaponet
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.sim.axes import first_values
-from gaponet_interop.engine import ranges as drawing
-from gaponet_interop.engine.ranges import ranges
-from gaponet_robots.virtual.fleet import draw, load_fleet
-from gaponet_robots.virtual.unit import VirtualRobot
+from gaponet.export import ranges as drawing
+from gaponet.export.ranges import ranges
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.axes import first_values
+from gaponet.testing.fleet import draw, load_fleet
+from gaponet.testing.unit import VirtualRobot
 
 KNOWN, UNSEEN, DRAWS, GOOD = 4, 12, 16, 0.01  # units, units, robots to learn in, rad
 WIDE = {"kp": (0.7, 1.3), "damping": (0.5, 2.0), "frictionloss": (0.5, 2.0), "armature": (0.5, 2.0)}  # of nominal

@@ -39,18 +39,18 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.data.split import one_motion
-from gaponet.metrics import standard_error
-from gaponet.model.backends import FunctionNetwork
-from gaponet.model.corrector import DeltaCorrector
-from gaponet.model.loop import DeltaLoop
-from gaponet.model.paper import PaperNet, released_inputs, released_network
-from gaponet.model.sensor import ProbeOracle
-from gaponet.robot import RobotSpec
+from gaponet.experiments.real.cards import prepare, read_cards
+from gaponet.experiments.real.rivals import Answer
+from gaponet.nn.backends import FunctionNetwork
+from gaponet.nn.corrector import DeltaCorrector
+from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.paper import PaperNet, released_inputs, released_network
+from gaponet.nn.sensor import ProbeOracle
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet_lab.real.cards import prepare, read_cards
-from gaponet_lab.real.rivals import Answer
+from gaponet.sim.metrics import standard_error
 
 LIMIT = 1e-6  # rad
 STATES, JOINTS = 300, 10

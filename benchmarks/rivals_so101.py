@@ -24,12 +24,12 @@ from pathlib import Path
 import numpy as np
 from identify_so101 import rows
 
+from gaponet.base.files import write_text
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.files import write_text
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
 

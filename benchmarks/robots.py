@@ -29,15 +29,15 @@ import numpy as np
 from plain_fit import plain_fit
 from strangers import SPOILS, Stranger, draw, spoiled
 
+from gaponet.base.files import write_text
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
-from gaponet.data.store import open_dataset
-from gaponet.files import write_text
-from gaponet.metrics import standard_error
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.report.figures.style import figure, save, styled
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.share.reading import open_dataset
+from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import whole_errors
-from gaponet_lab.plot.style import figure, save, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,19 +25,19 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
 from gaponet.data.sequence import Sequence
-from gaponet.model.baselines.mlp import DeltaMLP
-from gaponet.model.config import ModelConfig
-from gaponet.model.deeponet import build_network
-from gaponet.model.layers import dense, size
-from gaponet.model.loop import DeltaLoop
-from gaponet.model.observation import History
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.experiments.speed.training import bench_train, recordings
+from gaponet.experiments.speed.turns import Turn
+from gaponet.nn.baselines.mlp import DeltaMLP
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.layers import dense, size
+from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.observation import History
+from gaponet.nn.training.config import RewardConfig, TrainConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import idle_limbs
-from gaponet.training.config import RewardConfig, TrainConfig
-from gaponet.training.env import DeltaEnv
-from gaponet_lab.bench.training import bench_train, recordings
-from gaponet_lab.bench.turns import Turn
 
 Array = np.ndarray
 

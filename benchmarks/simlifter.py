@@ -26,15 +26,15 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.data.json_file import write_json
+from gaponet.base.json_file import write_json
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.model.config import ModelConfig
-from gaponet.robot import load_robot
+from gaponet.experiments.kept import read_kept
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.config import RewardConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import model_hash
-from gaponet.training.config import RewardConfig
-from gaponet.training.env import DeltaEnv
-from gaponet_lab.kept import read_kept
 
 DOCS = Path(__file__).parents[1] / "docs" / "results"
 FIGURES = ("composition", "joint_ranges", "torque_temperature", "real_and_twin", "gap_by_payload")

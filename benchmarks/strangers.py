@@ -22,7 +22,7 @@ PUBLIC = {  # model → joints that are welded where it stands: slides, wheels, 
     "boston_dynamics_spot/spot.xml": (), "wonik_allegro/right_hand.xml": (), "aloha/aloha.xml": ("finger",),
     "shadow_hand/right_hand.xml": ("FFJ1", "FFJ2", "MFJ1", "MFJ2", "RFJ1", "RFJ2", "LFJ1", "LFJ2"),
 }  # fmt: skip
-PACKAGED = Path(__file__).parents[1] / "src" / "gaponet" / "robots"  # more names
+PACKAGED = Path(__file__).parents[1] / "src" / "gaponet" / "robot" / "robots"  # more names
 RATES = (25, 30, 50, 60, 100, 125, 200, 240, 250, 500, 1000)  # Hz
 LAWS = (
     "stribeck",

@@ -15,15 +15,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.eval.verdict import Added
-from gaponet.robot import RobotSpec
+from gaponet.experiments.real.questions import Question, rehearsal
+from gaponet.experiments.real.rivals import LEFT_OUT, Answer, identified
+from gaponet.nn.training.labels import trajectory_labels
+from gaponet.nn.training.validation import added
+from gaponet.report.verdict import Added
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
-from gaponet.training.labels import trajectory_labels
-from gaponet.training.validation import added
-from gaponet_lab.real.questions import Question, rehearsal
-from gaponet_lab.real.rivals import LEFT_OUT, Answer, identified
 
 LIMIT, ROUNDS, TREES, LEAF, MOST = 0.3, 1, 120, 60, 60_000  # rad, rounds of DAgger, of each joint, rows, rows fitted
 

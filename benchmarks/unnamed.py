@@ -23,18 +23,18 @@ import numpy as np
 from trees import LIMIT, Trees
 from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.spread import Spread, Table
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.metrics import standard_error
-from gaponet.model import calibration
-from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.nn import calibration
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.training.labels import trajectory_labels
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import Corrector
-from gaponet.spread import Spread, Table
-from gaponet.training.labels import trajectory_labels
 
 SHUFFLED = "trees-shuffled"
 

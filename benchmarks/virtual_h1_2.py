@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.metrics import metrics, runs
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.metrics import metrics, runs
 from gaponet.sim.replay import Corrector, replay
 
 RECIPE = Path(__file__).with_suffix(".toml")

@@ -29,13 +29,13 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import inverse_dynamics
 from gaponet.sim.model import build_model, idle_joints
-from gaponet_robots.motion.library import Library
-from gaponet_robots.virtual.fleet import load_fleet
-from gaponet_robots.virtual.unit import VirtualRobot
+from gaponet.sysid.motion.library import Library
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.unit import VirtualRobot
 
 Array = np.ndarray
 

@@ -5,7 +5,7 @@
 
 A VIRTUAL robot plays excitation, `gaponet identify` makes a robot folder of the recordings, and a small network learns
 by PPO to make the arm follow motions: in the simulator as its file says, in the identified one, and in sixteen of those
-that differ by what identification does not know (gaponet_interop.engine.rollout.drawn_robots). All are played on
+that differ by what identification does not know (gaponet.export.rollout.drawn_robots). All are played on
 the VIRTUAL robot, on motions that nothing has learnt from. Last, `gaponet replay` is asked, before the robot is, what
 it will do under the targets of the nominal policy's own rollout.
 """
@@ -26,8 +26,8 @@ from tensordict import TensorDict
 
 from gaponet.cli.main import main as gaponet
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.robot import RobotSpec, load_robot
-from gaponet_interop.engine.rollout import drawn_robots
+from gaponet.export.rollout import drawn_robots
+from gaponet.robot.spec import RobotSpec, load_robot
 
 Array = np.ndarray
 RECORDED_SEED, LEARN_SEED, TRY_SEED = 0, 101, 202  # other numbers make other motions

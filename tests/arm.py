@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import build_model
 
 XML = """

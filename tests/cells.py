@@ -6,8 +6,8 @@ import errno
 import os
 import time
 
-from gaponet.errors import ModelError
-from gaponet_lab.study.pool import Cell, Tell
+from gaponet.base.errors import ModelError
+from gaponet.experiments.pool import Cell, Tell
 
 
 def note_threads(cell: Cell, tell: Tell) -> None:

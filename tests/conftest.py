@@ -2,7 +2,6 @@
 
 import os
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -14,25 +13,9 @@ from arm import write_arm
 
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
-
-OTHERS = ("whole", "robots", "lab", "interop", "fuzzing", "examples")  # folders of tests
-MISSING = [part for part in ("gaponet_robots", "gaponet_lab", "gaponet_interop") if find_spec(part) is None]
-
-
-def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """With the core alone its own tests are collected: those that import no other part."""
-    if not MISSING or collection_path.is_dir():
-        return (
-            bool(MISSING) and collection_path.name in ("whole", "robots", "lab", "interop", "fuzzing", "examples")
-        ) or None
-    if collection_path.suffix != ".py":
-        return None
-    text = collection_path.read_text(encoding="utf-8")
-    return any(part in text for part in MISSING) or None
-
 
 SHARED = Path(os.environ.get("GAPONET_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

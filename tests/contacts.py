@@ -13,7 +13,7 @@ import tomllib
 import mujoco
 import numpy as np
 
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 
 class Contacts:

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 from logs import write_sage
 
+from gaponet.base.errors import GAPONetError
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.importer import import_logs
-from gaponet.errors import GAPONetError
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import gravity_of
 from gaponet.sim.model import build_model
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from arm import TOML
 
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot
 
 COMMON = """<mujocoinclude>
   <default>

@@ -6,7 +6,7 @@ import os
 import signal
 from pathlib import Path
 
-from gaponet.errors import UsageError
+from gaponet.base.errors import UsageError
 
 
 def dies_at_first(job: tuple[Path, int]) -> tuple[int, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.data.sequence import Sequence, SequenceMeta
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 SERVO_NAMES = ("Rotation", "Pitch", "Elbow", "Wrist_Pitch", "Wrist_Roll", "Jaw")
 SO101 = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")

@@ -12,8 +12,8 @@ from arm import recordings
 from runs import untrained
 
 from gaponet.data.store import Dataset
-from gaponet.eval.evaluate import evaluate
-from gaponet.robot import RobotSpec
+from gaponet.report.evaluate import evaluate
+from gaponet.robot.spec import RobotSpec
 
 FACTS = {
     "hours": 0.1, "steps": 10, "seconds": 60.0, "excess_delay": 0.0, "parity_rad": 1e-7, "dataset_hash": "0123",

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from gaponet.data.store import Dataset
-from gaponet.model.artifact import GapModel, make_card
-from gaponet.model.config import ModelConfig
-from gaponet.model.deeponet import build_network
-from gaponet.model.export import drawn_states, export
-from gaponet.robot import RobotSpec
-from gaponet.robot_folder import save_robot
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec
 
 
 def untrained(folder: Path, robot: RobotSpec, data: Dataset, kind: str = "gaponet", **parts: tuple[str, ...]) -> Path:

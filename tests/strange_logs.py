@@ -103,7 +103,7 @@ def write_bag(
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    from gaponet_interop.formats.rosbag import CONTROLLER, HG
+    from gaponet.data.formats.rosbag import CONTROLLER, HG
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in HG.items():

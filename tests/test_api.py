@@ -9,8 +9,8 @@ from arm import recordings, write_arm
 
 import gaponet as gp
 from gaponet.data.store import Dataset
-from gaponet.model.config import ModelConfig
-from gaponet.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.config import TrainConfig, WarmStartConfig
 
 
 def test_public_names_are_there_and_what_is_not_says_what_is():

@@ -1,43 +1,45 @@
 """The house: what is loaded when, and which way imports go."""
 
 import ast
-import importlib
 import subprocess
 import sys
 from pathlib import Path
 
-import gaponet
+import pytest
 
-SOURCE = Path(gaponet.__file__).parents[1]
-# Part → the parts that it may import from. The core knows no other by name: it asks gaponet.parts.
-PARTS = {
-    "gaponet": {"gaponet"}, "gaponet_robots": {"gaponet", "gaponet_robots"},
-    "gaponet_interop": {"gaponet", "gaponet_interop"}, "gaponet_lab": {"gaponet", "gaponet_robots", "gaponet_lab"},
-}  # fmt: skip
-# Within a part a module may import from its own rank or a lower one, also inside functions. The ground floor: all
-# modules of the part's top folder that are not named here, and process/.
-RANKS = {
-    "gaponet": [
-        {"data"}, {"metrics"}, {"sim"}, {"model"}, {"training", "deploy"}, {"eval"}, {"api"}, {"cli"},
-    ],
-    "gaponet_robots": [{"motion"}, {"control", "drivers", "targets", "virtual"}, {"cli"}],
-    "gaponet_interop": [{"formats", "writers", "engine", "setup"}, {"share"}, {"cli"}],
-    "gaponet_lab": [{"plot"}, {"view", "report", "bench", "real", "known"}, {"study"}, {"cli"}],
-}  # fmt: skip
+import gaponet
+from gaponet.cli.main import COMMANDS, TASKS
+from gaponet.data.formats import FORMATS
+from gaponet.data.writers import WRITERS
+
+PACKAGE = Path(gaponet.__file__).parent
+# Sub-packages and modules of gaponet. Each may import from itself and from those before it, also inside functions.
+RANKS = (
+    "base", "plugins", "robot", "data", "sim", "sysid", "nn", "deploy", "hw", "testing", "report", "share", "export",
+    "experiments", "api", "fleet", "cli", "__main__",
+)  # fmt: skip
+# The same within sub-packages: these folders may be imported by those after them, never by what lies beside them.
+INNER = {"nn": ("training",), "sysid": ("motion",), "report": ("figures", "view"), "experiments": ("played",)}
+BESIDE = {"report": {"report"}}  # modules above the folders beside them
 HEAVY = ("mujoco", "torch", "pyarrow", "scipy", "rich", "tyro", "matplotlib", "onnxruntime", "rsl_rl", "pydantic")
 MODULES = {
-    ".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__"): file
-    for part in PARTS
-    for file in (SOURCE / part).rglob("*.py")
+    ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): file
+    for file in PACKAGE.rglob("*.py")
 }
-MOST = {"gaponet": 19, "sim": 17}  # files in a folder; 16 in all others
+MOST = {"cli": 30, "sysid": 17}  # files in a folder; 16 in all others
 
 
 def rank(module: str) -> int:
-    part, name = module.split(".")[:2]
-    ranks = RANKS[part]
-    assert (SOURCE / part / f"{name}.py").is_file() or name in {"process"}.union(*ranks), f"{module} has no rank"
-    return next((i for i, names in enumerate(ranks, 1) if name in names), 0)
+    return RANKS.index(module.split(".")[1])
+
+
+def inner_rank(module: str) -> int:
+    """Place of a module in its sub-package: 0 beside the folders of INNER, then in their order, then BESIDE."""
+    _, package, *rest = module.split(".")
+    folders = INNER.get(package, ())
+    if rest and rest[0] in BESIDE.get(package, ()):
+        return len(folders) + 1
+    return folders.index(rest[0]) + 1 if rest and rest[0] in folders else 0
 
 
 def top_level_imports(tree: ast.Module) -> list[str]:
@@ -79,27 +81,29 @@ def test_import_gaponet_loads_numpy_alone():
     assert out.strip() == "[]"
 
 
-def test_imports_go_one_way():
-    for name, file in MODULES.items():
-        if name.split(".")[1:2] in ([], ["__main__"]):
-            continue
-        part = name.split(".")[0]
-        for other in imported(file) - PARTS.keys():
-            of = other.split(".")[0]
-            assert of in PARTS[part], f"{file} imports {other} of a part that may be missing"
-            assert of != part or rank(other) <= rank(name), f"{file} imports {other}"
+@pytest.mark.parametrize("package", RANKS)
+def test_a_sub_package_imports_only_from_itself_and_from_lower_ones(package):
+    names = [name for name in MODULES if name.split(".")[1:2] == [package]]
+    assert names
+    for name in names:
+        for other in imported(MODULES[name]) - {"gaponet"}:
+            assert rank(other) <= rank(name), f"{name} imports {other}"
+            if rank(other) == rank(name):
+                assert inner_rank(other) <= inner_rank(name), f"{name} imports {other}"
 
 
-def test_what_the_parts_offer_is_there():
-    for part in sorted(PARTS.keys() - {"gaponet"}):
-        tables = {k: v for k, v in vars(importlib.import_module(part)).items() if k.isupper()}
-        assert tables
-        for where in (where for table in tables.values() for where in table.values()):
-            module, _, name = where.partition(":")
-            tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
-            assert not name or name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef)}, (
-                where
-            )
+def test_every_sub_package_has_a_rank():
+    assert {name.split(".")[1] for name in MODULES if "." in name} == set(RANKS)
+
+
+def test_what_the_tables_of_commands_formats_and_writers_name_is_there():
+    assert sorted(COMMANDS) == sorted(name for names in TASKS.values() for name in names)
+    homes = {PACKAGE / "data" / kind / f"{name}.py" for kind in ("formats", "writers") for name in ("npz", "lerobot")}
+    assert homes <= {MODULES[where] for where in (*FORMATS.values(), *WRITERS.values())}
+    for where in (*COMMANDS.values(), *FORMATS.values(), *WRITERS.values()):
+        module, _, name = where.partition(":")
+        tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
+        assert not name or name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}, where
 
 
 def test_no_module_imports_one_that_imports_it_not_even_in_a_function():
@@ -118,25 +122,19 @@ def test_no_folder_is_more_than_a_newcomer_can_hold():
 
 
 def test_torch_is_imported_only_where_networks_live():
-    allowed = {f"gaponet/model/{name}.py" for name in ("deeponet", "export", "fuse", "layers", "paper")}
-    allowed |= {"gaponet/sim/warp.py"}  # steps on a GPU
-    allowed |= {f"gaponet/model/baselines/{name}.py" for name in ("mlp", "transformer")}
-    free = ("gaponet/training/", "gaponet_interop/engine/", "gaponet_lab/bench/", "gaponet_lab/study/pool.py")
+    allowed = {f"nn/{name}.py" for name in ("deeponet", "fuse", "layers", "onnx_export", "paper")}
+    allowed |= {"sim/warp.py"}  # steps on a GPU
+    allowed |= {f"nn/baselines/{name}.py" for name in ("mlp", "transformer")}
+    free = ("nn/training/", "export/", "experiments/speed/", "experiments/pool.py")
     for file in MODULES.values():
-        place = file.relative_to(SOURCE).as_posix()
+        place = file.relative_to(PACKAGE).as_posix()
         names = top_level_imports(ast.parse(file.read_text(encoding="utf-8")))
         uses = "import torch" in file.read_text(encoding="utf-8") or any(n.split(".")[0] == "rsl_rl" for n in names)
         assert not uses or place in allowed or place.startswith(free), place
 
 
 def test_what_may_run_on_a_robot_never_imports_training():
-    for folder in (
-        "gaponet/model",
-        "gaponet/deploy",
-        "gaponet/eval",
-        "gaponet_robots",
-        "gaponet_interop",
-        "gaponet_lab/view",
-    ):
-        for file in (SOURCE / folder).rglob("*.py"):
-            assert "gaponet.training" not in file.read_text(encoding="utf-8"), file
+    for name, file in MODULES.items():
+        part = name.split(".")[1:]
+        if part and part[0] not in ("experiments", "api", "cli") and part[:2] != ["nn", "training"]:
+            assert "gaponet.nn.training" not in file.read_text(encoding="utf-8"), file

@@ -1,4 +1,4 @@
-"""What each of two processes that torchrun started does for tests/training/test_ranks.py: python two_ranks.py PLACE.
+"""What each of two processes that torchrun started does for tests/nn/training/test_ranks.py: python two_ranks.py PLACE.
 
 Each writes what it saw to PLACE/RANK.json.
 """
@@ -13,12 +13,12 @@ from pathlib import Path
 import torch
 
 from gaponet import api
-from gaponet.errors import ModelError
-from gaponet.model.config import ModelConfig
-from gaponet.model.layers import Standardise
-from gaponet.training import ranks
-from gaponet.training.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.training.run import Trainer
+from gaponet.base.errors import ModelError
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.layers import Standardise
+from gaponet.nn.training import ranks
+from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.run import Trainer
 
 CONFIG = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.model.artifact import GapModel, make_card
-from gaponet.model.backends import Bound
-from gaponet.model.config import ModelConfig
-from gaponet.robot import RobotSpec
-from gaponet_lab.study.played.trained import Trained
-from gaponet_lab.study.result import Result
-from gaponet_robots.virtual.physics import Physics, neutral
+from gaponet.experiments.played.trained import Trained
+from gaponet.experiments.result import Result
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.backends import Bound
+from gaponet.nn.config import ModelConfig
+from gaponet.robot.spec import RobotSpec
+from gaponet.testing.physics import Physics, neutral
 
 WEAK = 0.8  # of the gain: what such a servo does with u, the nominal one does with u + (0.8 − 1) (u − q)
 CONFIG = ModelConfig(history=2, payload_max=0.4)

@@ -25,8 +25,8 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from gaponet.process import child
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.base import child
+from gaponet.robot.spec import RobotSpec, load_robot
 
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
 FOLLOWERS = ("so_follower", "so101_follower")  # LeRobot's names of it, newest first
@@ -135,9 +135,9 @@ class GaponetSO101(Robot):
         """Servos are left as they are set; the limits and the model's card ask what they have."""
 
     def connect(self, calibrate: bool = True) -> None:
-        from gaponet_robots.control.consent import require_consent
-        from gaponet_robots.control.driver import DriverError
-        from gaponet_robots.targets.client import RemoteRobot
+        from gaponet.hw.control.consent import require_consent
+        from gaponet.hw.control.driver import DriverError
+        from gaponet.hw.targets.client import RemoteRobot
 
         if not self.config.yes:
             require_consent(f"The SO-101 at {self.config.port} will move as LeRobot says.", option="--robot.yes=true")
@@ -164,7 +164,7 @@ class GaponetSO101(Robot):
     def _command(self, address: str) -> list[str]:
         config, rate = self.config, self.config.fps
         if rate is None and config.model is not None:
-            from gaponet.model.artifact import GapModel
+            from gaponet.nn.artifact import GapModel
 
             rate = 1 / GapModel.load(config.model).card["dt"][0]
         words = ["--driver", "so101", "--port", config.port, "--rate", str(rate or DEFAULT_RATE), "--yes"]
@@ -271,10 +271,10 @@ class GaponetMotion(Teleoperator):
         Raises:
             UsageError: Some part of it would touch arm or table, or needs too much; the message says which.
         """
-        from gaponet_robots.control.phases import ControlConfig
-        from gaponet_robots.control.plan import Planner
-        from gaponet_robots.motion.files import SUFFIXES, read_motion
-        from gaponet_robots.motion.library import Library
+        from gaponet.hw.control.phases import ControlConfig
+        from gaponet.hw.control.plan import Planner
+        from gaponet.sysid.motion.files import SUFFIXES, read_motion
+        from gaponet.sysid.motion.library import Library
 
         given, dt = self.config.motions, 1 / self.config.fps
         files = sorted(str(f) for f in Path(given).iterdir() if f.suffix in SUFFIXES) if Path(given).is_dir() else []
@@ -329,8 +329,8 @@ class GaponetCorrect(ProcessorStep):
 
     def __post_init__(self) -> None:
         from gaponet.deploy.compensator import Compensator, CompensatorConfig
-        from gaponet.model.artifact import GapModel
-        from gaponet_robots.control.safety import Limits, SafetyConfig, limit_delta
+        from gaponet.hw.control.safety import Limits, SafetyConfig, limit_delta
+        from gaponet.nn.artifact import GapModel
 
         if bool(self.model) == bool(self.known):
             raise ValueError("gaponet_correct: give either model, a run, or known, a robot folder of gaponet identify")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from gaponet.errors import GAPONetError
+from gaponet.base.errors import GAPONetError
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -28,34 +28,25 @@ _HOMES = {  # name → module
         "gaponet.api",
     ),
     "Dataset": "gaponet.data.store",
-    "open_dataset": "gaponet.data.store",
-    "load_robot": "gaponet.robot",
-    "RobotSpec": "gaponet.robot",
-    "GapModel": "gaponet.model.artifact",
+    "open_dataset": "gaponet.share.reading",
+    "load_robot": "gaponet.robot.spec",
+    "RobotSpec": "gaponet.robot.spec",
+    "GapModel": "gaponet.nn.artifact",
     "AlignedSim": "gaponet.deploy.aligned_sim",
     "MujocoAligner": "gaponet.deploy.mujoco_loop",
     "Compensator": "gaponet.deploy.compensator",
+    "Controller": "gaponet.hw.control.controller",
+    "RemoteRobot": "gaponet.hw.targets.client",
 }
 __all__ = ["GAPONetError", "__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for (PEP 562); parts bring more (NAMES, gaponet.parts)."""
+    """A public name, imported when it is first asked for (PEP 562)."""
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    if not name.startswith("_") and name in (more := _of_parts()):
-        from gaponet.parts import named
-
-        return named(more[name])
-    offers = ", ".join([*_HOMES, *_of_parts()])
-    raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {offers}")
+    raise AttributeError(f"module 'gaponet' has no attribute '{name}'; it offers {', '.join(_HOMES)}")
 
 
 def __dir__() -> list[str]:
-    return [*__all__, *_of_parts()]
-
-
-def _of_parts() -> dict[str, str]:
-    from gaponet.parts import offered
-
-    return {name: where for name, where in offered("NAMES", _HOMES).items() if name not in _HOMES}
+    return __all__

@@ -5,7 +5,7 @@ import signal
 import sys
 from types import FrameType
 
-from gaponet.process.child import leave_folder
+from gaponet.base.child import leave_folder
 
 
 def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:

@@ -17,24 +17,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gaponet.base.errors import DatasetError, NoGainError, UsageError
+from gaponet.base.files import MARK
+from gaponet.base.progress import bar, noted
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, NoGainError, UsageError
-from gaponet.files import MARK
-from gaponet.parts import named, offered
-from gaponet.progress import bar, noted
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import MOVE_KEPT
+from gaponet.robot.folder import MOVE_KEPT
+from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
     from gaponet.data.importer import ImportReport
     from gaponet.data.sequence import Sequence
-    from gaponet.eval.evaluate import Evaluation
-    from gaponet.eval.knowledge import Knowledge
-    from gaponet.model.artifact import GapModel
-    from gaponet.model.calibration import Calibration
-    from gaponet.sim.identify import Covariance, Identified
-    from gaponet.training.config import TrainConfig
+    from gaponet.nn.artifact import GapModel
+    from gaponet.nn.calibration import Calibration
+    from gaponet.nn.training.config import TrainConfig
+    from gaponet.report.evaluate import Evaluation
+    from gaponet.sysid.fit import Covariance, Identified
+    from gaponet.sysid.knowledge import Knowledge
 
 Place = str | Path
 
@@ -143,22 +142,23 @@ def gap(
         by_motion, by_horizon the same; dataset, sequences, hours, virtual, robot, simulator_hash. Of an identified
         robot or a run also what eval.gap.gap_by_step says.
     """
-    from gaponet.metrics import Run, summary
+    from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash
 
     spec = None if robot is None else robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if run is not None or (spec is not None and spec.nominal is not None):
-        from gaponet.eval.candidate import Candidate
-        from gaponet.eval.gap import gap_by_step
+        from gaponet.report.candidate import Candidate
+        from gaponet.report.gap import gap_by_step
 
         folder = None if run is None else _run(run)
         data, spec = _opened(dataset, spec, folder)
         one = Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
         with bar("gap") as update:
             found = gap_by_step(one, data, motions, update)
-        draw = offered("PROVIDES").get("figure of a gap")
-        if draw and (folder is not None or (one.folder / MARK).is_file()):  # a user's own folder is left as it is
-            named(draw)(found, one.folder, one.kind)
+        if folder is not None or (one.folder / MARK).is_file():  # a user's own folder is left as it is
+            from gaponet.report.figures.gap_figure import write_gap
+
+            write_gap(found, one.folder, one.kind)
         return found
     data, spec = _opened(dataset, spec)
     _require_commands(data)
@@ -235,14 +235,14 @@ def identify(
         DatasetError, UsageError: A unit is not there.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
-    from gaponet.data.json_file import write_json
+    from gaponet.base.files import writing
+    from gaponet.base.json_file import write_json
     from gaponet.data.split import split_entries
-    from gaponet.files import writing
-    from gaponet.robot_folder import ORIGIN, save_robot
-    from gaponet.sim.identify import BETTER
-    from gaponet.sim.identify import identify as fit
+    from gaponet.nn.training.budget import Budget
+    from gaponet.robot.folder import ORIGIN, save_robot
     from gaponet.sim.replay import whole_errors
-    from gaponet.training.budget import Budget
+    from gaponet.sysid.fit import BETTER
+    from gaponet.sysid.identify import identify as fit
 
     data, spec = _opened(dataset, robot)
     data.require_robot(spec)
@@ -279,12 +279,12 @@ def _keep_known(
     folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance, before: Knowledge | None,
     judged: RobotSpec | None = None,
 ) -> None:  # fmt: skip
-    """Write how sure a robot folder's values are, where a part that can tell is installed."""
-    from gaponet.robot_folder import KNOWN
+    """Write how sure a robot folder's values are."""
+    from gaponet.robot.folder import KNOWN
+    from gaponet.sysid.evidence import known
 
     (folder / KNOWN).unlink(missing_ok=True)
-    if known := offered("PROVIDES").get("what is known of a robot"):
-        named(known)(load_robot(folder), sequences, judges, covariance, before, judged).save(folder)
+    known(load_robot(folder), sequences, judges, covariance, before, judged).save(folder)
 
 
 def train(
@@ -300,7 +300,8 @@ def train(
 ) -> GapModel:
     """Train a delta-action model; the run keeps the one that is best on whole validation motions in free run.
 
-    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model (training/ranks.py).
+    Ctrl-C ends training and leaves a usable run. Under torchrun all its processes train one model
+    (nn/training/ranks.py).
 
     Args:
         dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
@@ -321,11 +322,11 @@ def train(
         ModelError: The budget bought no training step.
         DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
-    from gaponet.files import writing
-    from gaponet.training import ranks
-    from gaponet.training.budget import Budget
-    from gaponet.training.config import TrainConfig
-    from gaponet.training.run import Trainer
+    from gaponet.base.files import writing
+    from gaponet.nn.training import ranks
+    from gaponet.nn.training.budget import Budget
+    from gaponet.nn.training.config import TrainConfig
+    from gaponet.nn.training.run import Trainer
 
     config = config or TrainConfig()
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
@@ -363,9 +364,9 @@ def evaluate(
         DatasetError, ModelError: A recording is not there or was used in training, a model fits another robot, or
             transfer was never measured so far from the simulator of the run.
     """
-    from gaponet.eval import evaluate as measuring
-    from gaponet.eval.candidate import is_robot
-    from gaponet.robot_folder import keeps_robot, kept_robot
+    from gaponet.report import evaluate as measuring
+    from gaponet.report.candidate import is_robot
+    from gaponet.robot.folder import keeps_robot, kept_robot
     from gaponet.sim.model import model_hash
 
     folder = _run(run)
@@ -410,9 +411,9 @@ def calibrate(
         UsageError, ModelError: The unit is not named, or the model fits another robot.
     """
     from gaponet.data.sequence import require_same_gains
-    from gaponet.eval.candidate import corrected_robot
-    from gaponet.model import calibration
-    from gaponet.model.artifact import GapModel
+    from gaponet.nn import calibration
+    from gaponet.nn.artifact import GapModel
+    from gaponet.report.candidate import corrected_robot
 
     folder = _run(run)
     data, spec = _opened(dataset, robot, folder)
@@ -477,12 +478,12 @@ def calibrate_robot(
         NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the robot as
             it was known; nothing is written.
     """
-    from gaponet.eval.knowledge import Knowledge
-    from gaponet.files import write_text, writing
-    from gaponet.robot_folder import ORIGIN, save_robot
-    from gaponet.sim.identify import BETTER
-    from gaponet.sim.refit import refit
+    from gaponet.base.files import write_text, writing
+    from gaponet.robot.folder import ORIGIN, save_robot
     from gaponet.sim.replay import whole_errors
+    from gaponet.sysid.fit import BETTER
+    from gaponet.sysid.knowledge import Knowledge
+    from gaponet.sysid.refit import refit
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
     before_known = Knowledge.load(spec)
@@ -556,7 +557,7 @@ def unit_recordings(
 def _opened(
     dataset: Dataset | Place, robot: RobotSpec | Place | None, run: Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
-    from gaponet.data.store import open_dataset
+    from gaponet.share.reading import open_dataset
 
     return open_dataset(dataset, robot, run)
 

@@ -13,7 +13,7 @@ from logs import arm_columns, late, table_text, wave, write_sage, write_so101
 
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 SI = ["--position-unit", "rad", "--time-unit", "s"]
 

@@ -3,7 +3,7 @@
 import subprocess
 import sys
 
-from gaponet.cli.main import commands, main
+from gaponet.cli.main import COMMANDS, main
 
 
 def test_help_is_one_screen_with_a_sentence_for_every_command(capsys):
@@ -11,7 +11,7 @@ def test_help_is_one_screen_with_a_sentence_for_every_command(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 48
     assert max(map(len, lines)) <= 80
-    for name in commands():
+    for name in COMMANDS:
         (line,) = [line for line in lines if line.startswith(f"  {name} ")]
         assert len(line.split(maxsplit=1)[1]) > 20
         assert not line.endswith("…")

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from logs import arm_sequence, late, wave
 
+from gaponet.base.errors import DatasetError
 from gaponet.data.card import make_card, write_card
 from gaponet.data.card_text import card_text, headline
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError
 
 
 def ramp(rows: int, top: float) -> np.ndarray:

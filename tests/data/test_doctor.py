@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from logs import arm_sequence, late, wave
 
-from gaponet.data.checks.finding import Finding
+from gaponet.base.errors import DatasetError
 from gaponet.data.checks.timing import EARLY, _drift
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response, lowpass
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError
+from gaponet.robot.finding import Finding
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 

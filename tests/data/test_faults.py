@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from faulty import FAULTS, all_of, examine, recordings
 
-from gaponet.data.checks.finding import Finding
+from gaponet.base.errors import GAPONetError
 from gaponet.data.store import Dataset
-from gaponet.errors import GAPONetError
-from gaponet.robot import load_robot
-from gaponet_lab.report.draw_findings import draw_findings
+from gaponet.report.figures.draw_findings import draw_findings
+from gaponet.robot.finding import Finding
+from gaponet.robot.spec import load_robot
 
 # Check, level and words of the finding that names it; no level: the import refuses with these words.
 NAMED = {

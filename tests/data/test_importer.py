@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from logs import SERVO_NAMES, arm_columns, late, table_text, wave, write_sage, write_so101
 
+from gaponet.base.errors import DatasetError, FolderError, LogError, UsageError
 from gaponet.data.importer import import_logs
 from gaponet.data.offsets import FILE
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, FolderError, LogError, UsageError
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from gaponet.base.errors import LogError
 from gaponet.data.log import Channel, Log
-from gaponet.errors import LogError
 
 TIME = np.array([0.0, 0.1, 0.2])
 VALUES = np.zeros((3, 2))

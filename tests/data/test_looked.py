@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from arm import recordings
 
+from gaponet.base.errors import WorkerError
 from gaponet.data.doctor import Diagnosis
 from gaponet.data.store import SURVEYS, Dataset
-from gaponet.errors import WorkerError
 from gaponet.sim.dynamics import gravity_of
 
 

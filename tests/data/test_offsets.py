@@ -7,10 +7,10 @@ import pytest
 from arm import TOML, XML, write_arm
 from logs import arm_sequence, wave
 
+from gaponet.base.errors import DatasetError
 from gaponet.data.holds import Holds
 from gaponet.data.offsets import FILE, UnitOffsets, read_offsets, record_offsets
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError
 from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from logs import arm_sequence, wave
 
+from gaponet.base.errors import DatasetError
 from gaponet.data.pair import Pair, Twin, require_disjoint
-from gaponet.errors import DatasetError
 
 
 def test_the_gap_is_real_minus_simulated(arm):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gaponet.base.errors import LogError, UsageError
 from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains, to_sequence
-from gaponet.errors import LogError, UsageError
 
 META = SequenceMeta("arm", "a", "wave", 0.0, source="wave.csv")
 ROWS = 50

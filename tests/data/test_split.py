@@ -9,6 +9,7 @@ import pytest
 from arm import commands, record
 from logs import arm_columns, arm_sequence, late, table_text, wave
 
+from gaponet.base.errors import DatasetError, UsageError
 from gaponet.data.commands import alike, sketch
 from gaponet.data.importer import import_logs
 from gaponet.data.split import (
@@ -23,7 +24,6 @@ from gaponet.data.split import (
     write_split,
 )
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError, UsageError
 
 
 @pytest.fixture

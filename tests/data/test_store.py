@@ -15,9 +15,9 @@ import pytest
 from arm import write_arm
 from logs import arm_sequence, late, wave
 
+from gaponet.base.errors import DatasetError, FolderError
 from gaponet.data.pair import Twin
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.errors import DatasetError, FolderError
 
 
 @pytest.fixture

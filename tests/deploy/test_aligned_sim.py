@@ -8,9 +8,9 @@ import pytest
 from arm import TOML, commands, recordings, write_arm
 from runs import small_model
 
+from gaponet.base.errors import ModelError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.mujoco_loop import MujocoAligner
-from gaponet.errors import ModelError, UsageError
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from arm import TOML, XML, commands, write_arm
 
+from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
-from gaponet.errors import ModelError, RobotError, UsageError
-from gaponet.model.artifact import GapModel, make_card
-from gaponet.model.backends import Bound
-from gaponet.model.calibration import Calibration
-from gaponet.model.config import ModelConfig
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.backends import Bound
+from gaponet.nn.calibration import Calibration
+from gaponet.nn.config import ModelConfig
 from gaponet.sim.batch import BatchSim
 
 CONFIG = ModelConfig(history=2, payload_max=0.4)

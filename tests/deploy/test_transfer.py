@@ -8,11 +8,11 @@ import pytest
 from arm import TOML, XML, commands, write_arm
 from runs import corrects_by
 
+from gaponet.base.errors import ModelError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.deploy.mujoco_loop import MujocoAligner
-from gaponet.errors import ModelError
-from gaponet.robot import Table, Tip
+from gaponet.robot.spec import Table, Tip
 from gaponet.sim.model import build_model
 
 STRONG = TOML.replace("effort_limit = 5.0", "effort_limit = 50.0")

@@ -44,8 +44,8 @@ def test_the_feed_forward_it_is_told_is_right_for_the_nominal_simulator(robot, t
 
 
 def test_it_is_as_good_on_a_robot_that_is_like_the_simulator(robot, task, monkeypatch):
-    from gaponet_robots.virtual.fleet import Fleet
-    from gaponet_robots.virtual.physics import neutral
+    from gaponet.testing.fleet import Fleet
+    from gaponet.testing.physics import neutral
 
     monkeypatch.setattr(example, "load_fleet", lambda *_: Fleet("none", "arm", 0, (), {"unit": neutral(2)}))
     unit = example.Unit(robot, task, "unit", np.array([0.0, 0.4]))

@@ -26,7 +26,7 @@ import sys; sys.path.insert(0, sys.argv[1])
 import numpy as np
 from pathlib import Path
 from arm import recordings, write_arm
-from gaponet.sim import joint_runs
+from gaponet.sysid import joint_runs
 robot = write_arm(Path(sys.argv[2]))
 values = {"kp": 20, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "stribeck": 0.3, "stribeck_speed": 0.1}
 runs = joint_runs.JointRuns(recordings(robot, 1, rows=100), robot)

@@ -10,7 +10,7 @@ import pytest
 FILE = Path(__file__).parents[2] / "examples" / "policy_transfer.py"
 
 
-@pytest.mark.slow  # tests/interop/cli/test_replay.py has what replay says
+@pytest.mark.slow  # tests/cli/test_replay.py has what replay says
 def test_the_tutorial_ends_in_a_table_and_in_what_replay_had_forecast(tmp_path):
     said = subprocess.run([sys.executable, FILE, tmp_path, "--quick"], capture_output=True, text=True, check=True)
     assert "WARNING" not in said.stderr + said.stdout  # of MuJoCo about a state that is no number

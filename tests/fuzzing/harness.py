@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from fuzzing.mutate import Files, mutate
-from gaponet.errors import GAPONetError
+from gaponet.base.errors import GAPONetError
 
 HANG_S = 5.0
 PATIENCE = 12  # times HANG_S of waiting: a reader may start a process, on a machine that others use too

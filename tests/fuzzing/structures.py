@@ -21,16 +21,16 @@ from gaponet.data.offsets import read_offsets
 from gaponet.data.pair import Twin
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
-from gaponet.eval import run_files
-from gaponet.eval.candidate import split_of_run as read_run_split
-from gaponet.model import calibration
-from gaponet.model.artifact import GapModel
-from gaponet.model.baselines.delay_offset import DelayOffset
-from gaponet.robot import load_robot
+from gaponet.nn import calibration
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.report import run_files
+from gaponet.report.candidate import split_of_run as read_run_split
+from gaponet.robot.collision import Collision
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
-from gaponet_robots.motion.collision import Collision
-from gaponet_robots.virtual.draw import MARK
-from gaponet_robots.virtual.fleet import FLEETS, load_fleet, to_toml
+from gaponet.testing.draw import MARK
+from gaponet.testing.fleet import FLEETS, load_fleet, to_toml
 
 COLLISION = """same_limb = ["upper fore"]
 [[capsule]]
@@ -103,10 +103,10 @@ def _fitted() -> Files:
     """A run folder with its model, calibration and evaluation."""
     import torch
 
-    from gaponet.model.artifact import make_card
-    from gaponet.model.config import ModelConfig
-    from gaponet.model.deeponet import build_network
-    from gaponet.model.export import export
+    from gaponet.nn.artifact import make_card
+    from gaponet.nn.config import ModelConfig
+    from gaponet.nn.deeponet import build_network
+    from gaponet.nn.onnx_export import export
 
     def write(folder: Path) -> None:
         torch.manual_seed(0)
@@ -130,7 +130,7 @@ def _fitted() -> Files:
 
 
 def _evaluation(folder: Path) -> None:
-    from eval.test_run_files import METRICS
+    from report.test_run_files import METRICS
 
     parts = {"left": {"nominal": 0.02, "gaponet": 0.01}, "floor": {"both": 0.001}}
     gap = parts | {"by_joint": {"elbow": parts}, "virtual": False, "unseen": True, "sequences": 1, "robot": "arm"}

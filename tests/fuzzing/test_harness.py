@@ -11,7 +11,7 @@ import pytest
 from fuzzing import harness
 from fuzzing.harness import AbsurdError, Target, run
 from fuzzing.mutate import mutate
-from gaponet.errors import LogError
+from gaponet.base.errors import LogError
 
 
 def refuse(source: Path, out: Path) -> None:

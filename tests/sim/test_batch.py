@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from arm import XML, write_arm
 
-from gaponet.errors import UsageError
-from gaponet.robot import LAW, SERVO, STOPS
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import LAW, SERVO, STOPS
 from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from arm import commands, record, write_arm
 
-from gaponet.robot import load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.replay import replay
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaponet.robot import load_robot
+from gaponet.robot.spec import load_robot
 from gaponet.sim.dynamics import inverse_dynamics, static_torque
 from gaponet.sim.model import build_model
 

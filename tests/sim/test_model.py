@@ -9,9 +9,9 @@ from arm import TOML, XML, write_arm
 from files_arm import COMMON, write_files_arm
 from files_arm import XML as FILES_XML
 
-from gaponet.errors import RobotError, UsageError
-from gaponet.identity import lines
-from gaponet.robot import load_robot
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.robot.identity import lines
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model, model_hash, qpos_range
 
 

@@ -7,7 +7,7 @@ from arm import commands, record, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.store import Dataset
-from gaponet.robot import load_robot
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import idle_limbs, pair_dataset, replay
 

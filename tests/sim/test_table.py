@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from arm import TOML, write_arm
 
-from gaponet.errors import RobotError
-from gaponet.robot import Table, load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.base.errors import RobotError
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import Table, load_robot
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.table import write_table

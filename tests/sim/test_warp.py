@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.robot import LAW, available, load_robot
+from gaponet.robot.spec import LAW, available, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
 pytest.importorskip("torch")

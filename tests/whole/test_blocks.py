@@ -24,12 +24,12 @@ from runs import random_run, untrained
 from strange_logs import write_bag
 
 import gaponet.api
-from gaponet.cli.main import commands, main
+from gaponet.cli.main import COMMANDS, main
 from gaponet.data.store import Dataset
-from gaponet.model.artifact import GapModel
-from gaponet.parts import named
-from gaponet.robot import load_robot
-from gaponet.robot_folder import save_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.plugins import load
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 
 ROOT = Path(__file__).parents[2]
@@ -45,8 +45,8 @@ WITH_PYTHON = (
 NOT_RUN = {
     "from gaponet_action import": "needs mjlab; make engines",
     "from actuators import": "needs mjlab, Isaac Lab and Newton; make engines",
-    "mujoco_servos.Servos": "needs an exported folder; tests/interop/engine plays it",
-    "gp.RemoteRobot()": "needs a run that takes live targets; tests/robots/targets",
+    "mujoco_servos.Servos": "needs an exported folder; tests/export plays it",
+    "gp.RemoteRobot()": "needs a run that takes live targets; tests/hw/targets",
 }
 # First words of console lines that are not gaponet's → why they are not run here.
 OTHERS = {
@@ -100,7 +100,7 @@ def actions(command: str) -> dict[str, Any]:
             if hasattr(inner, "__metadata__") or typing.get_origin(inner):
                 walk(inner)
 
-    walk(typing.get_type_hints(named(commands()[command]), include_extras=True).get("action"))
+    walk(typing.get_type_hints(load(COMMANDS[command]), include_extras=True).get("action"))
     return found
 
 
@@ -109,7 +109,7 @@ def parse(monkeypatch: pytest.MonkeyPatch) -> Callable[[list[str]], None]:
     """Parse a command line without running it. An action runs while it is parsed, so a function stands in for it."""
 
     def one(argv: list[str]) -> None:
-        for note in actions(argv[0]).values() if argv[0] in commands() else ():
+        for note in actions(argv[0]).values() if argv[0] in COMMANDS else ():
             stand_in = wraps(note.constructor_factory())(lambda *args, **kwargs: understood())
             monkeypatch.setitem(vars(note), "constructor_factory", lambda f=stand_in: f)
         with pytest.raises(Understood):
@@ -124,7 +124,7 @@ def options() -> dict[tuple[str, ...], set[str]]:
     found: dict[tuple[str, ...], set[str]] = {}
     patch = pytest.MonkeyPatch()
     patch.setenv("COLUMNS", "100")  # one column of options
-    for command in commands():
+    for command in COMMANDS:
         for path in [(command, action) for action in actions(command)] or [(command,)]:
             said = io.StringIO()
             with redirect_stdout(said), suppress(SystemExit):

@@ -9,9 +9,9 @@ import sys
 import pytest
 from logs import arm_sequence, late, wave
 
+from gaponet.base.files import writing
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
-from gaponet.files import writing
 
 COMMANDS = [
     ["import", "nowhere", "--robot", "so101", "--out"],

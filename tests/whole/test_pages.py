@@ -11,7 +11,7 @@ import pytest
 from arm import XML, commands, record, write_arm
 
 from gaponet.cli.main import main
-from gaponet.robot import load_robot
+from gaponet.robot.spec import load_robot
 
 DOCS = Path(__file__).parents[2] / "docs"
 SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))

@@ -75,7 +75,7 @@ def test_a_missing_extra_is_one_line_with_the_command(missing, monkeypatch, caps
         """Needs something."""
         raise ModuleNotFoundError(f"No module named '{missing}'", name=f"{missing}.sub")
 
-    monkeypatch.setattr("gaponet.cli.main.named", lambda where: command)
+    monkeypatch.setattr("gaponet.cli.main.load", lambda where: command)
     if missing == "made_up":  # that is our mistake, and not the user's
         with pytest.raises(ModuleNotFoundError):
             main(["doctor"])
@@ -89,7 +89,7 @@ def test_completion_knows_every_command_where_no_extra_is_installed():
     code = """
 import sys
 from gaponet.cli.main import main
-from gaponet.errors import EXTRAS
+from gaponet.base.errors import EXTRAS
 
 class Hidden:
     def find_spec(self, name, path=None, target=None):
@@ -124,7 +124,7 @@ def test_ctrl_c_is_one_line_and_130(monkeypatch, capsys):
         """Takes long."""
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("gaponet.cli.main.named", lambda where: command)
+    monkeypatch.setattr("gaponet.cli.main.load", lambda where: command)
     assert main(["doctor"]) == 130
     assert capsys.readouterr().err == "interrupted; what was written so far is complete\n"
 

@@ -40,14 +40,14 @@ for module, names in (
     for name in names.split():
         delattr(module, name)
 
-import gaponet.files
-gaponet.files.WINDOWS = True
+import gaponet.base.files
+gaponet.base.files.WINDOWS = True
 """
 WAY = """
 from pathlib import Path
 import gaponet as gp
 from gaponet.cli.main import main
-from gaponet.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import TrainConfig, WarmStartConfig
 
 work = Path(sys.argv[1])
 gp.import_logs(work / "logs", "so101", work / "data", unit_id="a", payload_mass=0.0)
@@ -62,7 +62,7 @@ print("all the way")
 LOCK = """
 import subprocess, sys
 from pathlib import Path
-from gaponet.files import lock
+from gaponet.base.files import lock
 descriptor, folder = lock(Path(sys.argv[1])), Path(sys.argv[1]).parent
 assert descriptor is not None
 if len(sys.argv) == 2:

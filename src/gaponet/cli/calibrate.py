@@ -11,12 +11,12 @@ from typing import Annotated, Any
 import tyro
 
 from gaponet import api
+from gaponet.base.errors import UsageError
 from gaponet.cli.identify import COLUMNS
 from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
-from gaponet.errors import UsageError
-from gaponet.eval.tables import mrad
-from gaponet.robot import RobotSpec, as_option
+from gaponet.report.tables import mrad
+from gaponet.robot.spec import RobotSpec, as_option
 
 Known = Annotated[
     Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN")
@@ -87,7 +87,7 @@ def _show(
     screen: Out, unit: str, servos: Mapping[str, Mapping[Any, float]], mass: float | None, std: float | None
 ) -> None:
     """A unit's servos, and its payload."""
-    from gaponet.sim.refit import FIELDS
+    from gaponet.sysid.refit import FIELDS
 
     screen.table(f"Unit {unit}", ["joint", *(COLUMNS[f][0] for f in FIELDS)], [
         [j, *(f"{v[f] * COLUMNS[f][1]:.3g}" for f in FIELDS)] for j, v in servos.items()
@@ -98,7 +98,7 @@ def _show(
 
 
 def _servos(robot: RobotSpec) -> dict[str, dict[str, float]]:
-    from gaponet.sim.refit import FIELDS
+    from gaponet.sysid.refit import FIELDS
 
     at = robot.joint_names.index
     return {j: {f: float(getattr(robot, f)[at(j)]) for f in FIELDS} for j in robot.operated}

@@ -7,12 +7,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from gaponet.base.progress import bar
 from gaponet.cli.options import Data, Json, Logs, Robot, Source
 from gaponet.cli.out import Out
-from gaponet.data.checks.finding import some
-from gaponet.data.store import Dataset, open_dataset
-from gaponet.parts import take
-from gaponet.progress import bar
+from gaponet.data.store import Dataset
+from gaponet.robot.finding import some
+from gaponet.share.reading import open_dataset
 
 
 def _card(
@@ -91,7 +91,7 @@ def _figures(
     Args:
         out: Folder for the pictures, each as SVG and PNG.
     """
-    draw_all = take("PROVIDES", "figures of a dataset", "drawing")
+    from gaponet.report.figures.draw_dataset import draw_all
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
@@ -166,10 +166,10 @@ def _labels(
         rate: Hz, of logs without a clock.
     """
     from gaponet.data.formats import read_logs
-    from gaponet.robot import load_robot
+    from gaponet.robot.spec import load_robot
+    from gaponet.sysid.labels import estimate, write
 
     screen, spec = Out(json), load_robot(robot)
-    estimate, write = (take("PROVIDES", f"labels {what}", "estimating labels") for what in ("of logs", "to logs.toml"))
     gain = dict(zip(spec.joint_names, spec.kp.tolist(), strict=True))
     found = estimate(read_logs(logs, spec, rate=rate), payloads, units, gain)
     write(found, out, rate)

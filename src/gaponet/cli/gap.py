@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from gaponet import api
+from gaponet.base.executor import LOCAL
+from gaponet.base.spread import Table
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
-from gaponet.data.store import open_dataset
-from gaponet.eval.tables import by_group, mrad, totals
-from gaponet.eval.verdict import next_step, verdict
-from gaponet.executor import LOCAL
-from gaponet.methods import title
-from gaponet.spread import Table
+from gaponet.report.methods import title
+from gaponet.report.tables import by_group, mrad, totals
+from gaponet.report.verdict import next_step, verdict
+from gaponet.share.reading import open_dataset
 
 UNITS = {"payload": ", kg", "horizon": ", s"}
 GROUPS = ("joint", "payload", "unit", "horizon", "motion")

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet import api
+from gaponet.base.text import measured
 from gaponet.cli.options import Flag, Json, Robot, Source, like
 from gaponet.cli.out import Out, writes
-from gaponet.eval.tables import mrad
-from gaponet.metrics import standard_error
-from gaponet.robot import as_option
-from gaponet.text import measured
+from gaponet.report.tables import mrad
+from gaponet.robot.spec import as_option
+from gaponet.sim.metrics import standard_error
 
 if TYPE_CHECKING:
-    from gaponet.sim.identify import Identified
+    from gaponet.sysid.fit import Identified
 
 COLUMNS = {  # field → heading, factor from SI
     "kp": ("kp, N·m/rad", 1.0),

@@ -9,14 +9,14 @@ import numpy as np
 import tyro
 
 from gaponet import api
+from gaponet.base.errors import UsageError
+from gaponet.base.files import writing
 from gaponet.cli.options import Flag, Json, Logs, Source, like
 from gaponet.cli.out import Out
-from gaponet.data.checks.finding import some
 from gaponet.data.signals import FAST
-from gaponet.errors import UsageError
-from gaponet.files import writing
-from gaponet.parts import attempt, take
-from gaponet.robot import RobotSpec, load_robot
+from gaponet.plugins import attempt
+from gaponet.robot.finding import some
+from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
@@ -106,9 +106,9 @@ def doctor(
         fix: Print a proposal for logs.toml after the findings; nothing is applied.
         figures: Folder for a picture of each finding.
     """
-    from gaponet.data.checks.finding import Finding
     from gaponet.data.doctor import Diagnosis
-    from gaponet.data.store import open_dataset
+    from gaponet.robot.finding import Finding
+    from gaponet.share.reading import open_dataset
 
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
@@ -120,7 +120,8 @@ def doctor(
         out.say(line)
     drawn: list[Path] = []
     if figures is not None:
-        draw_findings = take("PROVIDES", "figures of findings", "drawing")
+        from gaponet.report.figures.draw_findings import draw_findings
+
         with writing(figures, "figures"):
             drawn = draw_findings(data, spec, diagnosis.findings, figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")

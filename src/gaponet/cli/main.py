@@ -9,17 +9,16 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
-from functools import partial, wraps
+from functools import wraps
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from gaponet.errors import GAPONetError, MissingPartError, UsageError, missing_extra
-from gaponet.parts import attempt, installed, named, offered
-from gaponet.text import plain
+from gaponet.base.errors import GAPONetError, UsageError, missing_extra
+from gaponet.base.text import plain
+from gaponet.plugins import load
 
-# Task → commands; those of parts that are not installed are left out, and what somebody else's part brings comes last.
+# Task → commands.
 TASKS = {
     "Start here": ("start", "demo"),
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
@@ -30,18 +29,21 @@ TASKS = {
     "Share it, time it": ("push", "pull", "prune", "bench"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
-CORE = {
-    **{name: f"gaponet.cli.{name}:{name}" for name in ("data", "gap", "identify", "calibrate", "train")},
+COMMANDS = {
+    **{
+        name: f"gaponet.cli.{name}:{name}"
+        for name in (
+            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "torque", "calibrate",
+            "train", "export", "replay", "report", "runs", "experiment", "run", "record", "virtual", "attach", "bench",
+        )
+    },
     **{name: f"gaponet.cli.logs:{name}" for name in ("formats", "doctor")},
+    **{name: f"gaponet.cli.known:{name}" for name in ("show", "check", "fleet")},
+    **{name: f"gaponet.cli.share:{name}" for name in ("push", "pull", "prune")},
     "import": "gaponet.cli.logs:import_logs",
     "eval": "gaponet.cli.train:evaluate",
-}
+}  # fmt: skip
 ABOUT = "Close the gap between simulated and real motors from joint logs."
-
-
-def commands() -> dict[str, str]:
-    """Every command of this installation → module:function."""
-    return offered("COMMANDS", CORE)
 
 
 def main(argv: Sequence[str] | None = None, begin: Callable[[], object] = lambda: None) -> int:
@@ -82,13 +84,8 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(_overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
-    known = commands()
-    if name not in known and not completing:
-        if name in chain.from_iterable(TASKS.values()):
-            raise MissingPartError(
-                f"gaponet {name} is not in this installation (parts: {installed()}); install it whole"
-            )
-        close = get_close_matches(name, known, 1)
+    if name not in COMMANDS and not completing:
+        close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""
         raise UsageError(f"no command '{name}'; {guess}gaponet --help lists them all")
     import tyro
@@ -101,12 +98,9 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 
         return run
 
-    wanted = known if completing else {name: known[name]}
-    found = {name: attempt(where, partial(named, where), None) for name, where in wanted.items()}
-    if not completing and found[name] is None:
-        raise MissingPartError(f"gaponet {name} is broken in the package that brings it; update that package")
+    wanted = COMMANDS if completing else {name: COMMANDS[name]}
     tyro.extras.subcommand_cli_from_dict(
-        {name: begun(command) for name, command in found.items() if command},
+        {name: begun(load(where)) for name, where in wanted.items()},
         prog="gaponet",
         description=ABOUT,
         args=argv,
@@ -117,12 +111,8 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
 def _overview() -> str:
     """All commands by task, a line each, on one screen; nothing is imported for it."""
     lines = ["usage: gaponet COMMAND …   (gaponet COMMAND --help for one of them)", ABOUT]
-    known = commands()
-    others = tuple(name for name in known if name not in chain.from_iterable(TASKS.values()))
-    for task, names in (TASKS | {"Of other packages": others}).items():
-        present = [name for name in names if name in known]
-        lines += ["", task] * bool(present)
-        lines += [f"  {name:<11}{attempt(known[name], partial(_purpose, known[name]), '')}" for name in present]
+    for task, names in TASKS.items():
+        lines += ["", task, *(f"  {name:<11}{_purpose(COMMANDS[name])}" for name in names)]
     return "\n".join(lines)
 
 

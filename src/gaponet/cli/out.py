@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gaponet.data.json_file import finite
-from gaponet.files import writing
-from gaponet.spread import Table as ResultTable
-from gaponet.text import plain
+from gaponet.base.files import writing
+from gaponet.base.json_file import finite
+from gaponet.base.spread import Table as ResultTable
+from gaponet.base.text import plain
 
 if TYPE_CHECKING:
-    from gaponet.data.checks.finding import Finding
+    from gaponet.robot.finding import Finding
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 

@@ -12,12 +12,12 @@ from gaponet import api
 from gaponet.cli.gap import show_methods, show_verdict
 from gaponet.cli.options import Flag, Json, Known, Motions, Robot, Source, like
 from gaponet.cli.out import Out
-from gaponet.eval.tables import mrad
-from gaponet.eval.verdict import Added
-from gaponet.methods import title
-from gaponet.model.config import Kind
-from gaponet.robot_folder import KEPT
-from gaponet.training.config import TrainConfig
+from gaponet.nn.config import Kind
+from gaponet.nn.training.config import TrainConfig
+from gaponet.report.methods import title
+from gaponet.report.tables import mrad
+from gaponet.report.verdict import Added
+from gaponet.robot.folder import KEPT
 
 
 @like(api.train)
@@ -46,8 +46,8 @@ def train(
         log: Also write the training curve to TensorBoard event files in OUT/tensorboard, or to Weights & Biases.
         config: Everything else.
     """
-    from gaponet.model.artifact import GapModel
-    from gaponet.training.ranks import started
+    from gaponet.nn.artifact import GapModel
+    from gaponet.nn.training.ranks import started
 
     screen = Out(json)
     config = config.paper_recipe() if recipe == "paper" else config

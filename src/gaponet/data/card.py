@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from gaponet import __version__
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError
+from gaponet.base.files import write_text
+from gaponet.base.progress import Progress, silent
+from gaponet.base.structure import read_json
 from gaponet.data.log import UNITS
 from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import Dataset, Entry, dataset_hash
-from gaponet.errors import DatasetError
-from gaponet.files import write_text
-from gaponet.progress import Progress, silent
-from gaponet.structure import read_json
 
 QUANTILE_ROWS = 100_000  # so many rows, evenly spread over the set, give the 1 % and 99 % quantiles
 NOT_STATED = "not stated"

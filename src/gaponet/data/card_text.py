@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from gaponet.base.spread import Table
+from gaponet.base.text import markdown
 from gaponet.data.card import NOT_STATED
-from gaponet.spread import Table
-from gaponet.text import markdown
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}
 HEADS = {"min": "least", "p1": "1 %", "mean": "mean", "p99": "99 %", "max": "greatest", "std": "std"}

@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 
 SAMPLE, MOMENTS = 32, 24  # rows and moments kept
 STEP = 1e-5  # rad; rows nearer than this are one

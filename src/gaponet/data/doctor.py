@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.errors import DatasetError
+from gaponet.base.executor import LOCAL
+from gaponet.base.progress import Progress, silent
 from gaponet.data.checks import CHECKS
-from gaponet.data.checks.finding import LEVELS, Finding
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.looked import Looked
 from gaponet.data.checks.motor import fast_lags, lag_values, static_errors
@@ -19,10 +21,8 @@ from gaponet.data.checks.touching import Heights, touching
 from gaponet.data.offsets import Gravity
 from gaponet.data.store import Dataset
 from gaponet.data.survey import Survey
-from gaponet.errors import DatasetError
-from gaponet.executor import LOCAL
-from gaponet.progress import Progress, silent
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import LEVELS, Finding
+from gaponet.robot.spec import RobotSpec
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 
 WINDOW_S = 0.5  # this long must command and state be still

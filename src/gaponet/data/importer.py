@@ -12,6 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.errors import DatasetError, LogError, UsageError
+from gaponet.base.files import writing
+from gaponet.base.progress import Progress, silent
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.holds import Holds
 from gaponet.data.log import Log, skipping
@@ -19,10 +22,7 @@ from gaponet.data.offsets import Gravity, UnitOffsets, read_offsets, record_offs
 from gaponet.data.sequence import ARRAYS, Sequence, SequenceMeta, to_sequence
 from gaponet.data.signals import estimate_delay, fast_speed
 from gaponet.data.store import KIND, Dataset, Entry
-from gaponet.errors import DatasetError, LogError, UsageError
-from gaponet.files import writing
-from gaponet.progress import Progress, silent
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 HOLD = 1 << 26  # bytes of samples kept between checking and writing; a larger source is read twice
 UNSTATED = -1  # repetition that the format does not state, until it is counted

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.errors import LogError
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
 
 # Channel names and their SI units. ctrl is the commanded joint position.
 CHANNELS = {"ctrl": "rad", "qpos": "rad", "qvel": "rad/s", "tau": "N·m", "temperature": "°C"}

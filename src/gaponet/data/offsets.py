@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 from typing_extensions import TypedDict
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError
+from gaponet.base.files import write_text
+from gaponet.base.structure import Json, read_json
 from gaponet.data.holds import Holds, StaticError
 from gaponet.data.store import Dataset
-from gaponet.errors import DatasetError
-from gaponet.files import write_text
-from gaponet.robot import RobotSpec
-from gaponet.structure import Json, read_json
+from gaponet.robot.spec import RobotSpec
 
 Carried = tuple[float, str]  # payload_mass kg, payload_side
 Load = tuple[float, str, tuple[float, ...] | None]  # the same, and kp while recording where it is known

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError
 from gaponet.data.sequence import Sequence
-from gaponet.errors import DatasetError
 
 
 @dataclass(frozen=True)

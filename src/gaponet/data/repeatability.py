@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
 

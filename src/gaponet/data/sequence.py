@@ -10,12 +10,12 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Interval
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError, UsageError
+from gaponet.base.structure import Json
 from gaponet.data.log import Log
 from gaponet.data.signals import TIE, differentiate, resample_linear, resample_zoh
-from gaponet.errors import LogError, UsageError
-from gaponet.robot import GAIN_TOLERANCE, RobotSpec
-from gaponet.structure import Json
+from gaponet.robot.spec import GAIN_TOLERANCE, RobotSpec
 
 ARRAYS = ("ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature")
 OPTIONAL = ("qacc", "tau", "tau_eq", "temperature")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 
 TIE = 0.1  # of a period by which stamps may differ and mean one instant, as in rows that are kept as recorded
 FAST = 0.3  # rad/s of fast_speed from which a lag is mostly delay; below, it is mostly stiction

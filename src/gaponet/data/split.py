@@ -21,13 +21,13 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
+from gaponet.base.errors import DatasetError, UsageError
+from gaponet.base.files import write_text
+from gaponet.base.progress import Progress, silent
+from gaponet.base.structure import read_json
 from gaponet.data.commands import Sketch, alike, sketch
 from gaponet.data.pair import hash_order
 from gaponet.data.store import Dataset, Entry, dataset_hash
-from gaponet.errors import DatasetError, UsageError
-from gaponet.files import write_text
-from gaponet.progress import Progress, silent
-from gaponet.structure import read_json
 
 Parts = dict[str, list[Entry]]
 

@@ -12,8 +12,9 @@
     splits/<name>.json      which sequences are for training, validation, test (data.split)
 
 A sequence is written to a temporary file, renamed, on the disk, and only then listed (of many, once a second): a file
-that is not listed does not exist, nor does a line cut short by a crash. One process writes at a time (gaponet.files);
-reading needs no lock and changes no recording. Real data is never rewritten; twins can be computed again.
+that is not listed does not exist, nor does a line cut short by a crash. One process writes at a time
+(gaponet.base.files); reading needs no lock and changes no recording. Real data is never rewritten; twins can be
+computed again.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ import json
 import os
 import re
 import shutil
-import sys
 import time
 import weakref
 from collections.abc import Iterator
@@ -32,22 +32,21 @@ from dataclasses import asdict, dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired
 
 import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
+from gaponet.base.errors import DatasetError
+from gaponet.base.files import require_ours, sync, whole, write_text, writing
+from gaponet.base.structure import Name, parse_json, read_format
 from gaponet.data.commands import Sketch, sketch
 from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta
-from gaponet.errors import DatasetError
-from gaponet.files import require_ours, sync, whole, write_text, writing
-from gaponet.parts import take
-from gaponet.robot import RobotSpec, load_robot
-from gaponet.robot_folder import KEPT, keeps_robot, kept_robot, save_robot
-from gaponet.structure import Name, parse_json, read_format
+from gaponet.robot.folder import KEPT, keeps_robot, save_robot
+from gaponet.robot.spec import RobotSpec
 
 FORMAT = 1
 MEND = "restore the file or import the log again"
@@ -396,18 +395,6 @@ class Dataset:
                 raise DatasetError(f"{where}: '{listed[entry.hash]}' is listed already; delete this line")
             yield entry
 
-    @classmethod
-    def opened(cls, place: str | Path) -> Dataset:
-        """A dataset folder, or one behind an address.
-
-        Raises:
-            DatasetError: As open_dataset.
-        """
-        if "://" not in str(place):
-            return Dataset(place)
-        streamed = take("PROVIDES", "dataset behind an address", "reading datasets where they were pushed")
-        return cast("Dataset", streamed(str(place)))
-
 
 def entry_id(meta: SequenceMeta, digest: str) -> str:
     """A sequence's name in its dataset: what it is, as letters that any disk takes, and how its content hash begins."""
@@ -462,31 +449,3 @@ def _read_table(path: Path, columns: tuple[str, ...], rows: int, n: int) -> dict
         if len(values) != rows * n or not np.isfinite(values).all():
             raise DatasetError(f"{path}: {column} lacks values or holds NaN; {MEND}")
     return {c: values.reshape(rows, n) for c, values in arrays.items()}
-
-
-def open_dataset(
-    dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
-) -> tuple[Dataset, RobotSpec]:
-    """A dataset, to be read, and its robot: the one asked for, else the one that the dataset keeps.
-
-    Args:
-        dataset: Folder; or the address (s3://, gs://, file://) of one that was pushed, which is read where it lies.
-        robot: Another robot than the one that the dataset keeps.
-        run: The run whose robot is taken where the dataset keeps none.
-
-    Raises:
-        DatasetError: There is no dataset, it is damaged, or it cannot be reached.
-
-    A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
-    is said on stderr.
-    """
-    data = dataset if isinstance(dataset, Dataset) else Dataset.opened(dataset)
-    if robot is not None:
-        return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
-        return data, kept_robot(Path(run), data.robot_name)
-    spec = kept_robot(data.path, data.robot_name)
-    if not keeps_robot(data.path):
-        note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
-        print(note, file=sys.stderr)
-    return data, spec

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
 from gaponet.data.holds import Holds
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import FAST, Response, correlation, differentiate, estimate_delay, fast_speed, lowpass
 from gaponet.data.store import Entry
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 MAX_LAG_S = 0.4
 BLOCKED_ERROR = 0.15  # standing this far from a command, rad; a loaded joint may, so the command must also move

@@ -1,1 +1,1 @@
-"""What a user does with a model on a robot: aligned simulator, compensator, controller, drivers."""
+"""Use of a model: aligned simulator, MuJoCo loop, transfer, compensator, gymnasium."""

@@ -11,11 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
 from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
-from gaponet.errors import UsageError
-from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import PROBES, ClosedForm, Probed
 

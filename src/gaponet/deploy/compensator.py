@@ -24,13 +24,13 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
-from gaponet.errors import ModelError, RobotError, UsageError
-from gaponet.model.artifact import RECORDED_TOLERANCE, GapModel
-from gaponet.model.calibration import Calibration
-from gaponet.robot import RobotSpec
+from gaponet.nn.artifact import RECORDED_TOLERANCE, GapModel
+from gaponet.nn.calibration import Calibration
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.robot import LAW, RobotSpec
+from gaponet.base.arrays import Array
+from gaponet.robot.spec import LAW, RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present

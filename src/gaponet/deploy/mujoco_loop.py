@@ -8,12 +8,12 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import ModelError
 from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
-from gaponet.errors import ModelError
-from gaponet.model.artifact import GapModel
-from gaponet.robot import RobotSpec
-from gaponet.robot_folder import keeper, keeps_robot
+from gaponet.nn.artifact import GapModel
+from gaponet.robot.folder import keeper, keeps_robot
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Probed
 

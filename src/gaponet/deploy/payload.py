@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.robot import RobotSpec
+from gaponet.base.arrays import Array
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim
 
 MEMORY = 1.0  # s: time constant of forgetting

@@ -18,11 +18,11 @@ from typing import Literal
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import ModelError
 from gaponet.data.sequence import Sequence
-from gaponet.errors import ModelError
-from gaponet.model.artifact import DT_TOLERANCE, GapModel
-from gaponet.robot import RobotSpec
+from gaponet.nn.artifact import DT_TOLERANCE, GapModel
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Period, Probed
 from gaponet.sim.replay import idle_limbs

@@ -1,1 +1,1 @@
-"""Stepping: MJCF to model, many simulations at once, replay of logged commands."""
+"""Simulation: MJCF to model, many simulations at once, replay of recorded commands and its errors."""

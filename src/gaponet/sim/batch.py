@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
-from gaponet.arrays import like
+from gaponet.base.arrays import like
+from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.errors import UsageError
-from gaponet.robot import LAW, STOPS, RobotSpec
+from gaponet.robot.spec import LAW, STOPS, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoLaw, present
 

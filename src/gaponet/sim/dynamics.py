@@ -9,7 +9,7 @@ from functools import partial
 import mujoco
 import numpy as np
 
-from gaponet.robot import RobotSpec, Tip
+from gaponet.robot.spec import RobotSpec, Tip
 from gaponet.sim.model import build_model
 
 Array = np.ndarray

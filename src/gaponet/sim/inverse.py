@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.errors import UsageError
-from gaponet.robot import LAW
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import LAW
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit, present
 

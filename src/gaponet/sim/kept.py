@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gaponet.errors import GAPONetError
-from gaponet.robot import RobotSpec
-from gaponet.robot_folder import KEPT, keeps_robot, kept_robot
+from gaponet.base.errors import GAPONetError
+from gaponet.robot.folder import KEPT, keeps_robot, kept_robot
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 
 

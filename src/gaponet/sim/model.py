@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from gaponet.errors import RobotError, UsageError
-from gaponet.identity import lines
-from gaponet.mjcf import compiled, read_mjcf
-from gaponet.robot import LAW, RobotSpec
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.robot.freeze import freeze, units_per_si
+from gaponet.robot.identity import lines
+from gaponet.robot.mjcf import compiled, read_mjcf
+from gaponet.robot.spec import LAW, RobotSpec
 from gaponet.sim.table import add_table, soften_table
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ def build_spec(
     locked: tuple[str, ...] = (),
     bare: bool = False,
 ) -> mujoco.MjSpec:
-    """The same before compilation, for a scene that holds several robots (eval/scene.py)."""
+    """The same before compilation, for a scene that holds several robots (report/view/scene.py)."""
     spec = _read(robot)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND  # few joints, no contacts: islands cost more
     period = robot.dt if dt is None else _positive(dt)
@@ -140,8 +141,8 @@ def model_hash(robot: RobotSpec) -> str:
     """What the nominal simulator is, in 12 hex digits: everything in its compiled model that decides how it moves.
 
     Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written
-    (gaponet.identity); reports print it beside every score, since two public MJCFs of one robot can differ by a factor
-    of 50 in gain.
+    (gaponet.robot.identity); reports print it beside every score, since two public MJCFs of one robot can differ by a
+    factor of 50 in gain.
     """
     if "_model_hash" not in vars(robot):
         text = [
@@ -174,7 +175,7 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             value = getattr(robot, field)[i]
             if np.isfinite(value):
                 setattr(joint, field, value)
-        unit = _units_per_si(spec, joint)
+        unit = units_per_si(spec, joint)
         joint.ref -= unit * robot.zero[i]
         stops = unit * robot.stop_low[i], unit * robot.stop_high[i]
         if np.isfinite(stops).any():
@@ -185,34 +186,9 @@ def _set_joints(spec: mujoco.MjSpec, robot: RobotSpec) -> None:
             joint.damping = np.concatenate([[robot.damping[i]], np.zeros(np.size(joint.damping) - 1)])
 
 
-def _units_per_si(spec: mujoco.MjSpec, joint: mujoco.MjsJoint) -> float:
-    """Return how many of the specification's units are one rad or m of a joint: an MJCF may hold degrees."""
-    return math.degrees(1) if spec.compiler.degree and joint.type == mujoco.mjtJoint.mjJNT_HINGE else 1.0
-
-
 def _lock(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for name in locked:
         freeze(spec, spec.joint(name), robot.qpos_home[robot.joint_names.index(name)])
-
-
-def freeze(spec: mujoco.MjSpec, joint: mujoco.MjsJoint, value: float) -> None:
-    """Clamp a hinge or slide joint of a body with a quaternion at a value, rad or m.
-
-    Raises:
-        RobotError: Another joint of its body comes before it, and it is not clamped at its reference.
-    """
-    body, move = joint.parent, value - joint.ref / _units_per_si(spec, joint)
-    if move and body.joints[0].name != joint.name:
-        raise RobotError(f"joint '{joint.name}' turns after '{body.joints[0].name}' in one body: keep or clamp both")
-    turn, quat, offset = np.zeros(4), np.zeros(4), np.zeros(3)
-    slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-    axis = np.array(joint.axis) / np.linalg.norm(joint.axis)
-    mujoco.mju_axisAngle2Quat(turn, axis, 0.0 if slides else move)
-    mujoco.mju_rotVecQuat(offset, np.array(joint.pos), turn)
-    mujoco.mju_rotVecQuat(offset, axis * move if slides else np.array(joint.pos) - offset, np.array(body.quat))
-    mujoco.mju_mulQuat(quat, np.array(body.quat), turn)
-    body.pos, body.quat = np.array(body.pos) + offset, quat
-    spec.delete(joint)
 
 
 def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) -> None:

@@ -12,11 +12,11 @@ from typing import Protocol
 
 import numpy as np
 
+from gaponet.base.executor import LOCAL, opened
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
-from gaponet.executor import LOCAL, opened
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.model import LOOSE_IMPEDANCE, STIFF_MOBILITY, idle_joints, model_hash
 

@@ -14,8 +14,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.arrays import Array, library
-from gaponet.robot import LAW
+from gaponet.base.arrays import Array, library
+from gaponet.robot.spec import LAW
 
 Law = dict[str, Any]  # name of LAW → values that broadcast to the simulations' joints, numpy or torch
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
-from gaponet.errors import RobotError
-from gaponet.robot import RobotSpec
+from gaponet.base.errors import RobotError
+from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
     from mujoco.batch import Batch

@@ -17,8 +17,8 @@ import warp
 from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
-from gaponet.errors import UsageError
-from gaponet.robot import LAW
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import LAW
 from gaponet.sim import servo
 from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from logs import arm_columns, table_text, wave
 
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.formats import detect, read_logs
 from gaponet.data.log import skipping
 from gaponet.data.store import Dataset
-from gaponet.errors import JointMismatchError, LogError, UsageError
 
 UNITS = 'time_unit = "s"\nposition_unit = "rad"\n'
 

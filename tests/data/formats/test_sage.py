@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from logs import PERIOD_US, SERVO_NAMES, late, wave, write_sage, write_so101
 
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.data.formats import detect, find_logs, read_logs
-from gaponet.errors import JointMismatchError, LogError, UsageError
 
 
 def edit(file, line: int, old: str, new: str) -> None:

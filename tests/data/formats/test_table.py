@@ -6,8 +6,8 @@ import pyarrow.parquet as pq
 import pytest
 from logs import arm_columns, table_text
 
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
 from gaponet.data.formats import detect, find_logs, read_logs
-from gaponet.errors import JointMismatchError, LogError, UsageError
 
 SI = {"position_unit": "rad", "time_unit": "s"}
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from gaponet.data.checks import motor, recording, timing, wiring
-from gaponet.data.checks.finding import Finding
 from gaponet.data.survey import Survey
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding
+from gaponet.robot.spec import RobotSpec
 
 CHECKS: tuple[Callable[[list[Survey], RobotSpec], Iterator[Finding]], ...] = (
     *wiring.CHECKS, *timing.CHECKS, *recording.CHECKS, *motor.CHECKS,

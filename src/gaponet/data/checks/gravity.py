@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, Mend
+from gaponet.base.arrays import Array
 from gaponet.data.offsets import Carried, Gravity
 from gaponet.data.survey import Survey
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, Mend
+from gaponet.robot.spec import RobotSpec
 
 Loads = dict[Carried, tuple[Array, Array]]  # angles and torques, (k, n) each
 

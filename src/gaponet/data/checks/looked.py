@@ -23,6 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.executor import LOCAL, opened
+from gaponet.base.files import MARK
+from gaponet.base.progress import Progress
 from gaponet.data.checks.touching import RATE, Heights, Standing
 from gaponet.data.holds import Holds
 from gaponet.data.offsets import Gravity
@@ -30,10 +33,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import Response
 from gaponet.data.store import SURVEYS, Dataset, Entry
 from gaponet.data.survey import Survey, Torque
-from gaponet.executor import LOCAL, opened
-from gaponet.files import MARK
-from gaponet.progress import Progress
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 OWN = 1500  # rows that take as long as what is done once for a recording
 PART, MANY = 40_000, 600_000  # rows of a job, and from which processes are worth their start

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, names, some
+from gaponet.base.arrays import Array
 from gaponet.data.holds import Holds, StaticError
 from gaponet.data.signals import FAST, Response
 from gaponet.data.survey import Survey, Torque
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, names, some
+from gaponet.robot.spec import RobotSpec
 
 SAG = 0.02  # static error worth a line, rad
 LONG, APART = 0.15, 0.05  # s: dead time worth a warning; of one joint beyond the others'
@@ -59,7 +59,7 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _servo_lag(robot: RobotSpec) -> dict[str, float]:
     """Lag of a slow motion that kp, kd and the MJCF's damping make, by joint, s."""
-    from gaponet.mjcf import compiled, read_mjcf
+    from gaponet.robot.mjcf import compiled, read_mjcf
 
     model = compiled(read_mjcf(robot.mjcf), robot.mjcf)
     damping = np.array([model.dof_damping[model.joint(name).dofadr[0]] for name in robot.joint_names])

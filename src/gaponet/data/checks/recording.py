@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.data.checks.finding import Finding, names, some
 from gaponet.data.survey import Survey, Torque
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, names, some
+from gaponet.robot.spec import RobotSpec
 
 COARSE = 3e-3  # rad
 HALTED = 1.0  # s

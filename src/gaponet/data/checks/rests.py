@@ -13,11 +13,11 @@ from itertools import permutations
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, some
+from gaponet.base.arrays import Array
 from gaponet.data.offsets import Gravity
 from gaponet.data.survey import Survey
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, some
+from gaponet.robot.spec import RobotSpec
 
 FEW = 12  # rests of a joint that say nothing
 FOLDS = 20  # of the sequences, at most

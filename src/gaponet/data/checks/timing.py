@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, some
+from gaponet.base.arrays import Array
 from gaponet.data.signals import Response
 from gaponet.data.survey import HERTZ, Survey
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, some
+from gaponet.robot.spec import RobotSpec
 
 ROUNDS = 6  # of shifts and of what all follow
 FEW = 4  # recordings that say nothing of one among them

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, some
+from gaponet.base.arrays import Array
 from gaponet.data.offsets import Gravity
 from gaponet.data.sequence import Sequence
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, some
+from gaponet.robot.spec import RobotSpec
 
 Heights = Callable[[Array], Array]  # lowest tip in postures (k, n), (k,) m
 

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gaponet.arrays import Array
-from gaponet.data.checks.finding import Finding, some
+from gaponet.base.arrays import Array
 from gaponet.data.survey import Survey
-from gaponet.robot import RobotSpec
+from gaponet.robot.finding import Finding, some
+from gaponet.robot.spec import RobotSpec
 
 SCALE = (0.5, 1.25)  # a loaded joint falls short of its commands, and beyond them where its load stands on it
 OWN, OTHER, SEVERAL = 0.8, 0.95, 3  # correlations with the own joint and another's, and the motions to tell it

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import JointMismatchError, LogError
 from gaponet.data.describe.recording import SECONDS, Recording
-from gaponet.errors import JointMismatchError, LogError
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 # Words by which the world calls them; a name with a word of an earlier line is not looked for in a later one.
 WORDS = {

@@ -6,8 +6,8 @@ import difflib
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
-from gaponet.errors import JointMismatchError
-from gaponet.robot import RobotSpec, available, load_robot
+from gaponet.base.errors import JointMismatchError
+from gaponet.robot.spec import RobotSpec, available, load_robot
 
 
 def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None) -> list[str]:

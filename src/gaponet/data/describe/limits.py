@@ -8,10 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
 from gaponet.data.log import UNITS, Channel, Log
-from gaponet.errors import LogError
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 # Beyond these nothing was measured: 9,500 turns a minute; what differentiation and inverse dynamics make of noise.
 MOST = {"qpos": 1e3, "qvel": 1e3, "temperature": 400.0, "qacc": 1e6, "tau_eq": 1e6}

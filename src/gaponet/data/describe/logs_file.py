@@ -40,8 +40,8 @@ import numpy as np
 from annotated_types import Interval, Len
 from typing_extensions import TypedDict
 
-from gaponet.errors import LogError, UsageError
-from gaponet.structure import read_toml
+from gaponet.base.errors import LogError, UsageError
+from gaponet.base.structure import read_toml
 
 NAME = "logs.toml"
 HINT = "gaponet import LOGS --robot ROBOT --guess writes one to start from"

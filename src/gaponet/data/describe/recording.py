@@ -12,15 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError, UsageError
+from gaponet.base.structure import validated
 from gaponet.data.describe.joints import ignored, resolve_all
 from gaponet.data.describe.limits import to_radians
 from gaponet.data.describe.logs_file import HINT, LogsFile
 from gaponet.data.log import CHANNELS, DERIVED, REQUIRED, Channel, Log
 from gaponet.data.sequence import SequenceMeta
-from gaponet.errors import LogError, UsageError
-from gaponet.robot import LOG_UNITS, RobotSpec
-from gaponet.structure import validated
+from gaponet.robot.spec import LOG_UNITS, RobotSpec
 
 WIDEST = 500  # columns of an array that may be joints
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -29,15 +29,19 @@ from typing import Any, cast
 
 import numpy as np
 
+from gaponet import plugins
+from gaponet.base.errors import LogError, UsageError
 from gaponet.data.describe.limits import refuse_absurd
 from gaponet.data.describe.logs_file import LogsFile, Naming, read_logs_file
 from gaponet.data.describe.recording import COMMAND, Recording
 from gaponet.data.log import Channel, Log, skipped
-from gaponet.errors import LogError, UsageError
-from gaponet.parts import attempt, named, offered
-from gaponet.robot import RobotSpec
+from gaponet.plugins import attempt
+from gaponet.robot.spec import RobotSpec
 
-CORE = {name: f"gaponet.data.formats.{name}" for name in ("sage", "table", "npz")}  # parts bring others
+FORMATS = {
+    name: f"gaponet.data.formats.{name}"
+    for name in ("sage", "table", "npz", "lerobot", "bam", "rosbag", "hdf5", "mat", "pace", "asap")
+}
 LOOK = 20  # recordings that are looked at before they are described
 ALWAYS = ("names", "ignore", "signs", "offsets", "posture", "motion", "manifest", "unit", "payload", "side", "kp", "kd",
           "format")  # fmt: skip
@@ -46,7 +50,7 @@ DESCRIBED = tuple(k for k in LogsFile.__annotations__ if k not in ALWAYS)
 
 def formats() -> dict[str, str]:
     """Every format that this installation reads → its reader's module."""
-    return offered("FORMATS", CORE)
+    return plugins.registry(plugins.FORMATS, FORMATS)
 
 
 def module(fmt: str) -> ModuleType:
@@ -54,7 +58,7 @@ def module(fmt: str) -> ModuleType:
     known = formats()
     if fmt not in known:
         raise LogError(f"unknown format '{fmt}'; use one of {', '.join(known)}")
-    reader: ModuleType = named(known[fmt])
+    reader: ModuleType = plugins.load(known[fmt])
     return reader
 
 

@@ -4,7 +4,7 @@ What gaponet data export wrote says everything itself. GAPONet's files hold many
 real_dof_positions, real_dof_velocities, real_dof_torques (motions, rows, joints), padded with zero rows, or one array
 per motion; joint_sequence; payloads; or windows in which one joint moves, (windows, rows), with that joint's name in
 joint_sequence, (windows,). They have no clock: logs.toml says rate = 50.0, or --rate 50 does. In plain files logs.toml
-says which array is what; text in joint_names names the columns. Arrays of objects: gaponet_interop.formats.pickles.
+says which array is what; text in joint_names names the columns. Arrays of objects: gaponet.data.formats.pickles.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.base.structure import LARGEST_ARRAYS, parse_json
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading, restated
-from gaponet.data.formats import DESCRIBED, files_under
+from gaponet.data.formats import DESCRIBED, files_under, pickles
 from gaponet.data.log import CHANNELS, DERIVED
-from gaponet.errors import LogError
-from gaponet.parts import take
-from gaponet.process.sandbox import inside
-from gaponet.structure import LARGEST_ARRAYS, parse_json
 
 OPTIONS = DESCRIBED
 EXTRA = ""
@@ -97,7 +96,7 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
 
 @inside(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
-    """Every array; those of objects as another part does."""
+    """Every array; those of objects by a safe unpickler."""
     with reading(file, "npz file"), zipfile.ZipFile(file) as packed:
         parts = packed.infolist()
         if sum(part.file_size for part in parts) > LARGEST_ARRAYS:
@@ -111,7 +110,7 @@ def _array(data: bytes, where: str) -> Any:
     header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
     if header is None or not header(stream)[2].hasobject:
         return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-    found = take("PROVIDES", "strangers' pickles", "opening arrays of objects")(stream.read(), where)
+    found = pickles.load(stream.read(), where)
     if not isinstance(found, np.ndarray):
         raise LogError(f"{where}: not an array")
     return found

@@ -7,9 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gaponet.errors import LogError
-from gaponet.process.sandbox import inside
-from gaponet.structure import LARGEST_ARRAYS
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.base.structure import LARGEST_ARRAYS
 
 if TYPE_CHECKING:
     import pyarrow as pa

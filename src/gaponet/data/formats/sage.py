@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
+from gaponet.base.structure import LARGEST_ARRAYS, content
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.describe.limits import to_radians
 from gaponet.data.log import Channel, Log
-from gaponet.errors import LogError
-from gaponet.robot import RobotSpec
-from gaponet.structure import LARGEST_ARRAYS, content
+from gaponet.robot.spec import RobotSpec
 
 COLUMNS = {"positions": "qpos", "velocities": "qvel", "torques": "tau"}
 FILES = ("control.csv", "state_motor.csv")

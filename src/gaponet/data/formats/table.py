@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
+from gaponet.base.errors import LogError
+from gaponet.base.structure import LARGEST_ARRAYS, content
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
 from gaponet.data.formats import DESCRIBED, files_under, parquet
 from gaponet.data.log import CHANNELS, skipped
-from gaponet.errors import LogError
-from gaponet.structure import LARGEST_ARRAYS, content
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat", ".parquet")
 NOT_OURS = ("control.csv", "state_motor.csv", "event.csv", "joint_list.txt")  # of SAGE folders

@@ -17,14 +17,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from gaponet.base.errors import DatasetError, UsageError
+from gaponet.base.files import MARK, sync, write_text, writing
+from gaponet.base.progress import Progress, silent
 from gaponet.data.store import Dataset, Entry
-from gaponet.errors import DatasetError, UsageError
-from gaponet.files import MARK, sync, write_text, writing
-from gaponet.parts import offered
-from gaponet.progress import Progress, silent
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
-CORE = {name: f"gaponet.data.writers.{name}" for name in ("sage", "npz")}  # parts bring others
+WRITERS = {name: f"gaponet.data.writers.{name}" for name in ("sage", "npz", "lerobot", "asap", "mcap")}
 
 
 @dataclass(frozen=True)
@@ -37,27 +36,21 @@ class Written:
     fps: float
 
 
-def writers() -> dict[str, str]:
-    """Every format that this installation writes → its writer's module."""
-    return offered("WRITERS", CORE)
-
-
 def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = silent) -> list[Written]:
     """Write a dataset in a format of others.
 
     Args:
         robot: The robot, whose units and home the format may need.
         out: New or empty folder; appears when the export is complete.
-        to: One of writers().
+        to: One of WRITERS.
 
     Raises:
         DatasetError, UsageError: Nothing to write, a folder that holds something, or no such format.
     """
     out = Path(out)
-    known = writers()
-    if to not in known:
-        raise UsageError(f"no writer '{to}'; use one of {', '.join(known)}")
-    writer = import_module(known[to])
+    if to not in WRITERS:
+        raise UsageError(f"no writer '{to}'; use one of {', '.join(WRITERS)}")
+    writer = import_module(WRITERS[to])
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

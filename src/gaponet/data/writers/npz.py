@@ -13,7 +13,7 @@ import numpy as np
 from gaponet.data.sequence import ARRAYS
 from gaponet.data.store import Dataset
 from gaponet.data.writers import Tell, Written, stated
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.arrays import Array
+from gaponet.base.arrays import Array
+from gaponet.base.files import write_text
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.data.writers import Tell, Written
-from gaponet.files import write_text
-from gaponet.robot import RobotSpec
+from gaponet.robot.spec import RobotSpec
 
 SHEET = True
 

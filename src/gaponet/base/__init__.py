@@ -1,0 +1,1 @@
+"""What every sub-package uses: errors, files, checked structures, jobs in other processes, a sandbox."""

@@ -1,0 +1,73 @@
+"""Errors that a user can act on: what is wrong, where, and what to do.
+
+Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line and exits with 2.
+"""
+
+from gaponet.base.text import without_credentials
+
+LONGEST = 1000  # characters of an error; the middle of a longer one is left out: where and what to do stand at its ends
+
+
+class GAPONetError(Exception):
+    """Base of all errors caused by input, never by a bug in gaponet. Its text is one line of printable characters,
+    without the keys of an address."""
+
+    def __init__(self, text: str) -> None:
+        text = without_credentials(text)
+        if len(text) > LONGEST:
+            text = f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
+        super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text))
+
+
+class RobotError(GAPONetError):
+    """A robot folder is missing, incomplete or contradicts its MJCF."""
+
+
+class JointMismatchError(GAPONetError):
+    """Joint names of a log, dataset or model do not match the robot's."""
+
+
+class LogError(GAPONetError):
+    """A log file cannot be read: the message names the file and line."""
+
+
+class DatasetError(GAPONetError):
+    """A dataset folder is missing, damaged or belongs to another robot."""
+
+
+class FolderError(GAPONetError):
+    """A folder to write into is somebody else's, or another process is writing into it."""
+
+
+class ModelError(GAPONetError):
+    """A run or model artifact is missing, damaged or does not fit the robot, rate or gains."""
+
+
+class NoGainError(GAPONetError):
+    """Nothing that was fitted follows the recordings better than what is known already."""
+
+
+class WorkerError(GAPONetError):
+    """The processes that worked on something died of it, one after the other."""
+
+
+class UsageError(GAPONetError):
+    """Options contradict each other or are out of range."""
+
+
+# Modules of optional dependencies → the extra that brings them.
+EXTRAS = {
+    "torch": "train", "onnx": "train", "onnxruntime": "deploy",
+    "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
+    "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
+    "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "tensorboard": "tensorboard", "wandb": "wandb",
+    "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
+}  # fmt: skip
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install where an optional dependency is missing; None for any other module."""
+    module = (error.name or "").split(".")[0]
+    if module not in EXTRAS:
+        return None
+    return f"{module} is not installed; run: pip install 'gaponet[{EXTRAS[module]}]'"

@@ -1,0 +1,103 @@
+"""gaponet demo: logs → dataset → gap → identification → evaluation → report, in one command; a network on top."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+from gaponet import api
+from gaponet.base.errors import ModelError, UsageError
+from gaponet.base.progress import bar
+from gaponet.cli.gap import show_methods
+from gaponet.cli.identify import identify
+from gaponet.cli.options import Json
+from gaponet.cli.out import Out, writes
+from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.report.verdict import verdict
+from gaponet.robot.spec import as_option, load_robot
+
+QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
+
+
+@writes("demo")
+def demo(
+    data: Path | None = None,
+    robot: str = "h1_2",
+    out: Path = Path("demo_run"),
+    budget: str = "60s",
+    network: str = "40s",
+    json: Json = False,
+) -> None:
+    """See all of it in minutes, on VIRTUAL robots or on your logs.
+
+    Args:
+        data: Folder of real logs; default: logs collected from virtual H1-2 robots here and now.
+        robot: Robot name or folder.
+        out: Folder for dataset, robot, run and report; a demo that was interrupted there is finished.
+        budget: Time of identification.
+        network: Training time of a network on top of it, which is asked whether it adds anything.
+    """
+    require_extras()
+    from gaponet.data.store import Dataset
+    from gaponet.report.view.portrait import portrait, prepare
+
+    prepare()
+    from gaponet.report.report import write_report
+
+    screen, began = Out(json), time.monotonic()
+    dataset, known, run = out / "dataset", out / "robot", out / "network"
+    with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):  # stdout is the evaluation's
+        screen.say(f": how far is the simulator from the robot?  (gaponet gap {dataset})", "1 Measure")
+        holdout = _make_dataset(dataset, data, robot, screen)
+        gap = api.gap(str(dataset), robot)
+        show_methods(screen, gap, ("joint",))
+        for sentence in verdict(gap["methods"]):
+            screen.say(sentence)
+        screen.say(f": which causes explain that?  (gaponet identify {dataset} --out {known})", "2 Identify")
+        if not (known / "robot.toml").is_file():
+            identify(str(dataset), known, budget=budget, robot=robot, holdout_units=holdout)
+        screen.say(
+            f": does a network find more?  (gaponet train {dataset} --robot {as_option(known)} --out {run})", "3 Use"
+        )
+        resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(warm_start=QUICK)
+        try:
+            api.train(Dataset(dataset), run, network, config, robot=known, holdout_units=holdout, resume=resume)
+        except ModelError:  # a machine with much other work
+            screen.say(
+                f"{network} were over before a network learned anything; --network 5m gives it more", "", "yellow"
+            )
+            run = known
+    found = api.evaluate(run, str(dataset)).result
+    show_methods(screen, found, ("joint", "payload"))
+    with bar("report") as update:
+        path = write_report(run, progress=update, picture=portrait)
+    for sentence in verdict(found["methods"]):
+        screen.say(sentence)
+    screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
+    screen.say(f"next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot {as_option(known)}")
+    screen.result(found)
+
+
+def require_extras() -> None:
+    """Say at once, and together, what is not installed."""
+    if any(find_spec(module) is None for module in ("torch", "onnx", "onnxruntime", "matplotlib", "markupsafe")):
+        raise UsageError("the demo trains and draws: pip install 'gaponet[train,report]'")
+
+
+def _make_dataset(path: Path, data: Path | None, robot: str, screen: Out) -> tuple[str, ...]:
+    """Import logs or collect from the virtual fleet; returns the units to hold out of training."""
+    if data is not None:
+        from gaponet.cli.logs import import_logs
+
+        import_logs(data, robot, unit_id="lab", payload_mass=0.0, out=path)
+        return ()
+    if load_robot(robot).name != "h1_2":
+        raise UsageError(f"the embedded virtual robots are H1-2; for {robot} give logs with --data DIR")
+    from gaponet.cli.collect import collect
+
+    screen.say("No --data given: collecting from VIRTUAL H1-2 robots; nothing below says anything about real ones.")
+    collect(robot=robot, fleet="easy", recipe="demo", out=path)
+    return ("virtual-4",)

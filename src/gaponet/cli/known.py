@@ -1,0 +1,188 @@
+"""gaponet show, check and fleet: what is known of a robot, whether logs are still of it; and of many, every night."""
+
+from __future__ import annotations
+
+import sys
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from gaponet.base.errors import UsageError
+from gaponet.cli.options import Folder, Json, Motions, Unit
+from gaponet.cli.out import Out
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.knowledge import Knowledge
+
+if TYPE_CHECKING:
+    from gaponet.sysid.drift import Moved
+
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet calibrate.", metavar="ROBOT")]
+Logs = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.", metavar="LOGS"),
+]
+WIDE = 4  # columns of a table
+MEND = "identify or calibrate it again with this gaponet, which keeps it"
+
+
+def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
+    """What is known of an identified robot, and how surely.
+
+    Args:
+        out: Picture to write, .png or .svg.
+    """
+    from gaponet.report.figures.uncertainty import picture
+    from gaponet.sysid.table import SHOWN, certainty, rows, sentences
+
+    screen = Out(json)
+    spec, known = _opened(robot)
+    sure = {j: certainty(known, j) for j in known.joints}
+    fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
+    for start in range(0, len(fields), WIDE):
+        part = fields[start : start + WIDE]
+        title = f"{spec.name}, ± standard error" if start == 0 else "The same"
+        screen.table(title, ["joint", *(SHOWN[f][0] for f in part)], rows(known, part))
+    for line in sentences(known):
+        screen.say(line)
+    if out is not None:
+        from gaponet.base.files import whole
+
+        if out.suffix not in (".png", ".svg"):
+            raise UsageError(f"--out {out}: a picture is a .png or an .svg")
+        with whole(out) as temporary:
+            picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
+        screen.say(f"picture: {out}")
+    screen.result({
+        "robot": spec.name, "sources": known.sources, "held": known.held,
+        "joints": {
+            j: {
+                "values": c.values, "standard_errors": c.errors, "together": c.sets, "left": known.joints[j].left,
+                "band_90": known.joints[j].band, "predicted": known.joints[j].predicted,
+                "scale": known.joints[j].left / max(known.joints[j].predicted, 1e-12),
+            }
+            for j, c in sure.items()
+        },
+        "picture": None if out is None else str(out),
+    })  # fmt: skip
+
+
+def _opened(folder: Path) -> tuple[RobotSpec, Knowledge]:
+    """A robot folder, and what is known of it."""
+    if not (folder / "robot.toml").is_file():
+        raise UsageError(f"{folder}: is no robot folder (no robot.toml); give what gaponet identify wrote")
+    spec = load_robot(folder)
+    known = Knowledge.load(spec)
+    if known is None:
+        raise UsageError(f"{folder}: keeps only values (no known.json); {MEND}")
+    return spec, known
+
+
+def check(
+    robot: Known,
+    logs: Logs,
+    unit: Unit = "",
+    motions: Motions = (),
+    payload_mass: float | None = None,
+    threads: int = 0,
+    json: Json = False,
+) -> None:
+    """Is this still the robot that was identified? What moved?
+
+    The exit code is 0 where it is, 1 where it is not, 2 where that cannot be told.
+
+    Args:
+        unit: Which one, where the dataset holds several, or logs do not say.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        threads: 0 for all cores.
+    """
+    from gaponet.api import unit_recordings
+    from gaponet.sysid.drift import drift
+
+    screen = Out(json)
+    spec, known = _opened(robot)
+    with unit_recordings(logs, spec, unit, motions, payload_mass) as (_, sequences):
+        found = drift(spec, known, sequences, threads)
+    named = {m.joint for m in found.moved}
+    screen.table(
+        f"{len(sequences)} recordings, {found.seconds:.0f} s: what changed most, in standard deviations",
+        ["joint", "number", "by", "deviations", "moves it, mrad", "left anyway, mrad", ""],
+        [
+            _row(m, known, m.joint in named)
+            for m in (*found.moved, *(m for j, m in found.largest.items() if j not in named))
+        ],
+    )
+    for a in found.against:
+        what = f"{a.recording} differs from the others: {a.joint}, {a.field}, {abs(a.sigmas):.0f} deviations"
+        screen.say(f"  {what}", "warning", "yellow")
+    screen.say(f"{found.verdict}: {found.advice}")
+    screen.result({
+        "verdict": found.verdict, "advice": found.advice, "recordings": len(sequences), "seconds": found.seconds,
+        "moved": [_plain(m) for m in found.moved], "largest": {j: _plain(m) for j, m in found.largest.items()},
+        "against": [vars(a) for a in found.against], "threshold": found.threshold, "far": found.far,
+    })  # fmt: skip
+    if found.verdict != "same":
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+def fleet(
+    robots: Annotated[Folder, tyro.conf.arg(help="Folder of robot folders, each of gaponet identify or calibrate.")],
+    logs: Annotated[Folder, tyro.conf.arg(help="Folder of each robot's logs or dataset; or one dataset of all units.")],
+    out: Path,
+    night: str = "",
+    calibrate: bool = True,
+    payload_mass: float | None = None,
+    executor: str = "local",
+    workers: int = 0,
+    json: Json = False,
+) -> None:
+    """Check many robots, calibrate those that drifted, one page of them.
+
+    A fleet's nightly job: who drifted, by what, since when.
+
+    The same command again goes on where it was. The exit code is 0 where all are the same, else 1.
+
+    Args:
+        out: Folder of what is found: fleet.html, calibrated/ROBOT, ROBOT.json with its nights.
+        night: Its name; default today.
+        calibrate: Whether those that drifted are calibrated.
+        payload_mass: kg in each hand, of logs whose format does not state it.
+        executor: Where: local, ray or ray:ADDRESS (docs/scale.md); folders are on a disk that all machines see.
+        workers: Robots at a time; 0 for as many as there are cores.
+    """
+    from gaponet import fleet as known
+    from gaponet.base.progress import bar
+
+    screen, when, found = Out(json), night or date.today().isoformat(), dict[str, known.Night]()
+    with bar("checking") as update:
+        for name, mine, count in known.night(robots, logs, out, when, calibrate, payload_mass, executor, workers):
+            found[name] = mine
+            update(len(found), count, f"{name}: {mine['verdict']}")
+    odd = {name: mine for name, mine in sorted(found.items()) if mine["verdict"] != known.SAME}
+    if odd:
+        screen.table(f"Not as they were, {when}", ["robot", "since", "what moved, or what is wrong"], [
+            [name, known.since(known.history(out / f"{name}.json")), "; ".join(n["moved"]) or n["advice"]]
+            for name, n in odd.items()
+        ])  # fmt: skip
+    took = sum(n["took"] for n in found.values())
+    screen.say(f"{len(found) - len(odd)} of {len(found)} are the same; {took:.0f} s of processor; {out / 'fleet.html'}")
+    screen.result({"night": when, "robots": found, "page": str(out / "fleet.html")})
+    if odd:
+        sys.stdout.flush()
+        raise SystemExit(1)
+
+
+def _row(m: Moved, known: Knowledge, counts: bool) -> list[str]:
+    from gaponet.sysid.table import change
+
+    mine = [k.left for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
+    left = sum(mine) / len(mine)
+    by = change(m.field, m.by, known, m.joint)
+    return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
+            "moved" if counts else ""]  # fmt: skip
+
+
+def _plain(m: Moved) -> dict[str, object]:
+    return {**vars(m), "sigmas": m.sigmas}

@@ -1,0 +1,78 @@
+"""`gaponet record`: the same loop as gaponet run, its recording appended to a dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from gaponet.base.errors import DatasetError, UsageError
+from gaponet.cli.options import Json
+from gaponet.cli.out import Out, writes
+from gaponet.cli.run import Asked, Request, asked_robot, perform, tracking
+
+
+@writes("dataset")
+def record(
+    motion: tuple[str, ...],
+    out: Path,
+    payload_mass: float,
+    unit_id: str = "",
+    repetitions: int = 1,
+    seed: int = 0,
+    asked: Annotated[Asked, tyro.conf.arg(name="")] = Asked(),  # noqa: B008
+    json: Json = False,
+) -> None:
+    """Play a motion uncorrected and keep what the robot did.
+
+    Args:
+        motion: Motions' names or files, played one after the other.
+        out: Dataset folder; made, or appended to. Every run's full recording goes to OUT/recordings.
+        unit_id: Which of its kind was recorded; the virtual driver knows it and sets it.
+        payload_mass: kg in each hand named by payload_side; 0 when empty.
+        repetitions: How often each motion is played.
+        seed: virtual: of the first recording's noise; later ones count on.
+        asked: Robot and loop.
+    """
+    from gaponet.data.importer import findings
+    from gaponet.data.sequence import SequenceMeta, to_sequence
+    from gaponet.data.store import Dataset
+    from gaponet.robot.folder import MOVE_KEPT
+    from gaponet.sim.kept import require_kept
+
+    reach, side = asked.reach, asked.payload_side
+    if asked.driver != "virtual" and not unit_id:
+        raise UsageError("say which unit is recorded: --unit-id NAME")
+    screen = Out(json)
+    if asked.driver == "virtual":
+        unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
+    request = Request(**vars(asked), payload_mass=payload_mass)
+    spec = asked_robot(request)
+    known = Dataset.peek(out, spec)
+    if known is not None:  # before anything moves
+        require_kept(out, spec, DatasetError, MOVE_KEPT)
+    written: list[str] = []
+    errors: list[dict[str, Any]] = []
+    for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):
+        recording, played, spec = perform(screen, name, request, count, out / "recordings")
+        assert played
+        slot = (played.name, unit_id, payload_mass, side)
+        same = [e for e in known.entries if e.meta.slot == slot] if known else []
+        stem = f"{played.name}-{unit_id}-{payload_mass:g}kg-{len(same)}"
+        stem = recording.save(out / "recordings", stem).stem
+        if recording.fault:
+            raise UsageError(
+                f"'{played.name}' was stopped ({recording.fault.text}); it was not added to {out}, its recording is "
+                f"{out / 'recordings' / stem}.*; {len(written)} motions were added before it"
+            )
+        meta = SequenceMeta(
+            spec.name, unit_id, played.name, payload_mass, side, played.level, len(same), recording.virtual,
+            f"recordings/{stem}.parquet", notes={"controller": recording.summary()},
+        )  # fmt: skip
+        sequence = to_sequence(recording.log(stem), spec, meta)
+        known = known or Dataset.create(out, spec)  # not before there is something to keep
+        written.append(known.append(sequence, findings(sequence)).id)
+        errors.append(tracking(recording))
+        screen.say(f"added to {out}: {written[-1]}, {len(sequence)} rows at {sequence.rate:.2f} Hz")
+    screen.result({"dataset": str(out), "written": written, "tracking": errors})

@@ -1,0 +1,215 @@
+"""gaponet robot new, check, list, link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from gaponet.base.errors import UsageError
+from gaponet.base.files import whole
+from gaponet.cli.options import Flag, Json, Model
+from gaponet.cli.out import Out
+from gaponet.robot.spec import RobotSpec, as_option, available, load_robot
+from gaponet.share.reading import open_dataset
+
+if TYPE_CHECKING:
+    from gaponet.robot.new import Made
+
+POSTURES = 300  # of the logs
+
+
+def list_robots(json: Json = False) -> None:
+    """Robots in the package."""
+    out = Out(json)
+    specs = [load_robot(name) for name in available()]
+    out.table("Robots", ["name", "joints", "operated", "Hz", "payload", "what it is"], [
+        [s.name, str(len(s.joint_names)), str(len(s.operated)), f"{1 / s.dt:g}",
+         ", ".join(m.side for m in s.payload_mounts) or "–", s.description] for s in specs
+    ])  # fmt: skip
+    out.say("Your own: a folder with robot.toml and robot.xml; gaponet robot check FOLDER")
+    out.result({"robots": [{"name": s.name, "joints": s.joint_names, "operated": s.operated} for s in specs]})
+
+
+def link(
+    robot: tyro.conf.Positional[str] = "",
+    driver: Literal["unitree", "so101"] = "unitree",
+    domain: int = 0,
+    interface: str = "lo",
+    port: str = "/dev/ttyACM0",
+    seconds: float = 5.0,
+    json: Json = False,
+) -> None:
+    """Listen to a robot without moving it: how its states arrive, and who publishes what.
+
+    Args:
+        robot: Name, or a folder with robot.toml and robot.xml.
+        driver: unitree (DDS) or so101 (serial).
+        domain: unitree: DDS domain.
+        interface: unitree: network interface to the robot.
+        port: so101: serial port.
+        seconds: How long to listen.
+    """
+    from gaponet.cli.link import listen
+
+    options = {"domain": domain, "interface": interface, "silent": True} if driver == "unitree" else {"port": port}
+    listen(Out(json), driver, robot or ("h1_2" if driver == "unitree" else "so101"), options, seconds)
+
+
+def check(
+    robot: tyro.conf.Positional[str] = "",
+    data: Path | None = None,
+    payloads: tuple[float, ...] = (),
+    json: Json = False,
+) -> None:
+    """Step a robot's simulator and say what is wrong with its folder.
+
+    Args:
+        robot: Name, or a folder with robot.toml and robot.xml.
+        data: Dataset of this robot, whose postures and payloads are looked at.
+        payloads: kg in every mount, each held for a minute; default those of the data, or 0.
+    """
+    if not robot:
+        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
+    out = Out(json)
+    out.result(check_robot(out, load_robot(robot), data, payloads))
+
+
+def new(
+    model: Model,
+    out: Path,
+    joints: tuple[str, ...] = (),
+    operated: tuple[str, ...] = (),
+    kp: tuple[str, ...] = (),
+    kd: tuple[str, ...] = (),
+    effort_limit: tuple[str, ...] = (),
+    mounts: tuple[str, ...] = (),
+    packages: tuple[str, ...] = (),
+    rate: float = 50.0,
+    keyframe: str = "",
+    contacts: Flag = False,
+    name: str = "",
+    json: Json = False,
+) -> None:
+    """Make a robot folder from a vendor's MJCF or URDF, with the source of every number, and check it.
+
+    Args:
+        model: MJCF or URDF file, as it lies in its repository.
+        out: New robot folder.
+        joints: Those in the logs, by name or pattern ('*_elbow_*'); all others are frozen. Default: all hinges with
+            an actuator, or all hinges.
+        operated: Those of them that are to be corrected; default all.
+        kp: The gain of the controller that recorded the logs, N·m/rad: 100 for all, '*wrist*=20' for some, the later
+            wins. Default: the model's actuators.
+        kd: Likewise, N·m·s/rad.
+        effort_limit: Likewise, N·m.
+        mounts: Where payloads go: SIDE=BODY, or SIDE=BODY:x,y,z in m. Default: found by name.
+        packages: NAME=FOLDER of package://NAME in a URDF. Default: looked for around it.
+        rate: How many commands a second, Hz.
+        keyframe: At which frozen joints stand, and home. Default: the first, or the model's zero.
+        contacts: Let links touch as the model says.
+        name: What the robot is called. Default: the file's name.
+    """
+    from gaponet.report.view.portrait import prepare
+
+    prepare()
+    from gaponet.robot.new import Wanted, new_robot
+
+    screen = Out(json)
+    made = new_robot(model, out, Wanted(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
+                                        contacts, name))  # fmt: skip
+    for note in made.notes:
+        screen.say(f"  {note}", "   note", "cyan")
+    for what, field in (("kp", "kp_source"), ("kd", "kd_source"), ("effort_limit", "limit_source")):
+        screen.say(f"  {what}: {', '.join(dict.fromkeys(getattr(d, field) for d in made.drives))}", "   from", "cyan")
+    picture = None
+    try:
+        from gaponet.report.view.still import still
+
+        picture = _picture(made, model.name, still)
+    except (UsageError, ModuleNotFoundError) as error:
+        screen.say(f"  no picture: {error}", "   note", "cyan")
+    result = check_robot(screen, made.robot, None, ())
+    screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
+    screen.say(f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {as_option(out)} --out data")
+    screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
+
+
+def _picture(made: Made, label: str, still: Callable[..., bytes]) -> Path:
+    """picture.png in the folder: the vendor's model beside ours, both at home."""
+    from gaponet.sim.model import build_model
+
+    path = made.robot.folder / "picture.png"
+    png = still([(label, made.vendor, made.pose), ("robot.xml", build_model(made.robot), made.robot.qpos_home)])
+    with whole(path) as temporary:
+        temporary.write_bytes(png)
+    return path
+
+
+def check_robot(out: Out, spec: RobotSpec, dataset: Path | None, payloads: tuple[float, ...]) -> dict[str, Any]:
+    """Step the robot; a broken one raises RobotError, a doubtful one gets warnings."""
+    from gaponet.sim import robot_check as check
+    from gaponet.sim.model import model_hash
+
+    postures = None
+    if dataset is not None:
+        data, _ = open_dataset(dataset, spec)
+        payloads = payloads or tuple(sorted({e.meta.payload_mass for e in data.entries}))
+        rows = np.concatenate([data.read(e).qpos for e in data.entries])
+        postures = rows[:: max(1, len(rows) // POSTURES)].astype(float)
+    findings = check.check_robot(spec, payloads or (0.0,), postures)
+    out.table(f"{spec.name}: {spec.description}; N·m/rad, N·m·s/rad, N·m, rad",
+              ["joint", "operated", "kp", "kd", "limit", "range"], [
+        [name, "yes" if name in spec.operated else "no", f"{spec.kp[i]:g}", f"{spec.kd[i]:g}",
+         f"{spec.effort_limit[i]:g}", "{:.2f}…{:.2f}".format(*spec.qpos_range[i])]
+        for i, name in enumerate(spec.joint_names)
+    ])  # fmt: skip
+    for name, unit in zip(spec.joint_names, spec.log_units, strict=True):
+        if unit != "rad":
+            out.say(f"{name} is expected as {unit} in SAGE logs")
+    mounts = ", ".join(f"{m.side} on {m.body}" for m in spec.payload_mounts) or "none"
+    out.say(
+        f"control period {spec.dt * 1e3:g} ms, physics step {spec.timestep * 1e3:g} ms ({spec.decimation} a period); "
+        f"payload mounts: {mounts}; contacts {'on' if spec.contacts else 'off'}; simulator {model_hash(spec)}"
+    )
+    out.findings(findings)
+    bad = {level: sum(f.level == level for f in findings) for level in ("error", "warning")}
+    if bad["error"]:
+        out.say(f": {spec.name} is no simulator of it yet; mend the {bad['error']} error(s)", "not ok", "bold red")
+    elif bad["warning"]:
+        out.say(f"{spec.name} compiles and holds; see the {bad['warning']} warning(s)")
+    else:
+        out.say(f": {spec.name} compiles, holds its home and is stable", "ok", "bold green")
+    warnings = [f.message for f in findings if f.level in bad]
+    return as_dict(spec) | {"simulator_hash": model_hash(spec), "warnings": warnings,
+                                "findings": [vars(f) for f in findings]}  # fmt: skip
+
+
+def as_dict(spec: RobotSpec) -> dict[str, Any]:
+    """The check as a dictionary that JSON can hold."""
+    return {
+        "name": spec.name, "dt": spec.dt, "timestep": spec.timestep,
+        "joints": [
+            {"name": name, "operated": name in spec.operated, "kp": spec.kp[i], "kd": spec.kd[i],
+             "effort_limit": spec.effort_limit[i], "range": spec.qpos_range[i], "home": spec.qpos_home[i],
+             "log_unit": spec.log_units[i]}
+            for i, name in enumerate(spec.joint_names)
+        ],
+        "payload_mounts": [{"side": m.side, "body": m.body, "pos": m.pos} for m in spec.payload_mounts],
+    }  # fmt: skip
+
+
+# Each is run while the command line is parsed; what is left to call is nothing.
+Action = (
+    Annotated[None, tyro.conf.subcommand("new", constructor=new)]
+    | Annotated[None, tyro.conf.subcommand("check", constructor=check)]
+    | Annotated[None, tyro.conf.subcommand("list", constructor=list_robots)]
+    | Annotated[None, tyro.conf.subcommand("link", constructor=link)]
+)
+
+
+def robot(action: tyro.conf.OmitArgPrefixes[tyro.conf.OmitSubcommandPrefixes[Action]]) -> None:
+    """Make a robot folder from a vendor's model, or check one."""

@@ -1,0 +1,450 @@
+"""`gaponet run`: play a motion, or live targets, on a robot, real or virtual, with or without a model."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from gaponet.base.errors import UsageError
+from gaponet.cli.options import Flag, Json
+from gaponet.cli.out import Out, writes
+from gaponet.deploy.compensator import CompensatorConfig
+from gaponet.hw.control.consent import require_consent, require_terminal
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.safety import SafetyConfig
+from gaponet.hw.targets.live import LiveConfig
+
+if TYPE_CHECKING:
+    from gaponet.hw.control.clock import Clock
+    from gaponet.hw.control.controller import Controller
+    from gaponet.hw.control.driver import Driver
+    from gaponet.hw.control.plan import Plan
+    from gaponet.hw.control.recording import Event, Recording
+    from gaponet.hw.targets.live import LiveTargets, Wire
+    from gaponet.robot.spec import RobotSpec
+    from gaponet.sysid.motion.feasible import Feasibility
+    from gaponet.sysid.motion.motion import Motion
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How to reach the robot."""
+
+    topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
+    """unitree: arm_sdk leaves legs and balance to the robot; lowcmd is for a robot that hangs."""
+    joints: Literal["arms", "upper_body", "all"] = "arms"
+    """unitree: what is commanded; the legs only with all, on lowcmd."""
+    domain: int = 0
+    """unitree, and targets over DDS: DDS domain."""
+    interface: str = "lo"
+    """unitree, and targets over DDS: network interface to the robot; lo for a virtual one on this machine."""
+    port: str = "/dev/ttyACM0"
+    """so101: serial port."""
+    calibration: Path | None = None
+    """so101: the file that lerobot-calibrate wrote for this arm. It is compared with what the servos hold of it, which
+    counts where no file is given."""
+    unit: str = "4"
+    """virtual: number or name in the fleet."""
+    fleet: str = "hard"
+    """virtual: hard, easy, shifted, unnamed, or a .toml file."""
+    hangs: Flag = False
+    """unitree: the robot hangs. lowcmd demands it: all motors that are not commanded, legs too, go off."""
+    fast: Flag = False
+    """virtual: as fast as this machine can, not in real time."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What playing a motion may be told of robot and loop, as data: the docstrings are the command-line help."""
+
+    driver: Literal["virtual", "unitree", "so101"] = "virtual"
+    """virtual (in this process), unitree (DDS: a real H1-2, or gaponet virtual serve), so101 (serial)."""
+    robot: str | None = None
+    """Name or folder, identified ones too; default the one that the model's run keeps; without a model h1_2, or so101
+    with so101."""
+    limits_from: str | None = None
+    """Robot folder whose gains, joint ranges, effort limits and collision shapes are used on hardware instead of the
+    package's robot. Read its values before you name it. Identified values come from --robot or --model."""
+    payload_side: str = "both"
+    """both, or one hand."""
+    max_payload: float | None = None
+    """kg in each hand that the motion must be possible with; default payload_mass, 0 without one. A motion of the
+    library that several payloads shall play alike needs the heaviest of them here."""
+    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach()
+    """How to reach the robot."""
+    control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
+    """Timing."""
+    safety: SafetyConfig = SafetyConfig()  # noqa: RUF009
+    """Limits and checks of states."""
+    plane: float | None = None
+    """Height of the floor or table in the robot's frame, m; default what its collision.toml says."""
+    unchecked: Flag = False
+    """Go without looking whether the robot meets itself, or what it stands on."""
+    yes: Flag = False
+    """Do not ask before a robot moves."""
+
+
+@dataclass(frozen=True)
+class Live(LiveConfig):
+    """Targets that come while the robot moves."""
+
+    address: str = "tcp://127.0.0.1:5555"
+    """zmq: where to listen; 127.0.0.1 is heard from this machine alone."""
+    topic: str = "rt/joint_trajectory_controller/joint_trajectory"
+    """dds: of trajectory_msgs/JointTrajectory, as ROS 2 has it on the bus."""
+    states: str = "rt/joint_states"
+    """dds: of sensor_msgs/JointState, to which states go."""
+
+
+@dataclass(frozen=True)
+class Request(Asked):
+    """The same, with compensation between targets and commands, and live targets."""
+
+    targets: Literal["zmq", "dds", "stdin"] | None = None
+    """Instead of a motion, targets that come while the robot moves: JSON over ZeroMQ or in lines on standard input, or
+    ROS 2's JointTrajectory over DDS. docs/deploy.md has the messages."""
+    live: Live = Live()
+    """Live targets: where they come from, and which are taken."""
+    payload_mass: float | None = None
+    """kg in each hand; with compensation, None estimates it."""
+    compensate: Flag = False
+    """Command what gets the robot to where the motion says by what is known of it: the feed-forward of --robot, best
+    the folder that gaponet identify wrote. A motion's velocity and acceleration are fed forward too, live targets'
+    only with --compensation.dynamics."""
+    model: Path | None = None
+    """Run or artifact folder: compensate with its model on top."""
+    compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
+    """How commands are found, with compensation."""
+    unit_id: str = ""
+    """Which unit this is, with a model; what gaponet calibrate found out about it is used."""
+    extrapolate: Flag = False
+    """Take payloads, with a model, and servo gains other than those that the data were recorded with."""
+    dry_run: Flag = False
+    """Connect, read and compute, send nothing, and say what would be sent."""
+
+
+@writes("recordings")
+def run(
+    motion: str | None = None,
+    out: Path | None = None,
+    asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
+    json: Json = False,
+) -> None:
+    """Play a motion or live targets on a robot; any key stops it.
+
+    Ctrl-C, Ctrl-Z and SIGTERM do as well, within one control period. A real robot moves only after the word yes.
+
+    Args:
+        motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
+        out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npy.
+        asked: Robot, loop and model.
+    """
+    screen = Out(json)
+    if asked.dry_run and out:
+        raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
+    recording, played, _ = perform(screen, motion, asked, folder=out)
+    if out:
+        screen.say(f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}")
+    screen.result(recording.summary() | tracking(recording))
+    if recording.fault or (out and recording.rows.trouble):
+        sys.exit(3)
+
+
+def perform(
+    screen: Out, motion_name: str | None, asked: Request, seed: int = 0, folder: Path | None = None
+) -> tuple[Recording, Motion | None, RobotSpec]:
+    """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
+    from gaponet.hw.control.clock import MonotonicClock, SimulatedClock
+    from gaponet.hw.control.controller import Controller
+    from gaponet.hw.control.hardware import for_hardware, known_robot, require_plausible, robot_hash
+    from gaponet.hw.control.plan import Planner
+    from gaponet.hw.drivers.dry import DryRun
+
+    if (motion_name is None) == (asked.targets is None):
+        raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
+    spec = identified = asked_robot(asked)
+    if asked.driver != "virtual":
+        spec = for_hardware(identified, known_robot(asked.driver, asked.limits_from))
+    fast = asked.reach.fast and asked.driver == "virtual"
+    if fast and asked.targets:
+        raise UsageError("live targets come in real time; leave out --fast")
+    clock = SimulatedClock() if fast else MonotonicClock()
+    asks = asked.driver != "virtual" and not asked.yes and not asked.dry_run
+    if asks:
+        require_terminal()
+    _require_shapes(screen, asked, spec)
+    _require_hung(asked)
+    motion, limits = find_motion(motion_name, asked, spec)
+    driver, facts = make_driver(asked, spec, clock, seed)
+    if motion:
+        _require_commanded(motion, spec, driver)
+    planner = Planner(spec, driver.commanded, asked.control, asked.safety, limits)
+    if asked.dry_run:
+        driver = DryRun(driver)
+    compensator, calibrated = _compensator(screen, asked, identified, asked.unit_id or facts.get("unit_id", ""))
+    if compensator and asked.driver != "virtual":
+        require_plausible(compensator.robot)
+    live = None if motion else listen(screen, asked, spec, driver, clock)
+
+    def met(robot: Driver) -> None:
+        """The robot has answered and nothing was commanded: plan, show, ask."""
+        if compensator:
+            compensator.require_gains(robot.joint_names, robot.kp, robot.kd)
+        if motion:
+            plan = planner.plan(motion, robot.read().qpos)
+            if compensator:
+                stated = asked.payload_mass
+                masses = compensator.masses[[0, -1]].tolist() if stated is None else [stated]
+                plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
+            controller.plan = plan
+            _show(screen, plan, spec, robot, limits.max_payload)
+        if asks:
+            how = f"as {asked.targets} says" if motion is None else "as planned"
+            require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")
+
+    controller = Controller(
+        driver, spec, config=asked.control, safety=asked.safety, compensator=compensator, clock=clock,
+        payload_mass=asked.payload_mass, folder=folder, on_event=lambda event: _tell(screen, event), on_connect=met,
+        planner=None if asked.unchecked else planner, unchecked=asked.unchecked,
+        metadata={
+            "motion": motion.name if motion else "live", "payload_side": asked.payload_side,
+            "model": str(asked.model) if asked.model else None,
+            "compensated_by": str(compensator.robot.folder) if compensator else None, "calibrated": calibrated,
+            "limits_from": str(spec.folder), "robot_hash": robot_hash(spec),
+        } | facts | ({"targets": live.counts} if live else {}),
+    )  # fmt: skip
+    try:
+        recording = controller.run(live, keys=True)
+    finally:
+        if live:
+            events = controller.recording.events
+            live.close(events[-1].text if events else "nothing was commanded")
+    if asked.dry_run:
+        _report_dry(screen, recording, controller)
+    else:
+        _report(screen, recording)
+    return recording, controller.plan.motion if controller.plan else None, identified
+
+
+def listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
+    """The wire of live targets, open."""
+    from gaponet.hw.targets.live import LiveTargets
+
+    wire: Wire
+    live = asked.live
+    if asked.targets == "zmq":
+        from gaponet.hw.targets.zeromq import ZeroMQWire
+
+        wire = ZeroMQWire(live.address)
+    elif asked.targets == "dds":
+        from gaponet.hw.targets.ros2 import ROS2Wire
+
+        wire = ROS2Wire(asked.reach.domain, asked.reach.interface, live.topic, live.states)
+    else:
+        from gaponet.hw.targets.pipe import PipeWire
+
+        wire = PipeWire()
+    screen.say(f"targets are expected on {wire.address}")
+    return LiveTargets(wire, robot, driver.commanded, clock, 1.0 / asked.control.rate, asked.safety.speed, live)
+
+
+def asked_robot(asked: Request) -> RobotSpec:
+    """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
+    from gaponet.base.errors import ModelError
+    from gaponet.robot.folder import keeps_robot, kept_robot
+    from gaponet.robot.spec import load_robot
+    from gaponet.sim.kept import require_kept
+
+    place = None if asked.model is None else asked.model.parent if asked.model.name == "model" else asked.model
+    if place is not None and asked.robot is not None:
+        return require_kept(place, load_robot(asked.robot), ModelError, "leave --robot out")
+    if place is not None and keeps_robot(place):
+        return kept_robot(place, "")
+    return load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
+
+
+def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
+    """Refuse a motion that moves joints which the driver does not command."""
+    left = [name for name in motion.moved(robot) if name not in driver.commanded]
+    if left:
+        raise UsageError(
+            f"motion '{motion.name}' moves {', '.join(left)}, which {driver.address} does not command; it commands "
+            f"{', '.join(driver.commanded)}. Choose another motion, or let the driver command more joints"
+        )
+
+
+def _require_shapes(screen: Out, asked: Request, robot: RobotSpec) -> None:
+    """Refuse a real robot of which nobody knows where its limbs are."""
+    if asked.unchecked or (robot.folder / "collision.toml").is_file():
+        return
+    text = (
+        f"{robot.name} has no collision.toml, so nobody would look whether it meets itself or what it stands on. Write "
+        f"one into {robot.folder} (docs/new-robot.md has the fields), or say --unchecked"
+    )
+    if asked.driver != "virtual":
+        raise UsageError(text)
+    screen.say(f"unchecked: {text}")
+
+
+def _require_hung(asked: Request) -> None:
+    """Refuse lowcmd for a robot of which nobody said that it hangs."""
+    if asked.driver != "unitree" or asked.reach.topic != "lowcmd" or asked.reach.hangs or asked.dry_run:
+        return
+    words = {"arms": "legs and torso", "upper_body": "the legs", "all": "at the end of the run all motors"}
+    off = words[asked.reach.joints]
+    if asked.yes:
+        raise UsageError(f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs")
+    text = f"With --topic lowcmd {off} go off: a robot that stands falls."
+    require_consent(text, "Does it hang?", "it hangs", "--hangs")
+
+
+def find_motion(name: str | None, asked: Request, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
+    """A motion file as it is, or a motion of the library, or None for live targets; and the limits it must keep."""
+    from gaponet.sysid.motion.files import SUFFIXES, read_motion
+    from gaponet.sysid.motion.library import Library
+
+    payload = asked.payload_mass or 0.0
+    heaviest = payload if asked.max_payload is None else asked.max_payload
+    if heaviest < payload:
+        raise UsageError(f"--max-payload {heaviest:g} is less than --payload-mass {payload:g}")
+    library = Library(robot, max_payload=heaviest, height=asked.plane, unchecked=asked.unchecked)
+    if name is None:
+        return None, library.limits
+    return read_motion(name, robot) if name.endswith(SUFFIXES) else library.make(name), library.limits
+
+
+def make_driver(asked: Request, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
+    """The driver, and what is known about the unit behind it."""
+    from gaponet.hw.drivers.open import open_driver
+
+    reach = asked.reach
+    if asked.driver == "unitree":
+        options: dict[str, Any] = {n: getattr(reach, n) for n in ("topic", "joints", "domain", "interface")}
+        return open_driver("unitree", robot, silent=asked.dry_run, **options), {}
+    if asked.driver == "so101":
+        return open_driver("so101", robot, port=reach.port, calibration=reach.calibration), {}
+    from gaponet.testing.fleet import load_fleet
+    from gaponet.testing.virtual_driver import VirtualDriver
+
+    robot = robot.nominal or robot  # what identification found is the unit's, and that has its own
+    name = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
+    side = asked.payload_side
+    physics = load_fleet(reach.fleet, robot).unit(name)
+    payload = (asked.payload_mass or 0.0, side)
+    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": reach.fleet}
+
+
+def tracking(recording: Recording) -> dict[str, Any]:
+    """Mean |measured − asked| by joint over the run, rad: measured one period after the command, as everywhere."""
+    rows = recording.during("run")
+    if len(rows) < 2:
+        return {}
+    at = [recording.joint_names.index(name) for name in recording.commanded]
+    target, qpos = rows["target"][:, at], rows["qpos"][:, at]
+    error = np.abs(qpos[1:] - target[:-1])
+    moved = np.ptp(target, axis=0) > 1e-6
+    joints = {n: float(e) for n, e, m in zip(recording.commanded, error.mean(axis=0), moved, strict=True) if m}
+    return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
+
+
+def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
+    """The compensator, or None; and the unit whose calibration it uses."""
+    if asked.model is None and not asked.compensate:
+        return None, None
+    from gaponet.deploy.compensator import Compensator
+
+    config, dt = asked.compensation, 1.0 / asked.control.rate
+    if asked.model is None:
+        config = replace(config, dynamics=config.dynamics or asked.targets is None)
+        made = Compensator(robot, None, config, dt, None, asked.payload_side, extrapolate=asked.extrapolate)
+        if asked.payload_mass is not None:
+            made.require_payload(asked.payload_mass)  # before anything is opened
+        if robot.nominal is None:
+            screen.say(f"{robot.folder} is not identified: the feed-forward is the nominal robot's")
+        return made, None
+    from gaponet.nn import calibration
+    from gaponet.nn.artifact import GapModel
+
+    model = GapModel.load(asked.model)
+    folder = model.path.parent if model.path.name == "model" else model.path
+    known = calibration.Calibration.load(folder, model.weights_hash())
+    if unit in known:
+        screen.say(f"commands are found with the calibration of unit {unit}")
+    elif known:
+        units = ", ".join(known)
+        screen.say(f"the run holds calibrations of {units}, none of which is used: --unit-id says which unit this is")
+    compensator = Compensator(
+        robot, model, config, dt, payload_side=asked.payload_side,
+        extrapolate=asked.extrapolate, calibration=known.get(unit),
+    )  # fmt: skip
+    if asked.payload_mass is not None:
+        compensator.require_payload(asked.payload_mass)
+    return compensator, unit if unit in known else None
+
+
+def _show(screen: Out, plan: Plan, robot: RobotSpec, driver: Driver, heaviest: float) -> None:
+    """From where to where, what moves and what is held, how near it comes to what, and how it ends."""
+    from gaponet.hw.control.plan import STILL
+
+    rows = plan.rows
+    moves = [n for n, span in zip(robot.joint_names, np.ptp(rows, axis=0), strict=True) if span > STILL]
+    held = [n for n in driver.commanded if n not in moves]
+    assert plan.motion
+    title = f"Plan: {plan.motion.name}, {plan.duration:.1f} s, of which {plan.into.duration:.1f} to where it begins"
+    screen.table(title, ["moves", "found, rad", "begins", "lowest", "highest", "ends"], [
+        [joint, *(f"{x:.2f}" for x in (plan.found[j], plan.motion.ctrl[0, j], rows[:, j].min(), rows[:, j].max(),
+                                       rows[-1, j]))]
+        for joint, j in zip(moves, robot.index(moves), strict=True)
+    ])  # fmt: skip
+    around = len(plan.into.points) - 2
+    how = {"hand_over": "handed over to the robot's own controller", "hold": "held", "damp": "damped, then let go"}
+    load = f"with up to {heaviest:g} kg in each hand" if heaviest else "with nothing in the hands (--payload-mass)"
+    back = "goes back to where it was found and is " if plan.back else "is "
+    for text in (
+        f"held where found: {', '.join(held)}" if held else "",
+        f"the motion is {plan.changed}, to keep within limits" if plan.changed else "",
+        f"it goes around what is in between ({around} stops)" if around else "",
+        "nobody looks whether it meets itself or what it stands on" if not np.isfinite(plan.clearance)
+        else f"nearest to each other: {plan.nearest}, {100 * plan.clearance:.1f} cm",
+        f"commands lead their targets by at most {plan.correction:.2f} rad ({plan.corrected_joint}); nearest to each "
+        f"other: {100 * plan.command_clearance:.1f} cm" if plan.corrected_joint else "",
+        f"limits and collision shapes: {robot.folder}",
+        f"most torque, {load}: {plan.joint}, {plan.torque:.2f} of what may be used",
+        f"at the end it {back}{how[driver.at_end]}; a stop {driver.at_stop} it",
+    ):  # fmt: skip
+        if text:
+            screen.say(f"  {text}")
+
+
+def _tell(screen: Out, event: Event) -> None:
+    colour = "bold red" if event.kind not in ("", "end") else "cyan"
+    screen.say(f"  {event.kind and event.kind + ': '}{event.text}", f"{event.phase:>9}", colour)
+
+
+def _report(screen: Out, recording: Recording) -> None:
+    facts = recording.summary()
+    three = lambda what: ", ".join(f"{facts[what][q]:.2f}" for q in ("p50", "p99", "max"))  # noqa: E731
+    error = tracking(recording).get("tracking_error_rad", {}).get("mean")
+    label = "VIRTUAL " if recording.virtual else ""
+    screen.table(f"{label}{recording.robot} at {facts['rate_hz']:g} Hz", ["what", "value"], [
+        ["periods, of which never started", f"{facts['periods']}, {recording.missed}"],
+        ["late, ms: p50, p99, max", three("late_ms")],
+        ["age of state, ms: p50, p99, max", three("state_age_ms")],
+        ["tracking error, mrad", "–" if error is None else f"{1e3 * error:.2f}"],
+    ])  # fmt: skip
+
+
+def _report_dry(screen: Out, recording: Recording, controller: Controller) -> None:
+    from gaponet.hw.drivers.dry import would_send
+
+    sent = would_send(recording, controller.limits)
+    screen.table("Dry run: nothing was sent. These commands would have been, to a robot that follows at once",
+                 ["joint", "from, rad", "to, rad", "fastest, rad/s", "torque asked, N·m"], [
+        [joint, *(f"{value:.3f}" for value in values.values())] for joint, values in sent.items()
+    ])  # fmt: skip
+    recording.meta["would_send"] = sent

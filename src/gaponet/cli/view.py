@@ -1,0 +1,128 @@
+"""gaponet view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gaponet.base.errors import UsageError
+from gaponet.base.progress import bar
+from gaponet.cli.options import Data, Flag, Json, Robot
+from gaponet.cli.out import Out
+from gaponet.report.tables import mrad
+from gaponet.share.reading import open_dataset
+
+if TYPE_CHECKING:
+    from gaponet.data.sequence import SequenceMeta
+    from gaponet.report.view.film import Clip
+    from gaponet.report.view.scene import Scene
+
+
+def view(
+    dataset: Data,
+    model: tuple[Path, ...] = (),
+    motion: str = "",
+    unit: str = "",
+    payload_mass: float | None = None,
+    show: tuple[str, ...] = ("target", "nominal", "aligned", "recorded"),
+    render: Path | None = None,
+    web: Flag = False,
+    port: int = 8080,
+    start: float | None = None,
+    duration: float = 8.0,
+    speed: float = 1.0,
+    magnify: float = 1.0,
+    ghost: bool = True,
+    closeup: bool = False,
+    fps: float = 20.0,
+    width: int = 960,
+    course: bool = True,
+    azimuth: float = 145.0,
+    elevation: float = -14.0,
+    robot: Robot = None,
+    json: Json = False,
+) -> None:
+    """Watch a recording beside its simulations: window, browser, film.
+
+    Args:
+        model: Robot folders of gaponet identify and run folders of gaponet train; each gives a copy of the robot.
+        motion: Which motion; default: one that the model was not trained on, where there is one.
+        unit: Which unit's recording, where there are several.
+        payload_mass: Which payload's recording, kg.
+        show: Copies from left to right; aligned stands for the identified robot and every --model.
+        render: Write a .gif, .mp4 or .png instead, without a display (.png: the moment of the largest nominal error).
+        web: Serve the scene to a browser instead, without a display; needs gaponet[view].
+        port: Port of --web.
+        start: s into the recording; default: where most happens.
+        duration: s of the recording.
+        speed: Below 1 is slow motion.
+        magnify: Differences from the recording times this, to make milliradians visible; said on the picture.
+        ghost: Draw the recording, translucent, into each other copy.
+        closeup: Limbs without an operated joint (a humanoid's legs) may be cut off.
+        fps: Pictures a second of a film.
+        width: Width of a picture, pixels; the height follows from the robots.
+        course: Draw the error against time below a picture.
+        azimuth: Camera, degrees; 180 looks at the robot's front.
+        elevation: Camera, degrees; negative looks down.
+    """
+    _require_screen(render, web)
+    from gaponet.report.view.film import Clip
+    from gaponet.report.view.scene import Scene, View
+    from gaponet.report.view.side_by_side import pick, side_by_side
+
+    out = Out(json)
+    data, spec = open_dataset(dataset, robot)
+    entry = pick(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
+    with bar("replaying") as update:
+        shown = side_by_side(data, entry, spec, model, update)
+    shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
+    clip = Clip.of(shown, start, duration, speed, fps)
+    errors = {m.method: m.mpjae for m in shown.motions if m.method != "recorded"}
+    _introduce(out, entry.meta, {m.name: m.mpjae for m in shown.motions if m.method in errors}, shown.seen)
+    rows = slice(round(clip.start / shown.real.dt), round(clip.stop / shown.real.dt) + 1)
+    scene = Scene(shown.magnified(magnify), View(azimuth, elevation), ghost, rows, render is not None, closeup)
+    if render is not None:
+        _film(scene, clip, render, width, magnify, course, out)
+    elif web:
+        from gaponet.report.view.web import serve
+
+        serve(scene, clip, port, magnify, out.say)
+    else:
+        from gaponet.report.view.watch import watch
+
+        watch(scene, clip, magnify)
+    out.result({
+        "sequence": entry.id, "virtual": entry.meta.virtual, "seen": shown.seen, "start": clip.start,
+        "duration": clip.duration, "mpjae": errors, "render": None if render is None else str(render),
+    })  # fmt: skip
+
+
+def _require_screen(render: Path | None, web: bool) -> None:
+    """Refuse, before anything is simulated, what could not be seen."""
+    from gaponet.report.view.gl import choose_gl, has_display
+
+    if render is not None:
+        choose_gl()
+        from gaponet.report.view.film import require_kind
+
+        require_kind(render)
+    elif not web and not has_display():
+        raise UsageError("no display here; write a film with --render out.gif, or serve a browser with --web")
+
+
+def _introduce(out: Out, meta: SequenceMeta, errors: dict[str, float], seen: bool | None) -> None:
+    said = ", ".join(f"{name} {mrad(error)} mrad" for name, error in errors.items())
+    whose = "VIRTUAL " if meta.virtual else ""
+    out.say(f", {whose}unit {meta.unit_id}, {meta.payload_mass:g} kg; {said}", meta.motion)
+    if seen:
+        out.say("", "a model was trained or chosen on this recording: it is not held-out", "yellow")
+
+
+def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, course: bool, out: Out) -> None:
+    from gaponet.report.view.film import write
+    from gaponet.report.view.picture import Camera
+
+    span = (clip.start, clip.stop)
+    with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:
+        pictures = write(camera, clip, path, lambda done, total: update(done, total, "pictures"))
+    out.say(f"{path}: {pictures} picture{'s' * (pictures > 1)}, {path.stat().st_size / 1e6:.2f} MB")

@@ -1,0 +1,82 @@
+"""ASAP's motion pickle (.pkl): {motion: {dof, action, fps, …}}; opened with --allow-pickle only.
+
+`action` is the policy's: the target is default position + action_scale · action, 0.25 in ASAP's configuration. A file
+of ours says scale and default positions itself; for others logs.toml says action_scale, and home in robot.toml is the
+default position. Joints have no names in it: logs.toml lists them. Opened as formats.pickles says: nothing runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.base.structure import LARGEST_ARRAYS, parse_json
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, restated
+from gaponet.data.formats import DESCRIBED, files_under, pickles
+from gaponet.data.sequence import OPTIONAL
+
+OPTIONS = DESCRIBED
+EXTRA = ""
+PICKLED = True
+DEFAULT: LogsFile = {"ctrl": "action", "qpos": "dof", "qvel": "dof_vel", "position_unit": "rad", "time_unit": "s"}
+TARGETS = "target"  # signal made of action, where the file says how
+
+
+def detects(path: Path) -> bool:
+    """A file of that suffix, or a folder with one at or below it."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """The files."""
+    return files_under(path, (".pkl",))
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every motion of every file."""
+    for file in find(path):
+        found = _read(file)
+        motions = found if isinstance(found, dict) else {}
+        motions = {str(k): v for k, v in motions.items() if isinstance(v, dict) and "dof" in v}
+        if not motions:
+            raise LogError(f"{file}: no motion with dof in it; an ASAP file is {{motion: {{dof, action, fps}}}}")
+        for name, motion in motions.items():
+            yield _recording(file, name, motion)
+
+
+@inside(LogError, "numpy")
+def _read(file: Path) -> Any:
+    if file.stat().st_size > LARGEST_ARRAYS:
+        raise LogError(f"{file}: has more than {LARGEST_ARRAYS >> 20} MiB; split it into files of one motion")
+    return pickles.load(file.read_bytes(), str(file))
+
+
+def _recording(file: Path, name: str, motion: dict[str, Any]) -> Recording:
+    where = f"{file}#{name}"
+    arrays = {k: v for k, v in motion.items() if isinstance(v, np.ndarray) and v.dtype.kind in "fiu" and v.ndim}
+    fps = motion.get("fps")
+    if not isinstance(fps, (int, float, np.number)) or not 1 <= float(fps) <= 10_000:
+        raise LogError(f"{where}: fps is {fps!r:.40}; a number from 1 to 10000 Hz")
+    if "action" not in arrays or "dof" not in arrays:
+        raise LogError(f"{where}: no {'action' if 'dof' in arrays else 'dof'}: a motion to follow, not a log")
+    rows = min(len(arrays["action"]), len(arrays["dof"]))
+    arrays = {k: v[:rows] for k, v in arrays.items() if len(v) >= rows}
+    default = LogsFile(rate=float(fps))
+    scale, home = motion.get("action_scale"), motion.get("default_dof_pos")
+    if isinstance(scale, (int, float)) and isinstance(home, np.ndarray) and home.shape == arrays["action"].shape[1:]:
+        arrays[TARGETS] = np.asarray(home, float) + scale * arrays["action"]
+        default["ctrl"] = TARGETS
+    names = motion.get("joint_names")
+    labels = tuple(map(str, names)) if isinstance(names, (list, np.ndarray)) else ()
+    meta: dict[str, Any] = {}
+    if isinstance(motion.get("stated"), str):  # a file of ours
+        meta["stated"] = restated(parse_json(dict[str, Any], motion["stated"], where, LogError), where)
+        default |= {c: c for c in ("ctrl", *OPTIONAL) if c in arrays}  # type: ignore[typeddict-item]
+    motion_name = str(meta["stated"]["motion"]) if meta else name
+    return Recording.of_arrays(file, arrays, labels, motion_name, part=name, meta=meta, default=default)

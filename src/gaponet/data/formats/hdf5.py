@@ -1,0 +1,120 @@
+"""HDF5 file, or a folder of them: ALOHA, robomimic, or any with arrays of one row per sample.
+
+Signals are called by their path in the file: action, observations/qpos, … ALOHA's names are known; it has no clock, so
+logs.toml says rate = 50.0, and joints, as its columns have no names. A file with several demonstrations (robomimic's
+data/demo_0, …) holds one recording in each; robomimic's actions are mostly steps of the hand, not joint positions, so
+logs.toml must say which array is the command. Images are not read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import WIDEST, Recording, Signal, reading
+from gaponet.data.formats import DESCRIBED, files_under
+
+SUFFIXES = (".h5", ".hdf5")
+OPTIONS = DESCRIBED
+EXTRA = "hdf5"
+DEFAULT: LogsFile = {}
+ALOHA: LogsFile = {
+    "ctrl": "action", "qpos": "observations/qpos", "qvel": "observations/qvel", "tau": "observations/effort",
+    "position_unit": "rad",
+}  # fmt: skip
+DEEPEST, MOST = 6, 5000  # groups in groups; arrays in a file
+
+
+def detects(path: Path) -> bool:
+    """A file of that suffix, or a folder with one at or below it."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """The files."""
+    return files_under(path, SUFFIXES)
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every file, or every demonstration in it."""
+    for file in find(path):
+        arrays = _listed(file)
+        demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")}, key=_by_number)
+        for demo in demos or [""]:
+            inside = {n.removeprefix(demo).lstrip("/"): labels for n, labels in arrays.items() if n.startswith(demo)}
+            part = demo.rpartition("/")[2]
+            name = f"{file.stem}-{part}" if part else file.stem
+            aloha = not demo and {"action", "observations/qpos"} <= inside.keys()
+            yield Recording(
+                name, f"{file}#{part}" if part else str(file), inside, partial(_load, file, demo), str(file),
+                (str(file),), default=_there(ALOHA, inside) if aloha else LogsFile(),
+            )  # fmt: skip
+
+
+def _there(told: LogsFile, signals: dict[str, Any]) -> LogsFile:
+    return {k: v for k, v in told.items() if v in signals or k == "position_unit"}  # type: ignore[return-value]
+
+
+def _by_number(demo: str) -> tuple[int, str]:
+    digits = "".join(c for c in demo if c.isdigit())
+    return int(digits[:9] or 0), demo
+
+
+@contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """The file."""
+    import h5py
+
+    with reading(file, "HDF5 file"), h5py.File(file, "r") as root:
+        yield root
+
+
+@inside(LogError, "h5py")
+def _listed(file: Path) -> dict[str, tuple[str, ...]]:
+    with _opened(file) as root:
+        return _arrays(root)
+
+
+def _arrays(root: Any) -> dict[str, tuple[str, ...]]:
+    """Arrays of numbers with one row per sample, by path, and names of their columns. Links are not followed."""
+    import h5py
+
+    found: dict[str, tuple[str, ...]] = {}
+    todo = [("", root, 0)]
+    while todo:
+        place, group, depth = todo.pop()
+        for name in group:
+            path = f"{place}/{name}".lstrip("/")
+            if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+                continue  # a soft link may make a circle, an external one open another file
+            item = group[name]
+            if isinstance(item, h5py.Group) and depth < DEEPEST:
+                todo.append((path, item, depth + 1))
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "fiu" and 1 <= item.ndim <= 2:
+                width = item.shape[1] if item.ndim == 2 else 0
+                if len(item) > 0 and width <= WIDEST and item.external is None and not item.is_virtual:
+                    found[path] = tuple(map(str, range(width)))
+            if len(found) > MOST:
+                raise LogError(f"{root.filename}: more than {MOST} arrays; give one recording per file")
+    return dict(sorted(found.items()))
+
+
+@inside(LogError, "h5py")
+def _load(file: Path, demo: str, names: list[str]) -> dict[str, Signal]:
+    with _opened(file) as root:
+        found = {}
+        for name in names:
+            item = root[f"{demo}/{name}".lstrip("/")]
+            if item.size * 8 > LARGEST_ARRAYS:
+                raise LogError(f"{file}: {name} has {item.shape} numbers; cut the log into shorter ones")
+            found[name] = Signal(np.asarray(item[()], float))
+        return found

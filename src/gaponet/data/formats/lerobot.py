@@ -1,0 +1,227 @@
+"""LeRobotDataset folder, v3.0 or v2.1: meta/info.json.
+
+One folder, many episodes; what gaponet exports, and stock sets of position-controlled arms.
+
+    meta/info.json                          codebase_version "v3.0", fps, features, data_path
+    meta/tasks.parquet                      task, task_index
+    meta/episodes/chunk-000/file-000.parquet    one row per episode: length, where its rows are
+    data/chunk-000/file-000.parquet         one row per frame: action, observation.state, timestamp, frame_index, …
+
+Of v2.1, one data file an episode and meta/episodes.jsonl, the episodes whose files are there are read.
+
+Stock sets hold positions alone: action is the command, observation.state the joints (row t as in data.sequence). Their
+unit is not written in them: SO-101 sets are degrees, older ones −100..100 of the calibrated range; --position-unit says
+which. A joint that the robot's log_unit calls a fraction (a gripper) is 0..100 in both. What gaponet.data exported says
+its units, periods and metadata itself. Images and videos are left alone.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
+from gaponet.data.describe.joints import ignored, resolve_all
+from gaponet.data.describe.limits import to_radians
+from gaponet.data.formats.lerobot_set import AGAIN, FEATURES, Feature, Set, Stated, read_table, sets_under, tasks_of
+from gaponet.data.log import Channel, Log
+from gaponet.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+OPTIONS = ("position_unit", "joints", "ignore")
+EXTRA = ""
+POSITION_UNITS = ("rad", "deg", "fraction", "signed_percent")
+INDEX = ("timestamp", "frame_index", "episode_index")  # columns of data files
+
+
+def detects(path: Path) -> bool:
+    """A folder with meta/info.json, or of such folders."""
+    return path.is_dir() and any(next(path.glob(name), None) for name in ("meta/info.json", "*/meta/info.json"))
+
+
+def find(path: Path) -> list[Path]:
+    """The data file of every episode, of every set under the path."""
+    return [s.data_file(e) for s in sets_under(path) for e in s.episodes]
+
+
+def read(
+    path: Path,
+    robot: RobotSpec,
+    joint_map: dict[str, str] | None = None,
+    position_unit: str | None = None,
+    joints: list[str] | None = None,
+    ignore: list[str] | None = None,
+) -> Iterator[tuple[str, Callable[[], Log]]]:
+    """Yield (motion name, what reads its Log) for every episode.
+
+    Args:
+        joint_map: The set's name of a joint → the robot's.
+        joints: Names of the values, for a set that does not name them.
+        ignore: Patterns of names that are no joints of this robot.
+        position_unit: One of POSITION_UNITS; not for what gaponet exported, which says rad itself.
+    """
+    for part in sets_under(path):
+        unit = _unit(part, position_unit)
+        if part.absent:
+            print(f"note: {part.path}: {part.absent} episodes that it lists are not there", file=sys.stderr)
+        tasks = tasks_of(part)
+        open_file, table = Path(), None
+        for episode in part.episodes:
+            file = part.data_file(episode)
+            if file != open_file:
+                open_file, table = file, _Frames(part, file, robot, joint_map, unit, joints, tuple(ignore or ()))
+            assert table is not None
+            yield _motion(episode, tasks), partial(table.episode, episode)
+
+
+def read_episode(part: Set, episode: dict[str, Any], robot: RobotSpec, table: pa.Table) -> Log:
+    """The Log of one episode of what gaponet exported, from rows of its data file that were read elsewhere."""
+    return _Frames(part, part.data_file(episode), robot, None, _unit(part, None), None, (), table).episode(episode)
+
+
+def _unit(part: Set, given: str | None) -> str:
+    """The unit of positions: stated by an export, else by the user."""
+    stated = [(part.features[f].get("info") or {}).get("unit") for f in ("action", "observation.state")
+              if f in part.features]  # fmt: skip
+    if part.ours and stated == ["rad", "rad"]:
+        if given not in (None, "rad"):
+            raise UsageError(f"--position-unit {given}: {part.path}/meta/info.json says rad; leave it out")
+        return "rad"
+    if given not in POSITION_UNITS:
+        said = f"'{given}' is not one of {', '.join(POSITION_UNITS)}" if given else "is not written in the set"
+        raise UsageError(
+            f"{part.path}: the unit of positions {said}; say --position-unit deg (SO-101 sets), signed_percent (older "
+            "ones, −100..100) or rad"
+        )
+    return given
+
+
+class _Frames:
+    """Reads a data file once and cuts it into episodes."""
+
+    def __init__(
+        self, part: Set, file: Path, robot: RobotSpec, joint_map: dict[str, str] | None, unit: str,
+        joints: list[str] | None, ignore: tuple[str, ...], table: pa.Table | None = None,
+    ) -> None:  # fmt: skip
+        self.part, self.file, self.robot, self.given, self.ignore = part, file, robot, joints, ignore
+        features = part.features
+        present = {ours: theirs for ours, theirs in FEATURES.items() if theirs in features}
+        for need in ("ctrl", "qpos"):
+            if need not in present:
+                raise LogError(
+                    f"{part.path}/meta/info.json: no feature '{FEATURES[need]}'; it has "
+                    f"{', '.join(part.info['features'])}"
+                )
+        names = {c: self._joints(f, features[f], joint_map) for c, f in present.items()}
+        self.joints = tuple(j for j in robot.joint_names if j in names["ctrl"])
+        for channel, theirs in names.items():
+            odd = sorted(set(theirs) - {""} ^ set(self.joints))
+            if odd:
+                raise JointMismatchError(
+                    f"{part.path}/meta/info.json: joint '{odd[0]}' is not in both action and {FEATURES[channel]}"
+                )
+        self.units = [self._joint_unit(j, unit) for j in self.joints]
+        table = read_table(file, (*present.values(), *INDEX), table=table)
+        self.columns = {
+            c: _matrix(file, table, f, len(names[c]))[:, [names[c].index(j) for j in self.joints]]
+            for c, f in present.items()
+        }
+        self.timestamp, self.frame, self.episodes = (_matrix(file, table, name, 1)[:, 0] for name in INDEX)
+
+    def _joints(self, feature: str, spec: Feature, joint_map: dict[str, str] | None) -> list[str]:
+        """The robot's own joint of each column, "" where it is said to be none."""
+        names, where = spec["names"], f"{self.part.path}/meta/info.json: {feature}"
+        if isinstance(names, dict):
+            names = next((v for v in names.values() if isinstance(v, list)), None)
+        if names and isinstance(names[0], list):
+            names = names[0]
+        names = names or self.given
+        if not names or len(names) != int(np.prod(spec["shape"])):
+            raise LogError(
+                f"{where} does not name its {spec['shape']} values; write joints = [their names, in order] into "
+                "logs.toml beside the set"
+            )
+        short = [str(name).removesuffix(".pos") for name in names]
+        ours = iter(resolve_all([n for n in short if not ignored(n, self.ignore)], self.robot, where, joint_map))
+        return ["" if ignored(n, self.ignore) else next(ours) for n in short]
+
+    def _joint_unit(self, joint: str, unit: str) -> str:
+        """A gripper is 0..100 of its range wherever the other joints are not SI."""
+        share = self.robot.log_units[self.robot.joint_names.index(joint)] == "fraction"
+        return "percent" if share and unit in ("deg", "signed_percent") else unit
+
+    def episode(self, row: dict[str, Any]) -> Log:
+        """The frames of an episode as a Log, in SI."""
+        index, length = int(row["episode_index"]), int(row["length"])
+        where = np.flatnonzero(self.episodes == index)
+        if len(where) != length or not np.array_equal(self.frame[where], np.arange(length)):
+            raise LogError(
+                f"{self.file}: episode {index} has {len(where)} frames here, meta/episodes says {length} in a row; "
+                "download or export the set again"
+            )
+        time = self._time(where)
+        channels = {c: Channel(time, self._si(c, values[where])) for c, values in self.columns.items()}
+        meta: dict[str, Any] = {
+            "files": dict.fromkeys(channels, str(self.file)),
+            "first_line": int(where[0]) + 1,
+            "dt": self.part.dt,
+            "converted_from": {j: u for j, u in zip(self.joints, self.units, strict=True) if u != "rad"},
+        }
+        if self.part.ours:
+            said = self.part.ours["dataset"]
+            meta |= {"stated": row["stated"], "dataset": {k: v for k, v in said.items() if k in Stated.__annotations__}}
+        return Log(self.robot.name, self.joints, channels, f"{self.file}#{index}", meta)
+
+    def _time(self, where: Array) -> Array:
+        """Frames are a period apart; their timestamps, float32, lose digits and are believed only where they differ."""
+        regular = np.arange(len(where)) * self.part.dt
+        told = self.timestamp[where] - self.timestamp[where[0]]
+        return regular if np.abs(told - regular).max(initial=0) < max(1e-3, 1e-6 * regular[-1]) else told
+
+    def _si(self, channel: str, values: Array) -> Array:
+        """Percentages to fractions, then as for every format."""
+        values, units = values.copy(), list(self.units)
+        for column, unit in enumerate(self.units):
+            if unit in ("percent", "signed_percent") and channel in ("ctrl", "qpos", "qvel"):
+                low, span = (0.0, 100.0) if unit == "percent" else (-100.0, 200.0)
+                values[:, column] = (values[:, column] - (0.0 if channel == "qvel" else low)) / span
+                units[column] = "fraction"
+        return to_radians(channel, values, self.joints, units, self.robot)
+
+
+def _motion(episode: dict[str, Any], tasks: dict[int, str]) -> str:
+    """The motion's own name in an export; in a stock set, whose episodes are not repetitions, task and number."""
+    if "stated" in episode:
+        return str(episode["stated"]["motion"])
+    told = episode.get("tasks") or list(tasks.values())[:1] or ["episode"]
+    slug = re.sub(r"[^a-z0-9]+", "_", told[0].lower()).strip("_")[:40] or "episode"
+    return f"{slug}-{episode['episode_index']:04d}"
+
+
+def _matrix(file: Path, table: Any, feature: str, n: int) -> Array:
+    """A column of lists of n numbers, or of numbers where n is 1: (frames, n) float64."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    column, kind = table[feature].combine_chunks(), table.schema.field(feature).type
+    lists = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
+    kind = kind.value_type if lists else kind
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or not (lists or n == 1):
+        raise LogError(f"{file}: {feature} is {table.schema.field(feature).type}, not {n} numbers a row; {AGAIN}")
+    wrong = column.is_null().to_numpy(False)
+    if lists and not wrong.any():
+        wrong = pc.list_value_length(column).to_numpy(zero_copy_only=False) != n
+    flat = column.flatten() if lists else column
+    if wrong.any() or flat.null_count:
+        row = int(wrong.argmax()) if wrong.any() else int(flat.is_null().to_numpy(False).argmax()) // n
+        raise LogError(f"{file}:{row + 1}: {feature} is not {n} numbers; {AGAIN}")
+    return flat.to_numpy(zero_copy_only=False).astype(float).reshape(-1, n)

@@ -1,0 +1,242 @@
+"""What a LeRobotDataset, v3.0 or v2.1, is made of: info, features, episodes, tasks, each checked."""
+
+from __future__ import annotations
+
+import os.path
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, cast
+
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
+
+from gaponet.base.errors import LogError
+from gaponet.base.structure import parse_json, read_json, validated
+from gaponet.data.formats import parquet
+from gaponet.data.sequence import SequenceMeta
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+VERSION = "v3.0"  # that is written
+VERSIONS = ("v3", "v2")  # that are read
+FEATURES = {
+    "ctrl": "action",
+    "qpos": "observation.state",
+    "qvel": "observation.velocity",
+    "qacc": "observation.acceleration",
+    "tau": "observation.torque",
+    "tau_eq": "observation.equivalent_torque",
+    "temperature": "observation.temperature",
+}
+OURS = "gaponet.json"  # beside info.json in an export: dt, and that the episodes' metadata are ours
+STATED = tuple(f for f in SequenceMeta.__dataclass_fields__ if f != "robot")  # columns of our meta/episodes
+GAINS = ("kp", "kd")
+AGAIN = "download or export it again"
+
+Findings = dict[str, dict[str, float | None]]  # of a recording; none in sets from before they were written
+Name = Annotated[str, Len(1, 200)]
+Count = Annotated[int, Interval(ge=0, le=10**9)]
+Chunk = Annotated[int, Interval(ge=0, le=10**6)]
+
+
+class Info(TypedDict):
+    """meta/info.json, what is read of it."""
+
+    codebase_version: Name
+    fps: Annotated[float, Interval(ge=1, le=10_000)]
+    data_path: Annotated[str, Len(1, 500)]
+    features: dict[str, Any]
+    chunks_size: NotRequired[Annotated[int, Interval(ge=1, le=10**6)]]
+
+
+class Feature(TypedDict):
+    """One feature of a set; names are a list, one in a list or in a dictionary, often with .pos behind each."""
+
+    shape: Annotated[list[Annotated[int, Interval(ge=1, le=1000)]], Len(1, 2)]
+    names: list[Any] | dict[str, Any] | None
+    info: NotRequired[dict[str, Any] | None]
+
+
+# One row of meta/episodes; beside it, in what gaponet exported, the fields of SequenceMeta.
+Episode = TypedDict("Episode", {
+    "episode_index": Count, "length": Annotated[int, Interval(ge=1, le=10**8)],
+    "data/chunk_index": Chunk, "data/file_index": Chunk, "tasks": NotRequired[list[str] | None],
+})  # fmt: skip
+
+
+# One line of meta/episodes.jsonl, v2.1.
+class Listed(TypedDict):
+    episode_index: Count
+    length: Annotated[int, Interval(ge=1, le=10**8)]
+    tasks: NotRequired[list[str] | None]  # fmt: skip
+
+
+NEEDED = tuple(k for k in Episode.__annotations__ if k != "tasks")
+
+
+class Task(TypedDict):
+    """One row of meta/tasks."""
+
+    index: Count
+    text: str
+
+
+class Stated(TypedDict):
+    """What a dataset says of itself."""
+
+    licence: NotRequired[str]
+    source: NotRequired[str]
+
+
+class Ours(TypedDict):
+    """gaponet.json, what is read of it."""
+
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]
+    dataset: Stated
+
+
+@dataclass(frozen=True)
+class Set:
+    """One LeRobot folder: its info.json, its features that are read, its episodes and how many more it lists that are
+    not there; ours is None for a stock set."""
+
+    path: Path
+    info: Info
+    features: dict[str, Feature]
+    episodes: list[dict[str, Any]]
+    ours: Ours | None
+    absent: int = 0
+
+    @property
+    def dt(self) -> float:
+        """s, exact."""
+        return self.ours["dt"] if self.ours else 1 / self.info["fps"]
+
+    def data_file(self, episode: dict[str, Any]) -> Path:
+        """Where the frames of an episode are; never outside the set."""
+        given = self.info["data_path"]
+        which = {"chunk_index": "data/chunk_index", "file_index": "data/file_index",
+                 "episode_chunk": "data/chunk_index", "episode_index": "episode_index"}  # fmt: skip
+        number = lambda m: f"{episode[which[m[1]]]:0{m[2] or 0}d}"  # noqa: E731
+        place = os.path.normpath(re.sub(rf"\{{({'|'.join(which)})(?::0?(\d))?d?\}}", number, given))
+        if re.search(r"[{}\0]", place) or os.path.isabs(place) or place.startswith(".."):
+            raise LogError(
+                f"{self.path}/meta/info.json: data_path '{given}' is not a path inside the set with "
+                f"{{chunk_index:03d}} and {{file_index:03d}}; {AGAIN}"
+            )
+        return self.path / place
+
+
+def sets_under(path: Path) -> list[Set]:
+    """The set at a path, or those in its folders."""
+    infos = [path / "meta" / "info.json"]
+    if not infos[0].is_file():
+        infos = sorted(path.glob("*/meta/info.json"))
+    if not infos:
+        raise LogError(f"{path}: no meta/info.json in it; point at a LeRobotDataset v3.0 folder")
+    return [_open(info) for info in infos]
+
+
+def _open(file: Path) -> Set:
+    info = read_json(Info, file, LogError, AGAIN, more=True)
+    version = info["codebase_version"]
+    if version.split(".")[0] not in VERSIONS:
+        raise LogError(
+            f"{file}: codebase_version is {version}, this reads {' and '.join(VERSIONS)}; convert the set with "
+            "lerobot's own scripts"
+        )
+    root, features = file.parents[1], info["features"]
+    ours = file.with_name(OURS)
+    told = (
+        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", more=True)
+        if ours.is_file()
+        else None
+    )
+    listed = root / "meta" / "episodes.jsonl"
+    if listed.is_file():
+        episodes = _listed(listed, info.get("chunks_size", 1000))
+    else:
+        episodes = [row for f in sorted((root / "meta" / "episodes").glob("*/*.parquet")) for row in _episodes(f, told)]
+    if not episodes:
+        raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
+    episodes.sort(key=lambda e: e["episode_index"])
+    known = {
+        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, more=True)
+        for f in FEATURES.values()
+        if f in features
+    }
+    part = Set(root, info, known, episodes, told)
+    if not listed.is_file():
+        return part
+    here = [e for e in episodes if part.data_file(e).is_file()]  # v2: one file an episode, and often only some of them
+    if not here:
+        raise LogError(f"{root}: none of the {len(episodes)} episodes' data files is there; {AGAIN}")
+    return replace(part, episodes=here, absent=len(episodes) - len(here))
+
+
+def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
+    """Episodes of a v2.1 set, a line of JSON each."""
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    rows = [parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, more=True) for i, line in enumerate(lines, 1)]
+    return [dict(r) | {"data/chunk_index": r["episode_index"] // chunk} for r in rows]
+
+
+def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
+    said = STATED if ours else ()
+    hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
+    table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash", "findings"), hint)
+    rows = _rows(file, table)
+    known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
+    return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
+
+
+def _state(row: dict[str, Any], file: Path, hint: str) -> dict[str, Any]:
+    """A row of an export's episodes, with what it says of its recording checked, as `stated`."""
+    where = f"{file}: episode {row['episode_index']}"
+    told = {name: row[name] for name in STATED if name in row} | {"robot": "?"}
+    told["notes"] = parse_json(dict[str, Any], str(row["notes"]), f"{where}: notes", LogError, hint)
+    for name in GAINS:
+        gains = str(told.pop(name))
+        if gains != "null":
+            told[name] = parse_json(list[float], gains, f"{where}: {name}", LogError, hint)
+    stated = asdict(validated(SequenceMeta, told, where, LogError, hint))
+    found = parse_json(Findings, str(row.get("findings", "{}")), f"{where}: findings", LogError, hint)
+    return row | {"stated": {name: stated[name] for name in STATED}, "findings": found}
+
+
+def _rows(file: Path, table: Any) -> list[dict[str, Any]]:
+    try:
+        return cast("list[dict[str, Any]]", table.to_pylist())
+    except ValueError as error:  # a date that Python cannot hold
+        raise LogError(f"{file}: not readable ({error}); {AGAIN}") from None
+
+
+def tasks_of(part: Set) -> dict[int, str]:
+    """{task_index: text}; the text stands in the index of a pandas table, under either name."""
+    file = part.path / "meta" / "tasks.parquet"
+    if not file.is_file():
+        return {}
+    table = read_table(file, ("task_index",), ("task", "__index_level_0__"))
+    if table.num_columns != 2:
+        raise LogError(f"{file}: no task and task_index in it; {AGAIN}")
+    rows = validated(list[Task], _rows(file, table.rename_columns(["index", "text"])), file, LogError, AGAIN)
+    return {row["index"]: row["text"] for row in rows}
+
+
+def read_table(
+    file: Path, need: tuple[str, ...], also: tuple[str, ...] = (), hint: str = AGAIN, table: pa.Table | None = None
+) -> Any:
+    """The columns `need`, each once, and those of `also` that are there, in this order, of a Parquet file.
+
+    Args:
+        table: What was read of the file elsewhere, instead of all of it.
+    """
+    there = parquet.header(file)[0] if table is None else table.schema.names
+    for name in need:
+        if there.count(name) != 1:
+            text = "is missing" if name not in there else "stands twice"
+            raise LogError(f"{file}: column '{name}' {text}; it has {', '.join(there[:12])}; {hint}")
+    wanted = [*need, *(name for name in also if there.count(name) == 1)]
+    return parquet.read(file, wanted) if table is None else table.select(wanted)

@@ -1,0 +1,51 @@
+"""MATLAB .mat (up to v7; v7.3 is HDF5), or a folder of them: arrays of one row per sample.
+
+Signals are called by the names of the variables; a field of a struct is STRUCT.FIELD. logs.toml says which is what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, reading
+from gaponet.data.formats import DESCRIBED, files_under
+
+OPTIONS = DESCRIBED
+EXTRA = ""
+DEFAULT: LogsFile = {"time": "time"}
+
+
+def detects(path: Path) -> bool:
+    """A file of that suffix, or a folder with one at or below it."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """The files."""
+    return files_under(path, (".mat",))
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every file."""
+    for file in find(path):
+        yield Recording.of_arrays(file, _read(file))
+
+
+@inside(LogError, "scipy.io")
+def _read(file: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+
+    with file.open("rb") as stream:
+        if b"MATLAB 7.3" in stream.read(128):
+            raise LogError(f"{file}: a v7.3 file, which is HDF5: rename it to .h5, or save it with -v7")
+    with reading(file, ".mat file"):
+        told = loadmat(file, simplify_cells=True)
+        told |= {f"{name}.{k}": x for name, v in told.items() if isinstance(v, dict) for k, x in v.items()}
+        return {n: x for n, x in told.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiu"}

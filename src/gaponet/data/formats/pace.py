@@ -1,0 +1,77 @@
+"""PACE's .pt, or a folder of them: time, dof_pos, des_dof_pos as tensors or NumPy arrays, gains where it states them.
+
+Nothing pickled runs and torch is not needed (formats.pickles). The file does not name its joints; without joints
+in logs.toml the robot's own order is not assumed either. kp and kd, one number a joint or one for all, are the gains
+while recording. Files of other names work as well: logs.toml says which tensor is what.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, reading
+from gaponet.data.formats import DESCRIBED, files_under, pickles
+
+OPTIONS = DESCRIBED
+EXTRA = ""
+DEFAULT: LogsFile = {
+    "time": "time", "time_unit": "s", "position_unit": "rad", "ctrl": "des_dof_pos", "qpos": "dof_pos",
+    "qvel": "dof_vel", "tau": "dof_torque",
+}  # fmt: skip
+GAINS = ("kp", "kd")
+
+
+def detects(path: Path) -> bool:
+    """A file of that suffix, or a folder with one at or below it."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """The files."""
+    return files_under(path, (".pt",))
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every file."""
+    for file in find(path):
+        arrays = _read(file)
+        qpos = arrays.get(str(told.get("qpos")))
+        gains: LogsFile = {}
+        for name in GAINS:
+            stated = arrays.pop(name, None)
+            if stated is not None and qpos is not None and qpos.ndim in (1, 2):
+                joints = int(np.prod(qpos.shape[1:]))
+                if stated.size not in (1, joints):
+                    raise LogError(
+                        f"{file}: {name} has {stated.size} values; give 1 or one for each of {joints} joints"
+                    )
+                arrays[name] = np.broadcast_to(stated.ravel(), qpos.shape)
+                gains[name] = name  # type: ignore[literal-required]
+        yield Recording.of_arrays(file, arrays, default=gains)
+
+
+@inside(LogError, "numpy")
+def _read(file: Path) -> dict[str, Any]:
+    """Every array of numbers; others are left alone."""
+    with reading(file, ".pt file of tensors"), zipfile.ZipFile(file) as packed:  # as torch 1.6 and later write
+        if sum(part.file_size for part in packed.infolist()) > LARGEST_ARRAYS:
+            raise LogError(f"{file}: unpacks to more than {LARGEST_ARRAYS >> 20} MiB; cut it into shorter logs")
+        top = next((n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None)
+        if top is None:
+            raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")
+        if f"{top}byteorder" in packed.namelist() and packed.read(f"{top}byteorder") != b"little":
+            raise LogError(f"{file}: written big-endian; load it and save it again on another machine")
+        told = pickles.load(packed.read(f"{top}data.pkl"), str(file), lambda key: packed.read(f"{top}data/{key}"))
+    if not isinstance(told, dict):
+        raise LogError(f"{file}: holds no dictionary of tensors; save {{time, dof_pos, des_dof_pos}}")
+    arrays = {str(name): value for name, value in told.items() if isinstance(value, (np.ndarray, int, float))}
+    return {n: np.asarray(v, float) for n, v in arrays.items() if np.asarray(v).dtype.kind in "fiub"}

@@ -1,0 +1,209 @@
+"""Strangers' pickles, opened without running anything: numbers, text, lists, dictionaries, arrays and tensors come out.
+
+A pickle names functions to call. Here each name that is not on a short list is refused, and those on it are not NumPy's
+or torch's own functions but stand-ins that note what was meant; arrays are made of that afterwards, with type and size
+checked.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import zlib
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+
+from gaponet.base.errors import LogError
+from gaponet.base.structure import LARGEST_ARRAYS
+
+KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
+STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",
+            "Byte": "u1", "Bool": "b1"}  # torch's name → dtype  # fmt: skip
+MOST_STEPS = 1 << 20  # values of a tree that is walked; shared ones count each time
+
+
+class _RefusedError(Exception):
+    """What stands in the pickle is none of the things that may."""
+
+
+class _Type:
+    """A dtype that was meant."""
+
+    def __init__(self, text: Any = "", *_: Any) -> None:
+        self.text, self.order = str(text), ""
+
+    def __setstate__(self, state: Any) -> None:
+        self.order = state[1] if isinstance(state, tuple) and len(state) > 1 and state[1] in ("<", ">", "|") else ""
+
+    def real(self) -> np.dtype[Any]:
+        kind = np.dtype(self.text[:20])
+        return np.dtype(self.order + kind.str[1:]) if self.order in ("<", ">") else kind
+
+
+class _Array:
+    """An array that was meant: shape, dtype and bytes or list."""
+
+    def __init__(self, *_: Any) -> None:
+        self.state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def real(self, made: Any) -> Any:
+        shape, kind, order, data = self.state[-4:]
+        if not isinstance(kind, _Type) or not isinstance(shape, tuple) or not all(type(n) is int for n in shape):
+            raise _RefusedError("an array without type or shape")
+        if kind.text.lstrip("|<>=")[:1] == "O":
+            out = np.empty(len(data), object)
+            out[:] = [made(x) for x in data]
+            return out.reshape(shape)
+        if kind.real().kind not in KINDS or not isinstance(data, (bytes, bytearray)):
+            raise _RefusedError(f"an array of {kind.text}")
+        return np.frombuffer(bytes(data), kind.real()).reshape(shape, order="F" if order else "C")
+
+
+class _Wrapped:
+    """joblib's array: its bytes stand in the stream, behind what describes them."""
+
+    def __init__(self, *_: Any) -> None:
+        self.array: Any = None
+
+    def read(self, state: Any, stream: io.BytesIO) -> None:
+        kind, shape = state.get("dtype"), state.get("shape")
+        if not isinstance(kind, _Type) or kind.real().kind not in KINDS or not isinstance(shape, tuple):
+            raise _RefusedError("an array of objects inside a joblib file")
+        padding = state.get("numpy_array_alignment_bytes")
+        if padding is not None:
+            stream.seek(stream.read(1)[0], io.SEEK_CUR)
+        size = int(np.prod([int(n) for n in shape], dtype=object)) * kind.real().itemsize
+        if not 0 <= size <= LARGEST_ARRAYS:
+            raise _RefusedError(f"an array of {size} bytes")
+        data = stream.read(size)
+        order: Any = "F" if state.get("order") == "F" else "C"
+        self.array = np.frombuffer(data, kind.real()).reshape(tuple(map(int, shape)), order=order)
+
+
+def _frombuffer(data: Any, kind: Any, shape: Any, order: Any = "C") -> _Array:
+    """numpy's own pickle of a contiguous array, protocol 5."""
+    array = _Array()
+    array.state = (shape, kind, order == "F", data)
+    return array
+
+
+class _Scalar:
+    def __init__(self, kind: Any, data: Any = b"") -> None:
+        self.kind, self.data = kind, data
+
+    def real(self, made: Any) -> Any:
+        return np.frombuffer(self.data, self.kind.real())[0]
+
+
+class _Tensor:
+    """A tensor that was meant: a view of a storage, which the persistent id before it named."""
+
+    def __init__(self, storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> None:
+        if not isinstance(storage, np.ndarray) or not isinstance(size, tuple) or not isinstance(stride, tuple):
+            raise _RefusedError("a tensor without storage, size or stride")
+        if len(size) != len(stride) or not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)):
+            raise _RefusedError("a tensor whose size is not numbers")
+        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
+        if math.prod(size) and last >= len(storage):
+            raise _RefusedError(f"a tensor of size {size} in a storage of {len(storage)}")
+        steps, self.array = [n * storage.itemsize for n in stride], None
+        if math.prod(size) <= len(storage):  # one may claim to be large by repeating one number: it is left alone
+            self.array = np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
+
+
+def _new(*_: Any) -> _Array:
+    return _Array()
+
+
+def _codec(text: Any, encoding: Any) -> bytes:
+    """How Python 3 wrote bytes into old protocols."""
+    if encoding not in ("latin1", "latin-1"):
+        raise _RefusedError(f"codec {encoding!r:.40}")
+    return str(text).encode("latin1")
+
+
+MEANT = {
+    ("numpy", "ndarray"): _Array, ("numpy", "dtype"): _Type,
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _new for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): _frombuffer for core in ("core", "_core")},
+    ("joblib.numpy_pickle", "NumpyArrayWrapper"): _Wrapped, ("_codecs", "encode"): _codec,
+    ("collections", "OrderedDict"): dict, ("builtins", "bytearray"): bytearray,
+    ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
+    **{("torch", f"{name}Storage"): kind for name, kind in STORAGES.items()},
+}  # fmt: skip
+
+
+class _Unpickler(pickle._Unpickler):
+    """Python's own, slow one: what it keeps is bounded by what it has read, and BUILD can be seen."""
+
+    def __init__(self, stream: io.BytesIO, storage: Callable[[str], bytes] | None) -> None:
+        super().__init__(stream)
+        self.stream, self.storage = stream, storage
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in MEANT:
+            raise _RefusedError(f"it wants to run {module}.{name}")
+        return MEANT[module, name]
+
+    def persistent_load(self, pid: Any) -> Any:
+        known = isinstance(pid, tuple) and len(pid) == 5 and isinstance(pid[1], str) and pid[1] in STORAGES.values()
+        if self.storage is None or not known:
+            raise _RefusedError("a persistent id that is no storage of tensors")
+        return np.frombuffer(self.storage(str(pid[2])), np.dtype("<" + pid[1]))
+
+    def load_build(self) -> None:
+        stack = self.stack  # type: ignore[attr-defined]
+        state, what = stack.pop(), stack[-1]
+        if isinstance(what, _Wrapped) and isinstance(state, dict):
+            what.read(state, self.stream)
+        elif isinstance(what, (_Array, _Type)):
+            what.__setstate__(state)
+        else:
+            raise _RefusedError(f"state for a {type(what).__name__}")
+
+    dispatch: ClassVar[Any] = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}
+
+
+def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None) -> Any:
+    """What a pickle (or an uncompressed or zlib joblib file) holds.
+
+    Args:
+        storage: The storages of a file of torch's: key → the bytes of a storage of tensors, little-endian.
+
+    Raises:
+        LogError: It names anything else, is damaged, or too large.
+    """
+    steps = 0
+
+    def made(x: Any) -> Any:
+        nonlocal steps
+        steps += 1
+        if steps > MOST_STEPS:
+            raise _RefusedError("too many values")
+        if isinstance(x, (_Array, _Scalar)):
+            return x.real(made)
+        if isinstance(x, (_Wrapped, _Tensor)):
+            return x.array
+        if isinstance(x, dict):
+            return {k: made(v) for k, v in x.items()}
+        if isinstance(x, (list, tuple)):
+            return [made(v) for v in x]
+        if x is None or isinstance(x, (bool, int, float, str)):
+            return x
+        raise _RefusedError(f"a {type(x).__name__}")
+
+    try:
+        if data[:1] == b"\x78":
+            packed = zlib.decompressobj()
+            data = packed.decompress(data, LARGEST_ARRAYS)
+        return made(_Unpickler(io.BytesIO(data), storage).load())
+    except Exception as error:  # a damaged stream makes the machine of a pickle fail in any way
+        reason = " ".join(str(error).split())[:150] or type(error).__name__
+        raise LogError(f"{where}: not a pickle of arrays, numbers and text ({reason}); nothing of it was run") from None

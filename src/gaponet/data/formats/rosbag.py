@@ -1,0 +1,296 @@
+"""ROS 2 bag (.db3, .mcap, or their folder), or ROS 1 .bag: command and state topics, joined in time.
+
+Signals are called TOPIC.field[joint]: every array of numbers of any message whose definition is in the bag, or known
+(JointState's TOPIC.position, Float64MultiArray's TOPIC.data, TOPIC.motors.q of a message that holds a list of motors);
+joints have the names of a list of texts that is as long, or numbers. Read in their own way are JointTrajectory with one
+point a message, JointTrajectoryControllerState (TOPIC.reference.position, …) and Unitree's LowState and LowCmd (.q,
+.dq, .tau_est, .kp; motors by number). Where a bag has one topic with states and one with commands, these are taken;
+else logs.toml says which: ctrl = "/arm/commands.data". A topic has the clock of its header's stamps, and the recorder's
+where it has none. Stamps that run away from the recorder's clock, or from those of the other topic, are moved onto it
+by a straight line; that, and repeated messages that were dropped, stand in the notes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+from gaponet.data.describe.logs_file import LogsFile
+from gaponet.data.describe.recording import Recording, Signal, reading
+from gaponet.data.formats import DESCRIBED, files_under
+
+SUFFIXES = (".db3", ".mcap", ".bag")
+OPTIONS = DESCRIBED
+EXTRA = "ros"
+DEFAULT: LogsFile = {"time_unit": "s", "position_unit": "rad"}
+PEEK = 200  # messages of a topic in which all its joints are named
+LATENCY = 0.1  # s that a stamp may lie before the recorder's clock, and by which topics may differ in that
+DRIFT = 0.005  # s by which a stamp may run away from the recorder's clock during a recording
+COMMANDS = ("command", "cmd", "desired", "target", "goal", "reference", "setpoint")
+# Unitree's hg messages, for bags that do not hold the definitions of their messages; fields as in its public IDL.
+HG = {
+    "MotorCmd": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 tau\nfloat32 kp\nfloat32 kd\nuint32 reserve",
+    "LowCmd": "uint8 mode_pr\nuint8 mode_machine\nMotorCmd[35] motor_cmd\nuint32[4] reserve\nuint32 crc",
+    "MotorState": "uint8 mode\nfloat32 q\nfloat32 dq\nfloat32 ddq\nfloat32 tau_est\nint16[2] temperature\nfloat32 vol\n"
+    "uint32[2] sensor\nuint32 motorstate\nuint32[4] reserve",
+    "IMUState": "float32[4] quaternion\nfloat32[3] gyroscope\nfloat32[3] accelerometer\nfloat32[3] rpy\n"
+    "int16 temperature",
+    "LowState": "uint32[2] version\nuint8 mode_pr\nuint8 mode_machine\nuint32 tick\nIMUState imu_state\n"
+    "MotorState[35] motor_state\nuint8[40] wireless_remote\nuint32[4] reserve\nuint32 crc",
+}  # fmt: skip
+POINT = "trajectory_msgs/JointTrajectoryPoint"
+NOT_JOINTS = re.compile(  # packages and messages of what is seen, of bodies and of the system itself
+    r"(sensor_msgs/msg/(?!JointState$)|nav_msgs|tf2?_msgs|geometry_msgs|visualization_msgs|rosgraph_msgs|rcl_interfaces|"
+    r"diagnostic_msgs|stereo_msgs|vision_msgs|action_msgs|lifecycle_msgs|statistics_msgs|std_msgs/msg/U?Int8).*"
+)
+MOST = 256  # numbers of a field: more is a picture
+CONTROLLER = (
+    f"std_msgs/Header header\nstring[] joint_names\n{POINT} reference\n{POINT} feedback\n{POINT} error\n{POINT} output"
+)
+Fields = dict[str, tuple[tuple[str, ...], Any]]  # field → (names of its columns, its numbers)
+
+
+def detects(path: Path) -> bool:
+    """A bag, or a folder with bags."""
+    return bool(find(path))
+
+
+def find(path: Path) -> list[Path]:
+    """Bags: folders with metadata.yaml, and files that lie in none."""
+    files = files_under(path, SUFFIXES)
+    return sorted({f.parent if (f.parent / "metadata.yaml").is_file() and path.is_dir() else f for f in files})
+
+
+def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
+    """Every bag."""
+    for bag in find(path):
+        topics = _peeked(bag)
+        signals = {f"{topic}.{field}": labels for topic, fields in topics.items() for field, labels in fields.items()}
+        files = tuple(map(str, files_under(bag, SUFFIXES)))
+        meta: dict[str, Any] = {}
+        load = partial(_load, bag, meta)
+        yield Recording(bag.stem, str(bag), signals, load, "", files, meta=meta, default=_usual(signals))
+
+
+def _usual(signals: dict[str, tuple[str, ...]]) -> LogsFile:
+    """Which signals are command and state, where only one of each can be."""
+    measured = lambda s: ".feedback." in s or ".actual." in s  # noqa: E731
+    is_command = lambda s: not measured(s) and (any(w in s.lower() for w in COMMANDS) or s.endswith(".point"))  # noqa: E731
+    states = [s for s in signals if s.endswith((".position", ".q")) and not is_command(s)]
+    told: LogsFile = {}
+    commands = [s for s in signals if is_command(s) and s.endswith((".position", ".point", ".data", ".q"))]
+    if len(states) > 1:  # a controller's feedback repeats what another topic says
+        states = [s for s in states if not measured(s)] or states
+    if len(states) == 1:
+        told["qpos"] = states[0]
+        for channel, (theirs, motors) in {"qvel": ("velocity", "dq"), "tau": ("effort", "tau_est")}.items():
+            name = states[0].rpartition(".")[0] + "." + (motors if states[0].endswith(".q") else theirs)
+            if name in signals:
+                told[channel] = name  # type: ignore[literal-required]
+    if len(commands) == 1:
+        told["ctrl"] = commands[0]
+        gain = commands[0].rpartition(".")[0]
+        if f"{gain}.kp" in signals:
+            told["kp"], told["kd"] = f"{gain}.kp", f"{gain}.kd"
+    return told
+
+
+@contextmanager
+def _opened(bag: Path) -> Iterator[Any]:
+    """A reader of the bag."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in HG.items():
+        store.register(get_types_from_msg(text, f"unitree_hg/msg/{name}"))
+    store.register(get_types_from_msg(CONTROLLER, "control_msgs/msg/JointTrajectoryControllerState"))
+    with reading(bag, "bag"), AnyReader([bag], default_typestore=store) as reader:
+        yield reader
+
+
+def _messages(reader: Any, connections: list[Any]) -> Iterator[tuple[Any, float, Fields, float | None]]:
+    """(connection, recorder's time, fields, stamp) of each message; times in s."""
+    for connection, time, raw in reader.messages(connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        stamped = stamp.sec + 1e-9 * stamp.nanosec if stamp is not None and (stamp.sec or stamp.nanosec) else None
+        yield connection, 1e-9 * time, KINDS.get(connection.msgtype, _numbers)(connection.topic, message), stamped
+
+
+def _known(reader: Any) -> list[Any]:
+    known = reader.typestore.types
+    return [c for c in reader.connections if c.msgcount and c.msgtype in known and not NOT_JOINTS.match(c.msgtype)]
+
+
+@inside(LogError, "rosbags.highlevel", 4.0)
+def _peeked(bag: Path) -> dict[str, dict[str, tuple[str, ...]]]:
+    with _opened(bag) as reader:
+        return _peek(bag, reader)
+
+
+def _peek(bag: Path, reader: Any) -> dict[str, dict[str, tuple[str, ...]]]:
+    """topic → field → names of its columns; a second publisher's joints on one topic are TOPIC#2."""
+    topics: dict[str, dict[str, tuple[str, ...]]] = {}
+    for connection in _known(reader):
+        sets: dict[str, list[tuple[str, ...]]] = {}  # of a field
+        for i, (_, _, fields, _) in enumerate(_messages(reader, [connection])):
+            for field, (labels, _) in fields.items():
+                mine = sets.setdefault(field, [])
+                at = next((k for k, s in enumerate(mine) if set(s) == set(labels)), len(mine))
+                mine += [labels] * (at == len(mine))
+                topics.setdefault(_numbered(connection.topic, at), {}).setdefault(field, labels)
+            if i == PEEK:
+                break
+    if not topics:
+        types = ", ".join(sorted({c.msgtype for c in reader.connections})) or "no topics at all"
+        strange = sorted({c.msgtype for c in reader.connections} - set(reader.typestore.types))
+        why = f"; the bag does not define {', '.join(strange)}: record as .mcap, which does" if strange else ""
+        raise LogError(f"{bag}: none of its topics is about joints; it has {types}{why}")
+    return topics
+
+
+def _numbered(topic: str, at: int) -> str:
+    return topic if at == 0 else f"{topic}#{at + 1}"
+
+
+def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal]:
+    """The signals of these names, each on the clock of its topic."""
+    loaded, meta["notes"] = _read(bag, names)
+    return loaded
+
+
+@inside(LogError, "rosbags.highlevel", 4.0)
+def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any]]:
+    """The same, and notes."""
+    with _opened(bag) as reader:
+        topics = _peek(bag, reader)
+        asked = {t: {f: labels for f, labels in fields.items() if f"{t}.{f}" in names} for t, fields in topics.items()}
+        wanted = {topic: fields for topic, fields in asked.items() if fields}
+        rows: dict[str, list[Any]] = {topic: [] for topic in wanted}
+        for connection, time, fields, stamp in _messages(reader, [c for c in _known(reader) if _base(c.topic, wanted)]):
+            for topic, known in wanted.items():
+                if topic.split("#")[0] == connection.topic and all(
+                    f in fields and set(fields[f][0]) == set(labels) for f, labels in known.items()
+                ):
+                    values = [_ordered(*fields[f], labels) for f, labels in known.items()]
+                    rows[topic].append((time, time if stamp is None else stamp, stamp is not None, values))
+    notes: dict[str, Any] = {}
+    times = _clocks({t: np.array([r[:3] for r in found], float).reshape(-1, 3) for t, found in rows.items()}, notes)
+    loaded: dict[str, Signal] = {}
+    for topic, known in wanted.items():
+        columns = [np.array([r[3][i] for r in rows[topic]], float) for i in range(len(known))]
+        fresh = _fresh(times[topic], columns)
+        if not fresh.all():
+            notes["repeated"] = notes.get("repeated", 0) + int((~fresh).sum())
+        loaded |= {f"{topic}.{f}": Signal(v[fresh], times[topic][fresh]) for f, v in zip(known, columns, strict=True)}
+    return {name: loaded[name] for name in names}, notes
+
+
+def _base(topic: str, wanted: dict[str, Any]) -> bool:
+    return any(w.split("#")[0] == topic for w in wanted)
+
+
+def _ordered(labels: tuple[str, ...], values: Any, order: tuple[str, ...]) -> list[float]:
+    return [float(values[labels.index(name)]) for name in order] if labels != order else list(values)
+
+
+def _fresh(time: Array, values: list[Array]) -> Array:
+    """Rows that are no second copy of the row before, at the same time."""
+    fresh = np.ones(len(time), bool)
+    same = np.diff(time) == 0
+    for v in values:
+        same &= (np.diff(v, axis=0) == 0).all(axis=1)
+    fresh[1:] = ~same
+    return fresh
+
+
+def _clocks(stamps: dict[str, Array], notes: dict[str, Any]) -> dict[str, Array]:
+    """Time of the rows of each topic, from columns received, stamp, whether stamped; all on one clock."""
+    off = {}
+    for topic, (received, stamp, stamped) in ((t, s.T) for t, s in stamps.items()):
+        if len(stamp) > 1 and stamped.all():
+            off[topic] = np.polyfit(received - received[0], received - stamp, 1)  # s/s, s
+    span = {t: float(np.ptp(s[:, 0])) for t, s in stamps.items()}
+    late = [float(b) for _, b in off.values()] + [0.0] * (len(stamps) > len(off))
+    apart = len(stamps) > 1 and (max(late, default=0.0) - min(late, default=0.0) > LATENCY)
+    drifts = any(abs(a) * span[t] > DRIFT for t, (a, _) in off.items())
+    times = {}
+    for topic, table in stamps.items():
+        received, stamp = table[:, 0], table[:, 1]
+        if topic not in off:
+            times[topic] = received
+            notes.setdefault("clock", {})[topic] = "the recorder's: no stamps"
+        elif apart or drifts:
+            rate, start = off[topic]
+            times[topic] = stamp + start + rate * (received - received[0])
+            notes.setdefault("clock", {})[topic] = f"stamps moved by {start:.4f} s and {1e6 * rate:.0f} ppm"
+        else:
+            times[topic] = stamp
+    return times
+
+
+def _numbers(topic: str, m: Any) -> Fields:
+    """Numbers of any message: its arrays of numbers, and a number of each part where it holds a list of parts."""
+    found: Fields = {}
+    texts: list[tuple[str, ...]] = []
+    for name in m.__dataclass_fields__:
+        value = getattr(m, name)
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.dtype.itemsize > 1:
+            found[name] = (), value
+        elif isinstance(value, list) and value and isinstance(value[0], str):
+            texts.append(tuple(value))
+        elif isinstance(value, list) and value and hasattr(value[0], "__dataclass_fields__"):
+            numbers = [f for f in value[0].__dataclass_fields__ if isinstance(getattr(value[0], f), int | float)]
+            found |= {f"{name}.{f}": ((), [getattr(part, f) for part in value]) for f in numbers}
+            texts += [tuple(t) for f in ("name", "joint_name") if all(t := [getattr(x, f, "") for x in value])]
+        elif hasattr(value, "__dataclass_fields__") and name != "header":
+            found |= {f"{name}.{f}": x for f, x in _numbers(topic, value).items()}
+    named = lambda k: next((t for t in texts if len(t) == k), tuple(map(str, range(k))))  # noqa: E731
+    return {f: (labels or named(len(x)), x) for f, (labels, x) in found.items() if 0 < len(x) <= MOST}
+
+
+def _controller(topic: str, m: Any) -> Fields:
+    names, found = tuple(m.joint_names), {}
+    for part in ("reference", "desired", "feedback", "actual"):
+        point = getattr(m, part, None)
+        for theirs, ours in (("positions", "position"), ("velocities", "velocity"), ("effort", "effort")):
+            if point is not None and len(values := getattr(point, theirs)) == len(names):
+                found[f"{part}.{ours}"] = (names, values)
+    return found
+
+
+def _trajectory(topic: str, m: Any) -> Fields:
+    if len(m.points) > 1:
+        raise LogError(
+            f"{topic} sends whole trajectories ({len(m.points)} points); what the controller made of them stands in "
+            'its state topic (…/controller_state): record that, and say ctrl = "…" in logs.toml'
+        )
+    return {"point": (tuple(m.joint_names), m.points[0].positions)} if m.points else {}
+
+
+def _motors(field: str, names: tuple[str, ...]) -> Callable[[str, Any], Fields]:
+    def fields(topic: str, m: Any) -> Fields:
+        motors = getattr(m, field)
+        labels = tuple(map(str, range(len(motors))))
+        return {n: (labels, [getattr(x, n) for x in motors]) for n in names}
+
+    return fields
+
+
+STATE, COMMAND = _motors("motor_state", ("q", "dq", "tau_est")), _motors("motor_cmd", ("q", "dq", "tau", "kp", "kd"))
+KINDS: dict[str, Callable[[str, Any], Fields]] = {
+    "trajectory_msgs/msg/JointTrajectory": _trajectory,
+    "control_msgs/msg/JointTrajectoryControllerState": _controller,
+    "unitree_hg/msg/LowState": STATE, "unitree_go/msg/LowState": STATE,
+    "unitree_hg/msg/LowCmd": COMMAND, "unitree_go/msg/LowCmd": COMMAND,
+}  # fmt: skip

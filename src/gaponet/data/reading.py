@@ -1,0 +1,70 @@
+"""Logs that nobody described yet: read as they lie there, or by a logs.toml that is guessed from them."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from gaponet.base.errors import GAPONetError, LogError, UsageError
+from gaponet.base.files import write_text
+from gaponet.data.describe.guess import guess_logs
+from gaponet.data.formats import find_logs, look, read_logs
+from gaponet.data.log import Log, skipping
+from gaponet.robot.spec import RobotSpec
+
+NAMED = re.compile(r"^(\[names\]|joints = )", re.MULTILINE)  # lines of a logs.toml by which joints are told apart
+
+
+class UnreadError(LogError):
+    """A person has to look at `text`, a logs.toml: logs cannot be read by it, or it guesses which joint is which."""
+
+    def __init__(self, why: str, text: str) -> None:
+        super().__init__(why)
+        self.text = text
+
+
+def read_first(
+    logs: Path, robot: RobotSpec, told: Path | None = None, anyhow: bool = False, skip_bad: bool = False, **options: Any
+) -> tuple[Log, int, str]:
+    """The first recording, how many there are, and the logs.toml that was guessed; "" where none was needed.
+
+    Args:
+        logs: File or folder.
+        told: A logs.toml; nothing is guessed beside it.
+        anyhow: Also by a guess of which joint is which.
+        skip_bad: Leave out recordings that cannot be read.
+        options: Arguments of read_logs.
+
+    Raises:
+        UnreadError, LogError, UsageError: The message says what is missing.
+    """
+
+    def by(file: Path | None, described: str = "") -> tuple[Log, int, str]:
+        with skipping(skip_bad):
+            first = next(iter(read_logs(logs, robot, logs=file, **options)), None)
+        if first is None:
+            raise UsageError(f"{logs}: holds no recording")
+        return first[1], len(find_logs(logs, options.get("fmt"))), described
+
+    if told is not None:
+        return by(told)
+    try:
+        return by(None)
+    except GAPONetError as error:
+        try:
+            kind, known, recordings = look(logs, options.get("fmt"), allow_pickle=options.get("allow_pickle", False))
+        except GAPONetError:
+            raise error from None
+    text = guess_logs(recordings, robot, kind, dict(known))
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "logs.toml"
+        write_text(file, text)
+        try:
+            found = by(file, text)
+        except GAPONetError as again:
+            raise UnreadError(str(again), text) from None
+    if NAMED.search(text) and not anyhow:
+        raise UnreadError("which joint is which is a guess", text)
+    return found

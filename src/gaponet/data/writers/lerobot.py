@@ -1,0 +1,276 @@
+"""Dataset → LeRobotDataset v3.0, so that it comes back from data.formats.lerobot with the same content hashes.
+
+A LeRobot set has one rate and the same features in every frame; a dataset with several rates or choices of channels
+becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
+of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Files
+are laid out in blocks, each with its own file of meta/episodes, and nothing in a block depends on what comes after it:
+a dataset that grew has its earlier blocks again, byte by byte, and a push need not make them (share/dataset.py).
+
+    beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
+                            features.<name>.info.unit: SI
+                            columns of meta/episodes: unit_id, payload_mass, level, repetition, virtual, findings, …
+                            meta/gaponet.json: exact period, robot, joint names, licence, source
+
+A reader that knows none of these finds an ordinary set. Not in it: twins, which can be made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
+from gaponet.data.log import UNITS
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset, Entry, dataset_hash
+from gaponet.data.writers import Tell, Written
+from gaponet.data.writers.lerobot_stats import EpisodeStats, episode_stats, plain, pool
+from gaponet.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+Group = tuple[float, tuple[str, ...]]  # dt, channels
+
+LAYOUT = 1  # rises where the same recordings become other bytes
+FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
+USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
+BLOCK_MB, BLOCK_EPISODES = 32.0, 64  # a block ends with a file, once it holds as much of both together
+INDEX = {"timestamp": "float32", "frame_index": "int64", "episode_index": "int64", "index": "int64",
+         "task_index": "int64"}  # fmt: skip
+PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """An episode, its number, that of its first frame, of its task and of its data file."""
+
+    entry: Entry
+    index: int
+    first: int
+    task: int
+    file: int
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Whole data files and the file of meta/episodes that lists what is in them, one of this number.
+
+    The key stands for all that decides their bytes: what is in them, and all that lies before.
+    """
+
+    key: str
+    number: int
+    episodes: list[_Placed]
+    places: list[str]
+
+
+def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
+    """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate."""
+    written = []
+    for part in sets_of(dataset):
+        part.write_meta(folder, pool([part.write_block(block, folder, dataset.read, tell) for block in part.blocks]))
+        written.append(Written(Path(part.name), len(part.entries), part.frames, _fps(part.dt)))
+    return written
+
+
+def sets_of(dataset: Dataset) -> list[LeRobotSet]:
+    """The sets that a dataset becomes; nothing is read or written yet."""
+    groups: dict[Group, list[Entry]] = {}
+    for entry in dataset.entries:
+        groups.setdefault((entry.dt, entry.channels), []).append(entry)
+    names = {group: _folder(*group, list(groups)) if len(groups) > 1 else "" for group in groups}
+    return [LeRobotSet(dataset, names[group], *group, entries) for group, entries in groups.items()]
+
+
+def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
+    """ "50hz"; with the channels behind it where they are what differs."""
+    same_rate = [c for other, c in groups if other == dt]
+    return f"{_fps(dt):.6g}hz" + ("-" + "-".join(channels) if len(same_rate) > 1 else "")
+
+
+def _fps(dt: float) -> float:
+    """A whole number where it is one, as LeRobot expects; 49.85 Hz stays 49.85 Hz."""
+    return round(1 / dt) if abs(round(1 / dt) * dt - 1) < 1e-9 else 1 / dt
+
+
+class LeRobotSet:
+    """One LeRobot set: which episodes go where, decided from the journal alone, and the writing of it."""
+
+    def __init__(self, dataset: Dataset, name: str, dt: float, channels: tuple[str, ...], entries: list[Entry]) -> None:
+        self.dataset, self.name, self.dt, self.channels, self.entries = dataset, name, dt, channels, entries
+        self.n = len(dataset.joint_names)
+        self.tasks: dict[str, int] = {}
+        self.frames = 0
+        self.blocks = list(self._blocks())
+
+    def _blocks(self) -> Iterator[_Block]:
+        row = 4 * self.n * len(self.channels) + sum(np.dtype(kind).itemsize for kind in INDEX.values())
+        said = [LAYOUT, self.name, self.dataset.robot_name, self.dataset.joint_names, self.dt, self.channels]
+        digest = hashlib.sha256(json.dumps(said).encode())
+        block: list[_Placed] = []
+        file = size = total = number = 0
+        fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
+        for index, entry in enumerate(self.entries):
+            more = entry.rows * row
+            if ended or (size and size + more > FILE_MB * 1e6):
+                file, size = file + 1, 0
+                if fill >= 1:
+                    yield self._block(digest.hexdigest(), number, block)
+                    block, number, fill = [], number + 1, 0.0
+            digest.update(entry.line + b"\n")
+            task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
+            block.append(_Placed(entry, index, self.frames, task, file))
+            size, total, fill = size + more, total + more, fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
+            self.frames += entry.rows
+            ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
+        yield self._block(digest.hexdigest(), number, block)
+
+    def _block(self, key: str, number: int, episodes: list[_Placed]) -> _Block:
+        files = dict.fromkeys(episode.file for episode in episodes)
+        places = [*(self._place("data", file) for file in files), self._place("meta/episodes", number)]
+        return _Block(key, number, episodes, places)
+
+    def _place(self, what: str, number: int) -> str:
+        file = PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
+        return f"{self.name}/{what}/{file}".lstrip("/")
+
+    def write_block(
+        self, block: _Block, folder: Path, read: Callable[[Entry], Sequence], tell: Tell = lambda motion: None
+    ) -> EpisodeStats:
+        """Write the files of a block; returns the statistics of its frames."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows: list[dict[str, Any]] = []
+        stats, writer, file = [], None, -1
+        try:
+            for episode in block.episodes:
+                columns = self._columns(read(episode.entry), episode)
+                if episode.file != file:
+                    if writer is not None:
+                        writer.close()
+                    writer, file = self._open(folder / self._place("data", episode.file)), episode.file
+                assert writer is not None
+                writer.write_table(self._table(columns))
+                stats.append(episode_stats(columns))
+                rows.append(_row(episode, block.number, stats[-1]))
+                tell(episode.entry.meta.motion)
+        finally:
+            if writer is not None:
+                writer.close()
+        place = folder / block.places[-1]
+        place.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.Table.from_pylist(rows), place, compression="snappy")
+        return pool(stats)
+
+    def _open(self, path: Path) -> pq.ParquetWriter:
+        import pyarrow.parquet as pq
+
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return pq.ParquetWriter(path, self._schema(), compression="snappy", use_dictionary=False)
+
+    def _schema(self) -> pa.Schema:
+        import pyarrow as pa
+
+        vector = pa.list_(pa.float32(), self.n) if self.n > 1 else pa.float32()  # one value is no list in LeRobot
+        fields = [(FEATURES[c], vector) for c in self.channels]
+        return pa.schema(fields + [(name, pa.type_for_alias(kind)) for name, kind in INDEX.items()])
+
+    def _columns(self, sequence: Sequence, episode: _Placed) -> dict[str, Array]:
+        rows = np.arange(len(sequence))
+        return {FEATURES[c]: getattr(sequence, c) for c in self.channels} | {
+            "timestamp": (rows * self.dt).astype(np.float32),
+            "frame_index": rows,
+            "episode_index": np.full(len(rows), episode.index),
+            "index": episode.first + rows,
+            "task_index": np.full(len(rows), episode.task),
+        }
+
+    def _table(self, columns: dict[str, Array]) -> pa.Table:
+        import pyarrow as pa
+
+        schema = self._schema()
+        arrays = [
+            pa.FixedSizeListArray.from_arrays(pa.array(x.ravel()), type=field.type)
+            if pa.types.is_fixed_size_list(field.type) else pa.array(x.ravel(), field.type)
+            for field, x in zip(schema, columns.values(), strict=True)
+        ]  # fmt: skip
+        return pa.table(arrays, schema=schema)
+
+    def write_meta(self, folder: Path, stats: EpisodeStats) -> None:
+        """Write what is of the whole set, with the statistics of all frames."""
+        import pyarrow.parquet as pq
+
+        meta = folder / self.name / "meta"
+        meta.mkdir(parents=True, exist_ok=True)
+        pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
+        _write_json(meta / "info.json", self._info())
+        _write_json(meta / "stats.json", plain(stats))
+        header = {k: self.dataset.header[k] for k in ("licence", "source") if k in self.dataset.header}
+        _write_json(meta / OURS, {
+            "format": 1, "robot": self.dataset.robot_name, "joint_names": self.dataset.joint_names, "dt": self.dt,
+            "dataset_hash": dataset_hash(self.entries), "virtual": any(e.meta.virtual for e in self.entries),
+            "dataset": header,
+        })  # fmt: skip
+
+    def _info(self) -> dict[str, Any]:
+        names = list(self.dataset.joint_names)
+        features: dict[str, Any] = {
+            FEATURES[c]: {"dtype": "float32", "shape": [self.n], "names": names, "info": {"unit": UNITS[c]}}
+            for c in self.channels
+        }
+        features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in INDEX.items()}
+        return {
+            "codebase_version": VERSION, "robot_type": self.dataset.robot_name,
+            "total_episodes": len(self.entries), "total_frames": self.frames, "total_tasks": len(self.tasks),
+            "chunks_size": CHUNK_FILES, "data_files_size_in_mb": FILE_MB, "video_files_size_in_mb": 200,
+            "fps": _fps(self.dt), "splits": {"train": f"0:{len(self.entries)}"},
+            "data_path": "data/" + PLACE, "video_path": None, "features": features,
+        }  # fmt: skip
+
+
+def _row(episode: _Placed, number: int, stats: EpisodeStats) -> dict[str, Any]:
+    """The episode's row in the file of meta/episodes that has this number."""
+    entry, meta = episode.entry, asdict(episode.entry.meta)
+    return {
+        "episode_index": episode.index, "tasks": [entry.meta.motion], "length": entry.rows,
+        "dataset_from_index": episode.first, "dataset_to_index": episode.first + entry.rows,
+        "data/chunk_index": episode.file // CHUNK_FILES, "data/file_index": episode.file % CHUNK_FILES,
+        "meta/episodes/chunk_index": number // CHUNK_FILES, "meta/episodes/file_index": number % CHUNK_FILES,
+        **{name: meta[name] for name in STATED}, "payload_mass": float(entry.meta.payload_mass),
+        **{name: json.dumps(meta[name], ensure_ascii=False) for name in ("notes", *GAINS)},
+        "findings": json.dumps(entry.findings, ensure_ascii=False), "content_hash": entry.hash,
+        **{f"stats/{f}/{k}": v.tolist() for f, values in stats.items() for k, v in values.items()},
+    }  # fmt: skip
+
+
+def _task_table(tasks: dict[str, int]) -> pa.Table:
+    """task_index by task; the metadata make pandas take the text for the index, as LeRobot expects."""
+    import pyarrow as pa
+
+    column = {"metadata": None, "numpy_type": "int64", "pandas_type": "int64"}
+    text = {"metadata": None, "numpy_type": "object", "pandas_type": "unicode"}
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index"} | column,
+            {"name": "task", "field_name": "task"} | text,
+        ],
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.string())})
+    return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    path.write_text(json.dumps(value, indent=4, ensure_ascii=False, allow_nan=False) + "\n", encoding="utf-8")

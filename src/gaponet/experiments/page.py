@@ -1,0 +1,141 @@
+"""A result as files, in every form that someone may want.
+
+    NAME.md            for people            NAME.json   everything, exact
+    NAME[-TABLE].csv   one per table         NAME[-FIGURE].svg, .png
+    report.html        one offline page over all results of the folder
+
+The first table and the first figure are NAME.csv and NAME.svg, the others carry their own names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+from typing_extensions import TypedDict
+
+from gaponet.base.errors import DatasetError
+from gaponet.base.files import write_text, writing
+from gaponet.base.json_file import write_json
+from gaponet.base.structure import Json, Name, read_json, validated
+from gaponet.base.text import markdown, plain
+from gaponet.experiments.result import Result, fact_rows
+from gaponet.report.figures.style import save
+from gaponet.report.page import element, facts_table, page, picture, tag
+from gaponet.report.page import table as html_table
+
+FORMAT = "gaponet experiment 1"
+KIND = "experiments"
+
+
+class TableRecord(TypedDict):
+    """A table of a result's .json; texts is what people read, rows the exact numbers."""
+
+    name: str
+    caption: str
+    columns: list[str]
+    rows: list[list[Json]]
+    texts: list[list[str]]
+
+
+class Record(TypedDict):
+    """A result's .json; figures: name → file without suffix."""
+
+    format: str
+    name: Name
+    title: str
+    virtual: str
+    facts: dict[str, Json]
+    sentences: list[str]
+    tables: list[TableRecord]
+    figures: dict[str, Name]
+
+
+def write(result: Result, folder: Path) -> list[Path]:
+    """Write NAME.md, .json, .csv, .svg and .png and renew report.html; each file whole or not at all.
+
+    Returns:
+        All files written, the report last.
+
+    Raises:
+        FolderError: folder is somebody else's, or another process writes into it.
+    """
+    with writing(folder, KIND):
+        files: list[Path] = []
+        for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
+            files.append(folder / f"{stem}.csv")
+            write_text(files[-1], table.csv())
+        pictures = stems(result.name, list(result.figures))
+        for figure, stem in zip(result.figures.values(), pictures, strict=True):
+            files += save(figure, folder / f"{stem}.svg")
+        files += [folder / f"{result.name}.md", folder / f"{result.name}.json"]
+        write_text(files[-2], _markdown(result, pictures))
+        figures = dict(zip(result.figures, pictures, strict=True))
+        record = {
+            "format": FORMAT, "name": result.name, "title": result.title, "virtual": result.virtual,
+            "facts": dict(result.facts), "sentences": list(result.sentences),
+            "tables": [t.record() for t in result.tables if t.shown], "figures": figures,
+        }  # fmt: skip
+        write_json(files[-1], record)
+        return [*files, write_report(folder)]
+
+
+def stems(name: str, parts: list[str]) -> list[str]:
+    """File names without suffix: NAME, then NAME-PART."""
+    return [name if i == 0 else f"{name}-{part}" for i, part in enumerate(parts)]
+
+
+def _markdown(result: Result, pictures: list[str]) -> str:
+    parts = [f"# {markdown(result.title)}", f"**{markdown(result.virtual)}**"]
+    if result.sentences:
+        parts.append("\n".join(f"- {markdown(s)}" for s in result.sentences))
+    parts += [t.markdown() for t in result.tables if t.shown]
+    parts += [f"![]({stem}.svg)" for stem in pictures]
+    parts.append("\n".join(f"- {markdown(key)}: {markdown(value)}" for key, value in fact_rows(result.facts)))
+    return "\n\n".join(parts) + "\n"
+
+
+def write_report(folder: Path) -> Path:
+    """Write folder/report.html with a section for every result found in the folder, by name.
+
+    Raises:
+        DatasetError: No result there, or a figure of one is missing.
+    """
+    records = found(folder)
+    if not records:
+        raise DatasetError(f"{folder}: no result of gaponet experiment here; run one with this folder as OUT")
+    contents = [Markup('<li><a href="#{}">{}</a></li>').format(plain(r["name"]), plain(r["title"])) for r in records]
+    body = element("h1", "Experiments") + element("ul", *contents) if len(records) > 1 else Markup("")
+    path = folder / "report.html"
+    write_text(path, page("gaponet experiments", body + Markup("").join(_section(r, folder) for r in records)))
+    return path
+
+
+def found(folder: Path) -> list[Record]:
+    """The results of a folder as their .json files hold them; other JSON files are passed over."""
+    records, hint = [], "delete it and run its experiment again"
+    for file in sorted(folder.glob("*.json")):
+        record = read_json(Any, file, DatasetError, hint)
+        if isinstance(record, dict) and record.get("format") == FORMAT:
+            records.append(validated(Record, record, file, DatasetError, hint))
+    return records
+
+
+def _section(record: Record, folder: Path) -> Markup:
+    head = Markup('<h1 id="{}">{}</h1>').format(plain(record["name"]), plain(record["title"]))
+    parts = [
+        head,
+        element("p", tag("VIRTUAL" in record["virtual"]), " ", record["virtual"]),
+        element("ul", *(element("li", sentence) for sentence in record["sentences"])),
+        *(_figure(folder / f"{stem}.svg") for stem in record["figures"].values()),
+    ]
+    for t in record["tables"]:
+        parts += [html_table(t["columns"], t["texts"]), element("p", t["caption"]) if t["caption"] else Markup("")]
+    return Markup("").join([*parts, facts_table(fact_rows(record["facts"]))])
+
+
+def _figure(file: Path) -> Markup:
+    if not file.is_file():
+        raise DatasetError(f"{file}: is missing; run its experiment again, or delete its .json")
+    return element("figure", element("div", picture(file.read_bytes(), "image/svg+xml"), css="plot"))

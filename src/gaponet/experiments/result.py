@@ -1,0 +1,70 @@
+"""What a question found: tables, figures and sentences, and what it takes to repeat it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gaponet.base.spread import Table
+from gaponet.data.store import Dataset, dataset_hash
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+VERSIONS = ("gaponet", "mujoco", "numpy", "torch")
+
+
+@dataclass(frozen=True)
+class Result:
+    """Everything that one experiment found."""
+
+    name: str
+    """Stem of the names of its files."""
+    title: str
+    virtual: str
+    """Whose numbers these are, as a sentence (label())."""
+    facts: Mapping[str, Any]
+    """Facts that a reader needs to repeat it (facts())."""
+    tables: tuple[Table, ...] = ()
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    """Figures by name."""
+    sentences: tuple[str, ...] = ()
+    """What the numbers say, made from them."""
+
+
+def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str, Any]:
+    """What it takes to repeat an experiment: command, date, versions, data, seeds, and what else is to be said."""
+    entries = dataset.entries
+    seeds = list(seeds)
+    return {
+        "command": command_line(sys.argv[1:]),
+        "date": date.today().isoformat(),
+        "dataset": f"{dataset.path.name} ({dataset_hash(entries)})",
+        "recorded_hours": round(sum(e.rows * e.dt for e in entries) / 3600, 3),
+        "units": sorted({e.meta.unit_id for e in entries}),
+        **({"seeds": seeds} if seeds else {}),
+        **more,
+        "versions": {p: version(p) for p in VERSIONS},
+    }
+
+
+def command_line(words: list[str]) -> str:
+    """The command as typed, files and folders by their last name: where they lay is nobody's business."""
+    return shlex.join(["gaponet", *(Path(w).name if "/" in w else w for w in words)])
+
+
+def fact_rows(found: Mapping[str, Any]) -> list[list[str]]:
+    """Facts as two columns of text."""
+
+    def words(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return ", ".join(f"{k} {v}" for k, v in value.items())
+        return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+    return [[key.replace("_", " "), words(value)] for key, value in found.items()]

@@ -1,0 +1,1 @@
+"""Exports to other simulators: MJCF, URDF, configurations, action terms, actuator networks, randomisation."""

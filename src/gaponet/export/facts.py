@@ -1,0 +1,113 @@
+"""The simulator that a model was trained in, as numbers with units and as one MJCF with its servos."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gaponet.base.errors import RobotError
+from gaponet.export.scene_facts import joint_fields, solver_options
+from gaponet.robot.bare import bare_text, put
+from gaponet.robot.identity import lines
+from gaponet.robot.mjcf import compiled
+from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.sim.model import STIFF_MOBILITY, build_model, build_spec, model_hash
+
+UNITS = {
+    "kp": "N·m/rad", "kd": "N·m·s/rad", "effort_limit": "N·m", "armature": "kg·m²", "damping": "N·m·s/rad",
+    "frictionloss": "N·m", "delay": "s", "offset": "rad", "zero": "rad", "home": "rad", "range": "rad", "dt": "s",
+    "payload_mass": "kg", "stribeck": "N·m", "stribeck_speed": "rad/s", "target_speed": "rad/s", "friction_motor": "1",
+    "friction_external": "1", "min_torque": "N·m", "encoder_step": "rad",
+}  # fmt: skip
+Joints = dict[str, dict[str, Any]]  # name → numbers of its joint and servo, SI
+PLAIN_FIELDS = ("armature", "damping", "frictionloss")  # of a joint, as an MJCF has them
+MEANING = {
+    "offset": "the servo aims at command + offset",
+    "zero": "the MJCF's angle is reading + zero; robot.xml has it as ref",
+    "dof_invweight0_factor": "of joints' dof_invweight0 after compilation, so that friction holds; no MJCF can say it",
+    "law": "what servos do beyond PD, by joint; in no MJCF, but in servo_law.py and, for mjlab, the action term",
+    "plain": "the numbers that were fitted for servos without that law; the same as joints where there is none",
+    "left_mrad": "mean |error| of joints on the motions of check.npz, in gaponet",
+    "mujoco": "fields of the compiled MjModel by their names",
+}
+
+
+def simulator_facts(
+    robot: RobotSpec, dt: float, payload_mass: float = 0.0, plain: RobotSpec | None = None
+) -> dict[str, Any]:
+    """What another engine needs to be the simulator of `robot`; read from its compiled model.
+
+    Args:
+        robot: The simulator, e.g. of a run, or an identified one.
+        dt: Control period, s.
+        payload_mass: In each hand, kg.
+        plain: The same robot as fitted without a servo law; default this one, its law left out.
+    """
+    model = build_model(robot, payload_mass, dt=dt)
+    other = model if plain is None else build_model(plain, payload_mass, dt=dt)
+    return {
+        "format": 2, "robot": robot.name, "simulator": model_hash(robot), "units": UNITS, "meaning": MEANING,
+        "versions": {"mujoco": mujoco.__version__}, "dt": dt, "decimation": robot.steps_per(dt),
+        "payload_mass": payload_mass, "corrected": list(robot.operated), "options": solver_options(model),
+        "dof_invweight0_factor": STIFF_MOBILITY, "law": [term for term in LAW if getattr(robot, term).any()],
+        "joints": {name: _joint(robot, model, i) for i, name in enumerate(robot.joint_names)},
+        "plain": {name: _numbers(plain or robot, other, i) for i, name in enumerate(robot.joint_names)},
+    }  # fmt: skip
+
+
+def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
+    """The same simulator as one MJCF without files: joints, solver options and servos with their delays.
+
+    Raises:
+        RobotError: A text cannot hold it.
+    """
+    model = build_model(robot, payload_mass, dt=dt)
+    root = ET.fromstring(bare_text(build_spec(robot, payload_mass, dt=dt), robot.mjcf))
+    option = root.find("option")
+    assert option is not None
+    put(option, timestep=model.opt.timestep)
+    for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
+        put(pair, **{name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")})
+    servos = ET.SubElement(root, "actuator")
+    for i in range(model.nu):
+        name, bias = model.actuator(i).name, model.actuator_biasprm[i]
+        if bias[0]:
+            servo = ET.SubElement(servos, "general", {"name": name, "joint": name, "biastype": "affine"})
+            put(servo, gainprm=model.actuator_gainprm[i, 0], biasprm=bias[:3])
+        else:
+            servo = ET.SubElement(servos, "position", {"name": name, "joint": name})
+            put(servo, kp=-bias[1], kv=-bias[2])
+        put(servo, forcerange=model.actuator_forcerange[i])
+        if model.actuator_history[i, 0]:
+            servo.set("nsample", str(model.actuator_history[i, 0]))
+            servo.set("interp", "linear")
+            put(servo, delay=model.actuator_delay[i])
+        if model.nuser_actuator:
+            put(servo, user=model.actuator_user[i])
+    ET.indent(root)
+    text = ET.tostring(root, encoding="unicode") + "\n"
+    again = compiled(mujoco.MjSpec.from_string(text), robot.mjcf)
+    if list(lines(again)) != list(lines(model)) or again.opt.timestep != model.opt.timestep:
+        raise RobotError(f"{robot.mjcf}: with its servos it does not fit into one file that moves the same")
+    return text
+
+
+def _joint(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
+    law = {term: float(getattr(robot, term)[i]) for term in LAW} if robot.has_law else {}
+    return _numbers(robot, model, i) | {"mujoco": joint_fields(model, robot.joint_names[i])} | law
+
+
+def _numbers(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
+    name = robot.joint_names[i]
+    joint, dof = model.joint(name).id, model.joint(name).dofadr[0]
+    return {
+        "home": float(robot.qpos_home[i]),
+        "range": model.jnt_range[joint].tolist() if model.jnt_limited[joint] else None,
+        "kp": float(robot.kp[i]), "kd": float(robot.kd[i]), "effort_limit": float(robot.effort_limit[i]),
+        "armature": float(model.dof_armature[dof]), "damping": float(np.ravel(model.dof_damping[dof])[0]),
+        "frictionloss": float(model.dof_frictionloss[dof]), "delay": float(robot.delay[i]),
+        "offset": float(robot.offset[i]), "zero": float(robot.zero[i]), "target_speed": float(robot.target_speed[i]),
+    }  # fmt: skip

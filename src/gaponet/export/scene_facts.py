@@ -1,0 +1,75 @@
+"""Whether a compiled scene is the simulator of an export; copied beside it, it needs MuJoCo and numpy, not gaponet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.export.mujoco_servos import read
+
+CLOSE = 1e-5  # relative: facts of a scene that are the same
+OWN_FLAGS = {"contact", "island"}  # what a scene of your own may decide
+FIELDS = (
+    "dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp", "jnt_range", "jnt_stiffness",
+    "actuator_gainprm", "actuator_biasprm", "actuator_forcerange", "actuator_delay", "actuator_history",
+)  # fmt: skip
+OPTIONS = (
+    "timestep", "gravity", "impratio", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "ccd_iterations",
+    "noslip_iterations", "density", "viscosity", "wind",
+)  # fmt: skip
+
+
+def require_scene(model: Any, prefix: str, folder: str | Path) -> None:
+    """Refuse a compiled MjModel in which the robot's joints and servos are not those of training.
+
+    Raises:
+        ValueError: Names what differs.
+    """
+    facts, wrong = read(Path(folder) / "facts.json"), []
+    for name, joint in facts["joints"].items():
+        for field, value in joint_fields(model, prefix + name).items():
+            wrong += _differs(f"{field} of {name}", value, joint["mujoco"][field])
+    here = solver_options(model)
+    for field, value in facts["options"].items():
+        if field.endswith("flags"):
+            now, then = sorted(set(here[field]) - OWN_FLAGS), sorted(set(value) - OWN_FLAGS)
+            wrong += [] if now == then else [f"{field} {now} instead of {then}"]
+        elif isinstance(value, str):
+            wrong += [] if here[field] == value else [f"{field} {here[field]} instead of {value}"]
+        else:
+            wrong += _differs(field, here[field], value)
+    if wrong:
+        raise ValueError(
+            f"{folder}: was trained in simulator {facts['simulator']}; here {'; '.join(wrong[:5])}"
+            f"{' and more' * (len(wrong) > 5)}. Take mjlab_entity and mjlab_options, or check=False"
+        )
+
+
+def _differs(what: str, now: Any, wanted: Any) -> list[str]:
+    a, b = (np.array(x, float) for x in (now, wanted))
+    same = a.shape == b.shape and np.allclose(a, b, rtol=CLOSE, atol=1e-12)
+    return [] if same else [f"{what} {now} instead of {wanted}"]
+
+
+def joint_fields(model: Any, name: str) -> dict[str, Any]:
+    """What an MjModel has of a joint and of the servo with its name; only the first three of a servo's parameters."""
+    row = {"jnt": model.joint(name).id, "dof": model.joint(name).dofadr[0], "actuator": model.actuator(name).id}
+    values = {field: getattr(model, field)[row[field.split("_")[0]]] for field in FIELDS}
+    return {field: (x[:3] if field.endswith("prm") else x).tolist() for field, x in values.items()}
+
+
+def solver_options(model: Any) -> dict[str, Any]:
+    """The options of an MjModel that decide how it moves, with the names of MuJoCo and of mjlab's MujocoCfg."""
+    import mujoco
+
+    found = {name: getattr(model.opt, name) for name in OPTIONS}
+    found = {name: x.tolist() if hasattr(x, "tolist") else x for name, x in found.items()}
+    for name, kind in (("integrator", "Integrator"), ("cone", "Cone"), ("jacobian", "Jacobian"), ("solver", "Solver")):
+        found[name] = getattr(mujoco, f"mjt{kind}")(getattr(model.opt, name)).name.split("_", 1)[1].lower()
+    for name, kind in (("disableflags", "Disable"), ("enableflags", "Enable")):
+        bits = getattr(mujoco, f"mjt{kind}Bit").__members__.items()
+        known = {key.split("BL_")[1].lower(): bit.value for key, bit in bits if "BL_" in key}
+        found[name] = sorted(key for key, bit in known.items() if getattr(model.opt, name) & bit)
+    return found

@@ -1,0 +1,1 @@
+"""Robots in motion: controller, limits, watchdog, drivers, live targets."""

@@ -1,0 +1,312 @@
+"""Controller: plays targets on a robot at a fixed rate, within limits, and stops it when something is wrong.
+
+phases.TRANSITIONS is its state machine. What stops a robot is latched, and a controller that has stopped cannot be
+started again. docs/deploy-safety.md says what this guarantees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.hw.control.clock import Clock, MonotonicClock, uncollected
+from gaponet.hw.control.driver import Driver, DriverError, Fault, State
+from gaponet.hw.control.following import Following
+from gaponet.hw.control.output import Context, Output
+from gaponet.hw.control.phases import COMMANDING, ENDED, MOVING, TABLE, Action, ControlConfig, Phase, Trigger
+from gaponet.hw.control.plan import Compensates, Plan, Planner
+from gaponet.hw.control.publisher import sole_publisher
+from gaponet.hw.control.recording import Event, Recording
+from gaponet.hw.control.rows import Row
+from gaponet.hw.control.safety import ASTRAY, SOFT, Limits, SafetyConfig, Watch
+from gaponet.hw.control.stop import Keys, StopRequest, on_signal
+from gaponet.hw.control.target import Change, Readiness, TargetGenerator
+from gaponet.hw.control.watchdog import Watchdog
+from gaponet.hw.targets.policy import Policy, play
+from gaponet.robot.spec import RobotSpec
+
+HANG_PERIODS = 5.0  # control periods without a sign of life after which the watchdog damps the robot
+
+
+class Controller:
+    """Plays targets on one robot, once: ramp to the start, track, hold or damp at the end."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        robot: RobotSpec,
+        *,
+        config: ControlConfig | None = None,
+        safety: SafetyConfig | None = None,
+        compensator: Compensates | None = None,
+        clock: Clock | None = None,
+        watchdog: bool = True,
+        planner: Planner | None = None,
+        unchecked: bool = False,
+        payload_mass: float | None = None,
+        on_event: Callable[[Event], None] = lambda event: None,
+        on_connect: Callable[[Driver], None] = lambda driver: None,
+        folder: Path | None = None,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        """
+        Args:
+            driver: The robot; not yet connected.
+            robot: Its type.
+            config: Times of the phases.
+            safety: Limits and checks of states; default SafetyConfig().
+            compensator: Turns targets into commands; without one targets are sent as they are.
+            clock: Default the machine's monotonic clock.
+            watchdog: Start the process that damps the robot if this one dies, where the driver has one.
+            planner: Checks the way to the first target, and targets that are not known in advance while it moves;
+                default one without payload, for a robot that has shapes (collision.toml).
+            unchecked: Do without one.
+            payload_mass: kg per hand, for the compensator and the recording; None if it is not known.
+            on_event: Called with every change of phase.
+            on_connect: Called with the driver once the robot has answered and nothing was commanded; may refuse it.
+            folder: Where the recording is written as it grows, to be saved there; default a temporary file.
+            metadata: Saved with the recording (unit, model…).
+        """
+        self.driver, self.clock, self.config = driver, clock or MonotonicClock(), config or ControlConfig()
+        self.dt, safety = 1.0 / self.config.rate, safety or SafetyConfig()
+        if planner is None and not unchecked and (robot.folder / "collision.toml").is_file():
+            planner = Planner(robot, driver.commanded, self.config, safety)
+        self.context = Context(
+            driver, robot, self.config, safety, compensator, self.clock, planner, payload_mass,
+            robot.index(driver.commanded), self.dt,
+        )  # fmt: skip
+        self.phase, self.stop = Phase.CONNECT, StopRequest()
+        self.recording = Recording(
+            robot.name, driver.virtual, driver.joint_names, driver.commanded, self.dt,
+            meta=(metadata or {}) | {"payload_mass": payload_mass},
+        )  # fmt: skip
+        self.watch = Watch(driver.joint_names, self.context.joints, self.dt, safety, driver.noisy)
+        self.following = Following(self.context)
+        self.output = Output(self.context, self.watch)
+        self.readiness = Readiness(self.context, self.output)
+        self._targets: TargetGenerator | None = None
+        self._folder, self._use_watchdog, self._on_event, self._on_connect = folder, watchdog, on_event, on_connect
+        self._k, self._now, self._since = 0, 0.0, 0  # this period, its start in s, the first period of the phase
+        self._state: State | None = None  # the last one
+        self._error: BaseException | None = None  # of others' code, raised when the robot is damped
+        self._reported_full_disk = False
+
+    @property
+    def plan(self) -> Plan | None:
+        """May be given until it runs: its motion is played."""
+        return self.readiness.plan
+
+    @plan.setter
+    def plan(self, plan: Plan) -> None:
+        self.readiness.plan = plan
+
+    @property
+    def limits(self) -> Limits:
+        """Limits of the commanded joints."""
+        return self.output.limits
+
+    def run(self, policy: Policy | None = None, keys: bool = False) -> Recording:
+        """Go through all phases and return what was recorded, when the policy ends or the run is stopped.
+
+        Args:
+            policy: Says the targets of the run, once a control period; None: the plan's motion is played.
+            keys: Whether any key on the terminal, Ctrl-C included, stops the run.
+
+        Raises:
+            DriverError: The robot could not be reached; nothing was commanded.
+            UsageError: Another process commands it, or this controller has run before.
+            Exception: What the policy or the compensator raised, after the robot has damped.
+        """
+        if self.phase is not Phase.CONNECT:
+            raise UsageError("a controller runs once; make a new one")
+        driver, output = self.driver, self.output
+        with ExitStack() as stack:
+            stack.enter_context(uncollected())  # left last: the watchdog would take a collection for silence
+            lock = stack.enter_context(sole_publisher(driver.address))
+            stack.callback(lambda: driver.close(hold=output.damping_since is None))
+            driver.connect()
+            self.recording.virtual = driver.virtual
+            output.limits = output.servo_limits()
+            self._on_connect(driver)
+            stack.enter_context(on_signal(self.stop))
+            pressed = stack.enter_context(Keys(self.stop)) if keys else None  # from the consent on, not from the loop
+            gains = {name: getattr(driver, name)[self.context.joints].tolist() for name in ("kp", "kd")}
+            self.recording.meta |= gains | driver.facts
+            if self._folder:
+                self.recording.grow_in(self._folder)
+            stack.callback(self.recording.rows.close)
+            if self._use_watchdog and (spec := driver.watchdog()) is not None:
+                watchdog = output.watchdog = Watchdog(spec, lock, HANG_PERIODS * self.dt, self.config.damp)
+                stack.callback(lambda: watchdog.release(output.loose))
+                watchdog.wait_ready()
+            if policy is None:
+                if self.plan is None or self.plan.motion is None:
+                    raise UsageError("there is nothing to play: give a policy, or a plan with a motion")
+                policy = play(self.plan.motion, self.dt)
+            self._loop(policy, pressed)
+            self._verify()
+        if self._error:
+            raise self._error
+        return self.recording
+
+    def _loop(self, policy: Policy, keys: Keys | None) -> None:
+        start, due = self.clock.now(), 0  # due: the period that should follow the last one; _k: the one that can
+        self._now = self.readiness.since = start
+        self._fire(Trigger.CONSENT, "waiting for fresh states")
+        for remark in self.driver.facts.get("remarks", ()):
+            self._note(remark)
+        self.output.suspended_before = self.clock.suspended()
+        while self.phase is not Phase.STOPPED:
+            self._now = self.clock.wait_until(start + self._k * self.dt)
+            self.output.due = start + due * self.dt
+            if keys:
+                keys.poll()
+            watchdog = None if self.phase in ENDED else self.output.watchdog
+            if watchdog and (trouble := watchdog.trouble()):
+                self.stop(trouble)
+            self.recording.late.append(self._now - self.output.due)
+            self._period(policy)
+            lost = int((self.clock.now() - start) / self.dt) - self._k  # whole periods that this one ran over
+            self.recording.missed += max(lost - 1, 0)
+            self._k, due = self._k + max(1, lost), self._k + 1
+
+    def _period(self, policy: Policy) -> None:
+        """Read, judge, send, record. Whatever fails in it, the robot damps."""
+        state = sent = None
+        try:
+            state, fault = self._read()
+            self._state = state or self._state
+            if fault:
+                self._fail(fault)
+            if self.phase is Phase.IDLE and state:
+                self._start(state, policy)
+            if state:
+                sent = self._send(state, policy)
+        except BaseException as error:  # raised again at the end
+            self._error = self._error or error
+            self._fail(Fault("error", f"{type(error).__name__}: {error}"))
+        phase = self.phase
+        if phase is Phase.DAMP:
+            self._damp()
+        if state:
+            target, ctrl = sent or (None, None)
+            self.recording.rows.append(Row(self._now, phase.value, target, ctrl, state))
+            trouble = self.recording.rows.trouble
+            if trouble and not self._reported_full_disk:
+                self._reported_full_disk = True
+                self._note(f"nothing more is recorded ({trouble.strerror}); what was written is kept")
+
+    def _read(self) -> tuple[State | None, Fault | None]:
+        """Return the newest state, and what stops the robot now."""
+        state = fault = None
+        try:
+            state = self.driver.read()
+        except (DriverError, OSError) as error:
+            fault = Fault("driver", str(error))
+        if state:
+            ctrl = None if self.recording.not_obeyed else self.output.ctrl  # while it is let go nothing is to follow
+            fault = self.watch.check(self._now, state, ctrl, self._now - self.output.due)
+            if self.phase in MOVING:
+                fault = fault or self.following.check(state, self.output)
+            elif self.phase is Phase.IDLE and (fault is None or fault.kind != "stop"):
+                self.readiness.count(fault)
+                fault = None
+        if self.stop.reason:
+            return state, Fault("stop", f"asked to stop: {self.stop.reason}")
+        return state, self.output.suspended() or fault
+
+    def _start(self, state: State, policy: Policy) -> None:
+        """Leave idle if the robot may be commanded."""
+        first = self.readiness.first_target(self._now, state, policy)
+        if isinstance(first, Fault):
+            self._fail(first)
+        elif first is not None:
+            self.output.begin(state.qpos)
+            self._targets = TargetGenerator(self.context, self.following, self.plan, state, first)
+            self._fire(Trigger.READY, f"to the first target in {self._targets.way.duration:.1f} s")
+
+    def _send(self, state: State, policy: Policy) -> tuple[Array, Array] | None:
+        """Send this period's command. Return target and command of all joints, (n) rad; None if none was sent."""
+        while self._targets and self.phase in COMMANDING:
+            target = self._targets.step(self.phase, self._k - self._since, state, policy)
+            while self._targets.remarks:
+                self._note(self._targets.remarks.pop(0))
+            if isinstance(target, Change):
+                self._fire(*target)
+                continue
+            weight = self._targets.weight
+            sent = target if isinstance(target, Fault) else self.output.send(target, weight, state)
+            if not isinstance(sent, Fault):
+                return sent
+            self._fail(sent)
+            break
+        return None
+
+    def _damp(self) -> None:
+        left = self.output.damping_left(self._now)
+        try:
+            self.output.damp(left)
+        except Exception as error:  # whatever a driver raises, it is to damp: again next period; raised at the end
+            if not isinstance(error, DriverError | OSError):
+                self._error = self._error or error
+            if not any(e.text == str(error) for e in self.recording.events):
+                self._note(str(error), "driver", self.clock.now())
+        if not left:
+            self._fire(Trigger.DAMPED, *self.output.confirm())
+
+    def _verify(self) -> None:
+        """Ask the robot once more for all that it holds, at the end of a run without fault."""
+        if self.output.weight is None or self.recording.fault:
+            return
+        try:
+            fault = self.driver.verify()
+        except (DriverError, OSError) as error:
+            fault = Fault("driver", f"at the end: {error}")
+        if fault:
+            self._note(fault.text, fault.kind, self.clock.now())
+        elif self.following.share and not self.following.shown.any():
+            self.recording.not_obeyed = "no joint was told to go far enough to show whether the robot obeys"
+            self._note(f"no data: {self.recording.not_obeyed}", now=self.clock.now())
+
+    def _fail(self, fault: Fault) -> None:
+        """Stop the robot because of a fault; the table says how."""
+        output, trigger, text = self.output, Trigger.FAULT, fault.text
+        if output.weight is None:
+            trigger, text = Trigger.FAULT_BEFORE_COMMAND, f"{text}; nothing was commanded"
+        elif output.watchdog and output.watchdog.fired():
+            trigger, text = Trigger.FAULT_AFTER_WATCHDOG, f"{text}; the watchdog has damped the robot"
+        elif fault.kind == "obedience" and self.driver.at_end == "hand_over":
+            trigger = Trigger.NOT_FOLLOWING
+        self._fire(trigger, text, fault.kind)
+
+    def _fire(self, trigger: Trigger, text: str, kind: str = "") -> None:
+        """Make the transition that the table has for an event, and record it."""
+        phase, action = TABLE[self.phase, trigger]
+        if action is Action.IGNORE:
+            return
+        if action is Action.RAISE:
+            raise AssertionError(f"{trigger.name} in phase {self.phase}: {text}")
+        self.phase, self._since = phase, self._k
+        if action is Action.DAMP:
+            self.output.begin_damping(self._now, kind in SOFT)
+        elif self._targets and self._state:
+            if action is Action.GO_BACK:
+                self._targets.go_back(self._state)
+            elif action is Action.RELEASE_HERE:
+                self._targets.hold(self._state)
+        self._note(text, kind)
+
+    def _note(self, text: str, kind: str = "", now: float | None = None) -> None:
+        event = Event(self._now if now is None else now, self.phase.value, kind, text)
+        if kind in ASTRAY:
+            self.recording.not_obeyed = self.recording.not_obeyed or text
+        self.recording.events.append(event)
+        try:
+            self._on_event(event)
+        except Exception as error:  # a listener is the caller's code, and may raise anything: damp, raise it at the end
+            self._error = self._error or error
+            self.stop(f"its listener failed: {error}")

@@ -1,0 +1,172 @@
+"""Output: commands to a robot within its limits, and damping; and what all parts of a controller share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.hw.control.clock import Clock
+from gaponet.hw.control.driver import Driver, DriverError, Fault, State
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.plan import MOVED, Compensates, Planner
+from gaponet.hw.control.safety import Limits, SafetyConfig, Watch, limit_command, limit_delta
+from gaponet.hw.control.watchdog import Watchdog
+from gaponet.robot.spec import RobotSpec
+
+MAX_BEYOND_RANGE_RAD = 0.05  # at the start, where only the MJCF says where a joint's range ends
+MAX_SEND_DELAY_S = 0.001  # between the last look at the clock and a command's leaving
+MAX_SUSPENDED_S = 0.05  # less than any suspend, more than two clocks that are read in turn differ by
+
+
+@dataclass(frozen=True)
+class Context:
+    """Robot, settings and clock of one controller; indices of the commanded joints; control period, s."""
+
+    driver: Driver
+    robot: RobotSpec
+    config: ControlConfig
+    safety: SafetyConfig
+    compensator: Compensates | None
+    clock: Clock
+    planner: Planner | None
+    payload_mass: float | None
+    joints: Array
+    dt: float
+
+
+class Output:
+    """Corrects, limits and sends commands to one robot, and damps it. Arrays are of the commanded joints.
+
+    Attributes:
+        due: When the present period should have begun, s.
+        suspended_before: s for which the computer was suspended before the run.
+        ctrl: The command in force, rad; None before the first one, and while the robot is damped.
+        weight: Weight of the last command; None if nothing was ever commanded.
+        damping_since: s of the clock; None if the robot was not damped.
+        loose: Nobody has confirmed that the robot is damped.
+    """
+
+    def __init__(self, context: Context, watch: Watch) -> None:
+        self.context, self.watch = context, watch
+        self.watchdog: Watchdog | None = None
+        self.limits = self.servo_limits()
+        self.due = self.suspended_before = 0.0
+        self._start = self._requested = self._delta = np.zeros(len(context.joints))
+        self.ctrl: Array | None = None
+        self.weight: float | None = None
+        self.damping_since: float | None = None
+        self.loose = self._soft = False
+
+    def servo_limits(self) -> Limits:
+        """Return the limits by what the driver knows of the servos, which is final once it is connected."""
+        driver = self.context.driver
+        gains = (driver.kp, driver.kd)
+        return Limits.of(self.context.robot, driver.commanded, self.context.safety, gains, driver.qpos_range)
+
+    def suspended(self) -> Fault | None:
+        """Return a fault if the computer was suspended: time stood still for this process, not for the robot."""
+        duration = self.context.clock.suspended() - self.suspended_before
+        if duration <= MAX_SUSPENDED_S:
+            return None
+        return Fault("suspend", f"the computer was suspended for {duration:.1f} s; keep it awake while a robot moves")
+
+    def admit(self, qpos: Array) -> Fault | None:
+        """Widen the limits to where the robot is, (n) rad, so that this can be the first command; or refuse it."""
+        driver, joints = self.context.driver, self.context.joints
+        at, ranges = qpos[joints], self.context.robot.qpos_range[joints]
+        # Servos that know their own range cut goals beyond it.
+        spare = MAX_BEYOND_RANGE_RAD if driver.qpos_range is None else MOVED
+        ends = ranges if driver.qpos_range is None else driver.qpos_range[joints]
+        low, high = np.minimum(ranges, ends)[:, 0] - spare, np.maximum(ranges, ends)[:, 1] + spare
+        beyond = np.maximum(low - at, at - high)
+        if beyond.max() > 0:
+            i = int(beyond.argmax())
+            return Fault(
+                "plan",
+                f"{driver.commanded[i]} was found at {at[i]:.2f} rad, beyond its range of {low[i]:.2f} to "
+                f"{high[i]:.2f}; bring it there by hand, or calibrate",
+            )
+        self.limits = replace(self.limits, low=np.minimum(self.limits.low, at), high=np.maximum(self.limits.high, at))
+        return None
+
+    def begin(self, qpos: Array) -> None:
+        """Take the measured position, (n) rad, as the command in force."""
+        self._start = self._requested = self.ctrl = qpos[self.context.joints]
+
+    def expected(self) -> Array:
+        """Return where the joints are requested to be, rad, as far as the robot is handed over.
+
+        That is not what was sent: a command never goes further from a joint than its torque allows, and so goes with
+        a joint that hangs.
+        """
+        handed = (self.weight or 0.0) if self.context.driver.at_end == "hand_over" else 1.0
+        return self._start + handed * (self._requested - self._start)
+
+    def send(self, target: Array, weight: float, state: State) -> tuple[Array, Array] | Fault:
+        """Send a target, corrected and limited. Return target and command of all joints, or why nothing was sent."""
+        context, limits, joints = self.context, self.limits, self.context.joints
+        full = corrected = state.qpos_with(joints, target)
+        if context.compensator:
+            corrected = context.compensator.step(full, state.qpos, state.qvel)
+        if not np.isfinite(target).all() or not np.isfinite(corrected[joints]).all():
+            return Fault("target", "the motion or the model gave something that is not a number")
+        self._delta = limit_delta(corrected[joints] - target, self._delta, context.dt, limits)
+        step = limits.speed * context.dt
+        requested = np.clip(target + self._delta, self._requested - step, self._requested + step)
+        self._requested = np.clip(requested, limits.low, limits.high)
+        command = self._write(target + self._delta, weight, state)
+        return command if isinstance(command, Fault) else (full, command)
+
+    def _write(self, ctrl: Array, weight: float, state: State) -> Array | Fault:
+        """Limit a command and write it, or say why none may leave. A period that stood still sends nothing."""
+        context, joints, before, last_look = self.context, self.context.joints, self.ctrl, -np.inf
+        q, v = state.qpos[joints], state.qvel[joints]
+        assert before is not None
+        if self.watchdog and not self.watchdog.beat(weight):  # first, so that it counts from before the first command
+            return Fault("stop", "the watchdog ended")
+        while (now := context.clock.now()) - last_look > MAX_SEND_DELAY_S:
+            last_look = now
+            fault = self.watch.overrun(now - self.due) or self.suspended()
+            if fault or (self.watchdog and self.watchdog.fired()):
+                return fault or Fault("overrun", "this process stood still")
+            out = limit_command(ctrl, before, q, v, context.dt, self.limits, now + MAX_SEND_DELAY_S - state.time)
+        if not out.feasible.all():
+            joint = context.driver.commanded[int(np.argmin(out.feasible))]
+            if limit_command(ctrl, before, q, v, context.dt, self.limits).feasible.all():
+                age = f"{(now - state.time) * 1e3:.0f} ms"
+                return Fault(
+                    "stale", f"the newest state is {age} old; no command is safe wherever {joint} can be by now"
+                )
+            return Fault("torque", f"{joint}: no command is within range, rate and torque")
+        self.ctrl, self.weight, full = out.ctrl, weight, state.qpos_with(joints, out.ctrl)
+        try:
+            context.driver.write(full, weight)
+        except (DriverError, OSError) as error:
+            return Fault("driver", str(error))
+        return full
+
+    def begin_damping(self, now: float, soft: bool) -> None:
+        """Let `damp` begin now; soft: a robot that cannot brake is lowered."""
+        self.damping_since, self._soft, self.ctrl = now, soft, None
+
+    def damping_left(self, now: float) -> float:
+        """Return the share of the time for damping that is left."""
+        return max(1.0 - (now - (self.damping_since or 0.0)) / self.context.config.damp, 0.0)
+
+    def damp(self, left: float) -> None:
+        """Damp for a period, with this share of the last weight; may raise whatever a driver raises."""
+        weight = left * (self.weight or 0.0)
+        if self.watchdog and not self.watchdog.fired():
+            self.watchdog.beat(weight)
+        self.context.driver.damp(weight, left * self._soft)
+
+    def confirm(self) -> tuple[str, str]:
+        """Return what the robot itself reports after damping, and the kind of fault if it does not confirm it."""
+        try:
+            return self.context.driver.confirm(), ""
+        except (DriverError, OSError) as error:
+            self.loose = True
+            more = "; the watchdog goes on trying" if self.watchdog else ""
+            return f"could NOT be damped: switch the supply off ({error}){more}", "driver"

@@ -1,0 +1,114 @@
+"""State machine of a run on a robot, as one table, and the durations of its phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, StrEnum
+
+from gaponet.base.errors import UsageError
+
+
+class Phase(StrEnum):
+    """State of a controller."""
+
+    CONNECT = "connect"
+    IDLE = "idle"
+    BLEND_IN = "blend_in"
+    RUN = "run"
+    BLEND_OUT = "blend_out"
+    RELEASE = "release"
+    DAMP = "damp"
+    STOPPED = "stopped"
+
+
+class Trigger(Enum):
+    """Event of the state machine, with its meaning."""
+
+    CONSENT = "the robot has answered, and `on_connect` (which shows the plan and asks) did not refuse"
+    READY = "five good states in a row, a first target, a clear way to it"
+    ARRIVED = "at the first target and settled; weight 1"
+    RETURN = "the motion is over, and the robot is to go back"
+    HAND_OVER = "the run is over without fault, on rt/arm_sdk"
+    HOLD = "the run is over without fault, on an SO-101"
+    DAMP = "the run is over without fault, on rt/lowcmd"
+    RELEASED = "weight 0 was sent"
+    DAMPED = "the time for damping (`--damp`) is over"
+    NOT_FOLLOWING = "a joint does not follow its commands, on rt/arm_sdk"
+    FAULT = "any other fault, key, signal or call, after the first command"
+    FAULT_BEFORE_COMMAND = "any fault, key, signal or call, before the first command"
+    FAULT_AFTER_WATCHDOG = "any fault, key, signal or call, after the watchdog began to damp the robot"
+
+
+class Action(Enum):
+    """What a controller does in a transition and until the next one."""
+
+    READ = "read states; send nothing"
+    BLEND_IN = "send positions, from the measured one to the first target; weight 0 → 1 on rt/arm_sdk"
+    PLAY = "send the positions of the motion, corrected where a model is given"
+    GO_BACK = "send positions, back to where the robot was at the start"
+    RELEASE = "send the last position; weight 1 → 0"
+    RELEASE_HERE = "send the measured position; weight → 0"
+    DAMP = "send no position: stiffness 0, damping gains (H1-2); torque limits to 0, then torque off (SO-101)"
+    HOLD = "send nothing; servos hold the last position"
+    SEND_NOTHING = "send nothing"
+    CONFIRM = "send nothing; report what the robot itself says"
+    IGNORE = "none"
+    RAISE = "raise an error of this program, which then is a fault"
+
+
+MOVING = (Phase.BLEND_IN, Phase.RUN, Phase.BLEND_OUT)
+COMMANDING = (*MOVING, Phase.RELEASE)
+ENDED = (Phase.DAMP, Phase.STOPPED)
+_WAITING = (Phase.CONNECT, Phase.IDLE)
+_FAULTS = (Trigger.FAULT, Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG, Trigger.NOT_FOLLOWING)
+
+# Phases, triggers, next phase (None: the same one), action. All triggers: those that no row above has for the phase.
+TRANSITIONS: tuple[tuple[tuple[Phase, ...], tuple[Trigger, ...], Phase | None, Action], ...] = (
+    ((Phase.CONNECT,), (Trigger.CONSENT,), Phase.IDLE, Action.READ),
+    ((Phase.IDLE,), (Trigger.READY,), Phase.BLEND_IN, Action.BLEND_IN),
+    ((Phase.BLEND_IN,), (Trigger.ARRIVED,), Phase.RUN, Action.PLAY),
+    ((Phase.RUN,), (Trigger.RETURN,), Phase.BLEND_OUT, Action.GO_BACK),
+    ((Phase.RUN, Phase.BLEND_OUT), (Trigger.HAND_OVER,), Phase.RELEASE, Action.RELEASE),
+    ((Phase.RUN, Phase.BLEND_OUT), (Trigger.HOLD,), Phase.STOPPED, Action.HOLD),
+    ((Phase.RUN, Phase.BLEND_OUT), (Trigger.DAMP,), Phase.DAMP, Action.DAMP),
+    ((Phase.RELEASE,), (Trigger.RELEASED,), Phase.STOPPED, Action.SEND_NOTHING),
+    (MOVING, (Trigger.NOT_FOLLOWING,), Phase.RELEASE, Action.RELEASE_HERE),
+    ((Phase.RELEASE,), (Trigger.NOT_FOLLOWING,), Phase.DAMP, Action.DAMP),
+    (COMMANDING, (Trigger.FAULT,), Phase.DAMP, Action.DAMP),
+    (COMMANDING, (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG), Phase.STOPPED, Action.SEND_NOTHING),
+    (_WAITING, _FAULTS, Phase.STOPPED, Action.SEND_NOTHING),
+    ((Phase.DAMP,), (Trigger.DAMPED,), Phase.STOPPED, Action.CONFIRM),
+    (ENDED, tuple(Trigger), None, Action.IGNORE),
+    ((*_WAITING, *COMMANDING), tuple(Trigger), None, Action.RAISE),
+)
+TABLE = {
+    (phase, trigger): (following or phase, action)
+    for phases, triggers, following, action in reversed(TRANSITIONS)
+    for phase in phases
+    for trigger in triggers
+}
+
+
+@dataclass(frozen=True)
+class ControlConfig:
+    """Timing of a controller."""
+
+    rate: float = 50.0
+    """Control periods per second."""
+    blend: float = 2.0
+    """Least duration of the moves to the first target and back, s."""
+    blend_speed: float = 0.5
+    """Fastest joint in those moves, rad/s."""
+    settle: float = 0.5
+    """Standing still at the first target before the run, s."""
+    blend_out: bool = True
+    """Go back to where the robot was found; a fault never waits for this."""
+    damp: float = 2.0
+    """Damping after a fault, or handing the arms back after a run, before the robot is let go, s."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.rate <= 1000:
+            raise UsageError(f"rate is {self.rate} Hz; give 1 to 1000")
+        for name in ("blend", "blend_speed", "damp"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"{name} is {getattr(self, name)}; give a positive number")

@@ -1,0 +1,332 @@
+"""Which commands may leave, and when none may: limits, and checks on arrays. No clock, no bus, no file is touched.
+
+A position command leaves only if it is within
+
+1. the joint range less a margin,
+2. the command rate: |u − u_previous| ≤ speed · dt,
+3. the torque that it asks for: |kp (u − q) − kd q̇| ≤ share · effort limit, wherever the joint can have got to since it
+   was measured, accelerating at most as `acceleration` says,
+
+all three, for every joint. Each is an interval; the command is moved into their intersection. Range and rate always
+intersect, because the previous command was within the range. The torque interval follows the measured joint and may
+leave the other two: the joint was pushed away, or moves so fast that braking alone exceeds the limit. Then there is no
+position command that is safe, and `feasible` is False: the controller damps the robot instead. So no limit ever yields
+to another. The size and rate of a model's correction are bounded before that, on the request; the three limits above
+come last and may cut a correction further.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.hw.control.driver import Fault, State
+from gaponet.robot.spec import RobotSpec
+
+ROUNDING = 1e-9  # of a bound: kept free so that a limit computed back from a command is not passed by rounding
+
+STILL = 4  # new states in which one joint must read the same before that can count; at a turn two may by chance
+
+
+@dataclass(frozen=True)
+class SafetyConfig:
+    """Limits and checks of states."""
+
+    margin: float = 0.02
+    """Distance kept from each end of a joint's range, rad."""
+    speed: float = 5.0
+    """Fastest change of a command, rad/s."""
+    torque_share: float = 0.95
+    """Share of a joint's effort limit that a command may ask for."""
+    acceleration: float = 50.0
+    """Fastest acceleration of a joint, rad/s²: how wrong an old state may be."""
+    delta: float = 0.5
+    """Largest correction of a model, rad."""
+    delta_rate: float = 2.0
+    """Fastest change of a model's correction, rad/s."""
+    stale: float = 2.0
+    """Control periods after which a state is too old."""
+    frozen: int = 2
+    """Control periods with new messages but equal readings until a state counts as frozen; 0: never."""
+    frozen_travel: float = 0.3
+    """How far a command may move while nothing moves, rad, on coarse encoders whose readings may repeat."""
+    frozen_joint: float = 0.1
+    """How far one joint's command or velocity may move on while its position stands still, rad, on fine encoders."""
+    joint_speed: float = 12.0
+    """A joint that moves faster between two states has jumped, rad/s."""
+    jump: float = 0.05
+    """Distance allowed beyond that before it counts as a jump, rad."""
+    temperature: float = 85.0
+    """Hottest motor, °C."""
+    tilt: float = 0.7
+    """Largest lean of the trunk, rad."""
+    tracking: float = 0.6
+    """Largest |command − measured|, rad, …"""
+    tracking_time: float = 0.25
+    """… for longer than this, s."""
+    following: float = 0.25
+    """Share of its command's way that a joint must go along, on robots that do not say what they were told; 0: not
+    watched, for joints that press on something."""
+    overrun: float = 2.0
+    """Control periods by which a cycle may start late."""
+    refused: int = 20
+    """Messages with a wrong checksum within one second."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if (
+                not np.isfinite(value)
+                or value < 0
+                or (value == 0 and name not in ("margin", "jump", "frozen", "following"))
+            ):
+                raise UsageError(f"safety: {name} is {value}; give a positive number")
+        if self.torque_share > 1:
+            raise UsageError(f"safety: torque_share is {self.torque_share}; give at most 1, the effort limit itself")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of the commands to some joints, (n) each: rad, rad, rad/s, N·m, N·m/rad, N·m·s/rad, rad, rad/s, rad/s²."""
+
+    low: Array
+    high: Array
+    speed: Array
+    effort: Array
+    kp: Array
+    kd: Array
+    delta: Array
+    delta_rate: Array
+    acceleration: Array
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotSpec,
+        joints: tuple[str, ...],
+        config: SafetyConfig,
+        gains: tuple[Array, Array] | None = None,
+        qpos_range: Array | None = None,
+    ) -> Limits:
+        """Limits of a robot's joints, in the order of `joints`.
+
+        Args:
+            robot: Ranges and effort limits.
+            gains: kp and kd of the real servos, all joints (n) each; default the robot's, before identification.
+            qpos_range: Ranges of the real joints, all (n, 2) rad, within the robot's; default those of the MJCF alone.
+        """
+        nominal = robot.nominal or robot
+        kp, kd = gains or (nominal.kp, nominal.kd)
+        at = robot.index(joints)
+        ranges = np.stack([robot.qpos_range, robot.qpos_range if qpos_range is None else qpos_range])[:, at]
+        low, high = ranges[..., 0].max(axis=0) + config.margin, ranges[..., 1].min(axis=0) - config.margin
+        if (low > high).any():
+            joint = joints[int(np.argmax(low > high))]
+            raise UsageError(f"safety: margin {config.margin} leaves nothing of the range of {joint}; make it smaller")
+        full = lambda value: np.full(len(joints), value)  # noqa: E731
+        return cls(
+            low, high, full(config.speed), config.torque_share * nominal.effort_limit[at], kp[at], kd[at],
+            full(config.delta), full(config.delta_rate), full(config.acceleration),
+        )  # fmt: skip
+
+
+class Limited(NamedTuple):
+    """ctrl (..., n): what may be sent where feasible; else the previous command within range, which must not be sent.
+
+    feasible (..., n): a command within all three limits exists. cut (..., n): the request was changed.
+    """
+
+    ctrl: Array
+    feasible: Array
+    cut: Array
+
+
+def limit_delta(delta: Array, previous: Array, dt: float, limits: Limits) -> Array:
+    """A correction (..., n) rad bounded in size and in rate from the previous one; NaN becomes the previous one."""
+    step = limits.delta_rate * dt
+    wanted = np.clip(np.where(np.isfinite(delta), delta, previous), previous - step, previous + step)
+    return np.clip(wanted, -limits.delta, limits.delta)
+
+
+def limit_command(
+    target: Array, previous: Array, qpos: Array, qvel: Array, dt: float, limits: Limits, age: Array | float = 0.0
+) -> Limited:
+    """The nearest command to `target` within range, rate and torque, or the statement that there is none.
+
+    Args:
+        target: Wanted, (..., n) rad.
+        previous: The last command, (..., n) rad; one outside the range counts as at its end.
+        qpos, qvel: Measured, (..., n) rad and rad/s.
+        dt: Control period, s.
+        age: Age of the state when the command leaves, s, or (..., n).
+    """
+    before = np.clip(previous, limits.low, limits.high)
+    step = limits.speed * dt * (1 - ROUNDING)
+    low, high = np.maximum(limits.low, before - step), np.minimum(limits.high, before + step)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        brake, half = limits.kd * qvel / limits.kp, limits.effort * (1 - ROUNDING) / limits.kp
+        # As measured, and where the joint can be by now: it went on and may have accelerated either way.
+        spread = limits.acceleration * age * (age / 2 + limits.kd / limits.kp)
+        for centre, width in ((qpos + brake, half), (qpos + qvel * age + brake, half - spread)):
+            rounding = ROUNDING * np.abs(centre)
+            low, high = np.maximum(low, centre - width + rounding), np.minimum(high, centre + width - rounding)
+        finite = np.isfinite(target) & np.isfinite(previous) & np.isfinite(qpos) & np.isfinite(qvel)
+        feasible = finite & (low <= high)
+        ctrl = np.where(feasible, np.minimum(np.maximum(target, low), high), before)
+    return Limited(ctrl, feasible, ctrl != target)
+
+
+def damping(kd: Array, qvel: Array, effort: Array) -> Array:
+    """Damping gains (n) at most kd whose torque kd |q̇| stays within the effort limits; kd where q̇ is unknown."""
+    speed = np.abs(np.nan_to_num(qvel, nan=0.0, posinf=0.0, neginf=0.0))
+    return np.minimum(kd, effort / np.maximum(speed, 1e-6))
+
+
+# Kinds of faults, which docs/deploy-safety.md explains. SOFT: no fault of the robot itself; one that cannot brake is
+# lowered then, instead of let fall at once. ASTRAY: a joint did not go where it was sent; what was recorded is no data.
+SOFT = ("stale", "overrun", "suspend", "checksum", "target", "silence", "driver", "obedience", "error", "stop")
+FAULTS = (*SOFT, "frozen", "nan", "jump", "temperature", "tracking", "torque", "plan", "robot", "tilt")
+ASTRAY = ("obedience", "frozen", "jump", "tracking")
+
+
+class Watch:
+    """Checks of successive states; the first fault is returned, and it is the caller who remembers it."""
+
+    def __init__(
+        self, joint_names: tuple[str, ...], commanded: Array, dt: float, config: SafetyConfig, noisy: bool = True
+    ) -> None:
+        """
+        Args:
+            joint_names: Names of all joints, (n).
+            commanded: Index of the commanded ones.
+            dt: Control period, s.
+            noisy: Equal readings mean frozen at once; else only when the command has moved on (frozen_travel).
+        """
+        self.names, self.commanded, self.dt, self.config, self.noisy = joint_names, commanded, dt, config, noisy
+        self._last: State | None = None
+        self._equal, self._travel = 0, np.zeros(len(commanded))
+        self._ctrl: Array | None = None
+        self._anchor: Array | None = None
+        self._glided, self._still = np.zeros(len(commanded)), np.zeros(len(commanded), int)
+        self._astray = 0.0
+        self._refused: list[tuple[float, int]] = []
+
+    def check(self, now: float, state: State, ctrl: Array | None, late: float = 0.0) -> Fault | None:
+        """What is wrong at the start of a control period.
+
+        Args:
+            now: s.
+            ctrl: The command that holds since the last period, (len(commanded),) rad; None where there is none.
+            late: How late this period starts, s.
+        """
+        fault = (
+            self.overrun(late)
+            or self._stale(now, state)
+            or self._finite(state)
+            or state.fault
+            or self._tilt(state)
+            or self._jump(state)
+            or self._hot(state)
+            or self._frozen(state, ctrl)
+            or self._frozen_joint(state, ctrl)
+            or self._tracking(state, ctrl)
+            or self._checksum(now, state)
+        )
+        self._last, self._ctrl = state, ctrl
+        return fault
+
+    def overrun(self, late: float) -> Fault | None:
+        """What is wrong if a period that was due `late` s ago has not sent its command yet."""
+        if late > self.config.overrun * self.dt:
+            return Fault("overrun", f"the period was {late * 1e3:.0f} ms late; make the loop lighter or slower")
+        return None
+
+    def _stale(self, now: float, state: State) -> Fault | None:
+        age = now - state.time
+        if age > self.config.stale * self.dt * (1 + ROUNDING):
+            return Fault("stale", f"the newest state is {age * 1e3:.0f} ms old, {age / self.dt:.1f} control periods")
+        return None
+
+    def _finite(self, state: State) -> Fault | None:
+        for name in ("qpos", "qvel", "tau"):
+            bad = ~np.isfinite(getattr(state, name))
+            if bad.any():
+                return Fault("nan", f"{name} of {self.names[int(bad.argmax())]} is not a number")
+        return None
+
+    def _tilt(self, state: State) -> Fault | None:
+        if not state.tilt <= self.config.tilt:
+            return Fault("tilt", f"the robot leans by {state.tilt:.2f} rad")
+        return None
+
+    def _jump(self, state: State) -> Fault | None:
+        if self._last is None:
+            return None
+        passed = max(state.time - self._last.time, 0.0)
+        moved = np.abs(state.qpos - self._last.qpos)
+        worst = int(moved.argmax())
+        if moved[worst] > self.config.joint_speed * passed + self.config.jump:
+            return Fault("jump", f"{self.names[worst]} moved {moved[worst]:.3f} rad in {passed * 1e3:.0f} ms")
+        return None
+
+    def _hot(self, state: State) -> Fault | None:
+        worst = int(np.nan_to_num(state.temperature, nan=-np.inf).argmax())
+        if state.temperature[worst] > self.config.temperature:
+            return Fault("temperature", f"{self.names[worst]} is at {state.temperature[worst]:.0f} °C; let it cool")
+        return None
+
+    def _frozen(self, state: State, ctrl: Array | None) -> Fault | None:
+        last = self._last
+        if last is None or state.time <= last.time or not self.config.frozen:
+            return None
+        if any(not np.array_equal(getattr(state, name), getattr(last, name)) for name in ("qpos", "qvel", "tau")):
+            self._equal, self._travel[:] = 0, 0.0
+            return None
+        self._equal += 1
+        if ctrl is not None and self._ctrl is not None:
+            self._travel += np.abs(ctrl - self._ctrl)
+        if self._equal < self.config.frozen or not (self.noisy or self._travel.max() > self.config.frozen_travel):
+            return None
+        return Fault("frozen", f"{self._equal + 1} states in a row read exactly the same")
+
+    def _frozen_joint(self, state: State, ctrl: Array | None) -> Fault | None:
+        """Fault where one encoder stands still while its command moves on or its velocity says that the joint moves."""
+        qpos, last = state.qpos[self.commanded], self._last
+        if last is not None and state.time <= last.time:
+            return None  # the same state again
+        if last is None or ctrl is None or not self.noisy:
+            self._anchor = ctrl
+            return None
+        moved = qpos != last.qpos[self.commanded]
+        anchor = ctrl if self._anchor is None else np.where(moved, ctrl, self._anchor)
+        glided = self._glided + state.qvel[self.commanded] * (state.time - last.time)
+        self._anchor, self._glided = anchor, np.where(moved, 0.0, glided)
+        self._still = np.where(moved, 0, self._still + 1)
+        beyond = np.where(self._still < STILL, 0.0, np.maximum(np.abs(ctrl - anchor), np.abs(self._glided)))
+        worst = int(beyond.argmax())
+        if beyond[worst] <= self.config.frozen_joint:
+            return None
+        joint = self.names[int(self.commanded[worst])]
+        far = f"{beyond[worst]:.2f} rad"
+        return Fault("frozen", f"the position of {joint} stands still while its command or velocity goes {far}")
+
+    def _tracking(self, state: State, ctrl: Array | None) -> Fault | None:
+        error = np.zeros(1) if ctrl is None else np.abs(ctrl - state.qpos[self.commanded])
+        worst = int(error.argmax())
+        self._astray = self._astray + self.dt if error[worst] > self.config.tracking else 0.0
+        if self._astray > self.config.tracking_time:
+            joint = self.names[int(self.commanded[worst])]
+            return Fault("tracking", f"{joint} is {error[worst]:.2f} rad from its command; is it blocked or unpowered?")
+        return None
+
+    def _checksum(self, now: float, state: State) -> Fault | None:
+        self._refused = [*(r for r in self._refused if now - r[0] <= 1.0), (now, state.refused)]
+        count = state.refused - self._refused[0][1]
+        if count > self.config.refused:
+            return Fault(
+                "checksum", f"{count} messages with a wrong checksum within a second; check cable and firmware"
+            )
+        return None

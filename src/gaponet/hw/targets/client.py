@@ -1,0 +1,101 @@
+"""The other end of `gaponet run --targets zmq`: a robot as a policy or a teleoperator in another process has it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import zmq
+
+from gaponet.base.arrays import Array
+from gaponet.hw.control.driver import DriverError, State
+from gaponet.hw.targets.zeromq import ADDRESS
+
+
+class RemoteRobot:
+    """States come from a robot that `gaponet run --targets zmq` commands, targets go to it.
+
+        with RemoteRobot() as robot:
+            for state in robot:  # the newest, once per control period of the robot
+                robot.send(policy(state.qpos, state.qvel))
+
+    A policy that is slow, stalls or dies leaves the robot held, then damped; it never leaves it waiting.
+
+    Attributes:
+        joint_names: All joints of the robot, in the order of every array; known from the first state on.
+        commanded: The ones among them that targets may be for.
+        ended: Why the run is over, where it told.
+    """
+
+    def __init__(self, address: str = ADDRESS, patience: float = 10.0) -> None:
+        """
+        Args:
+            address: Where `gaponet run` listens.
+            patience: s to wait for a state.
+        """
+        self.address, self.patience = address, patience
+        self.joint_names: tuple[str, ...] = ()
+        self.commanded: tuple[str, ...] = ()
+        self.ended = ""
+        self._context = zmq.Context()
+        self._socket = self._context.socket(zmq.DEALER)
+        for option, value in ((zmq.LINGER, 200), (zmq.SNDHWM, 8), (zmq.RCVHWM, 8)):
+            self._socket.setsockopt(option, value)
+        self._socket.connect(address)
+        self._say({})
+
+    def __enter__(self) -> RemoteRobot:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close(end=kind is None)
+
+    def __iter__(self) -> Iterator[State]:
+        """The newest state, whenever there is a newer one; until the run is over.
+
+        Raises:
+            DriverError: No state came for `patience` s.
+        """
+        while (state := self._newest()) is not None:
+            yield state
+
+    def send(self, target: Mapping[str, float] | Array) -> None:
+        """Where the robot shall be now: joint → rad, or an array (n) of all joints, rad, of which the commanded count.
+
+        Raises:
+            DriverError: An array before the first state: its joints' names are not known.
+        """
+        if not isinstance(target, Mapping):
+            if not self.joint_names:
+                raise DriverError("take a state first: only then the order of the joints is known; or name them")
+            named = dict(zip(self.joint_names, np.asarray(target, float).tolist(), strict=True))
+            target = {name: named[name] for name in self.commanded}
+        self._say({"target": {name: float(value) for name, value in target.items()}})
+
+    def close(self, end: bool = True) -> None:
+        """Leave. With `end` the robot goes back to where it was found; else it holds, then damps."""
+        if end and not self.ended:
+            self._say({"end": True})
+        self._context.destroy()
+
+    def _say(self, message: dict[str, object]) -> None:
+        with contextlib.suppress(zmq.Again):  # nobody reads; the next target is newer
+            self._socket.send(json.dumps({"time": time.monotonic()} | message).encode(), zmq.NOBLOCK)
+
+    def _newest(self) -> State | None:
+        if not self._socket.poll(round(1e3 * self.patience)):
+            raise DriverError(
+                f"no state from {self.address} in {self.patience:g} s; is gaponet run --targets zmq there?"
+            )
+        with contextlib.suppress(zmq.Again):
+            while True:
+                said = json.loads(self._socket.recv(zmq.NOBLOCK))
+                self.ended = said.get("end", "")
+                if self.ended:
+                    return None
+        self.joint_names, self.commanded = tuple(said["joint_names"]), tuple(said["commanded"])
+        qpos, qvel, tau = (np.array(said[name], float) for name in ("qpos", "qvel", "tau"))
+        return State(said["time"], qpos, qvel, tau, np.full_like(qpos, np.nan))

@@ -1,0 +1,1 @@
+"""Networks: observation, sensors, operator, baselines, the loop around them, the artifact that ships, training."""

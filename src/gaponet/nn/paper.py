@@ -1,0 +1,195 @@
+"""The network of the GAPONet paper in its literal form: `gaponet train … --model paper`.
+
+    (μ, log σ²) = f(A, Q, V, P, J),  S ~ N(μ, σ²)      (1)  sensor predictor, 128-128
+    b = Branch(S)                                      (2)  branch, 256-256-256-16n, ELU after the last layer as well
+    y = Trunk(A) or Trunk(P, A)                        (3)  trunk, 128-128-128-16n, linear output
+    Δa_j = Σ_i b_ij y_ij,  i = 1 … p = 16              (4)  no bias
+
+S holds the answers of the simulator to m = 20 probe targets (nn/sensor.py): positions and velocities of all n joints
+after one control period, (m, 2n). The branch sees these values alone, so all that it knows of the state comes through
+them. Targets A, positions Q, and velocities V are the present state and the H frames of the observation: 20 + 30 H
+numbers for n = 10, one more with the payload P. The joint index J is the place in the output: one pass serves all
+joints.
+
+The paper also names the recorded state, Q_real and V_real, in (1). The critic of PPO sees both (nn/training/env.py).
+The predictor does not: the simulator's answers do not depend on them. With `real_state` the branch sees them beside S.
+
+The probe targets are q + e_k, k = 1 … m. `sensor_source` is one of:
+
+    predicted   e_k are fixed; one predictor gives the answers to all
+    fixed       e_k are fixed; the simulator itself gives S: what a perfect predictor would be worth
+    learned     e_k are parameters that PPO trains, within ±probe_limit. The predictor takes one e_k beside the state
+                and gives its 2n answers. It is fitted to random e_k, then frozen; gradients pass through it.
+
+The literal form lacks two inputs of the default network. With `branch_observation` the branch also sees the
+observation, and thus its history, relative to q. With `relative_action` the trunk sees A − q instead of A.
+
+S is sampled in training and is the mean in evaluation and export. Δ_max is a safety limit: exact clipping, in
+evaluation and export; training reports the share of corrections at the limit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from gaponet.base.arrays import Array
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.layers import DeltaNet, Standardise, dense
+from gaponet.nn.sensor import ProbeOracle
+
+PREDICTOR, BRANCH, TRUNK = (128, 128), (256, 256, 256), (128, 128, 128)  # widths of hidden layers
+REAL_UNITS = (0.05, 0.3)  # rad, rad/s: differences of recorded and simulated state that count as 1
+RELEASED_EPSILON = 0.01  # of the published network's normaliser, (x − mean) / (std + ε)
+
+
+class SensorPredictor(nn.Module):
+    """Equation (1): mean and log-variance of the standardised sensor values."""
+
+    def __init__(self, inputs: int, hidden: tuple[int, ...], sensors: int) -> None:
+        super().__init__()
+        self.outputs = Standardise(sensors)
+        self.net = dense(inputs, hidden, 2 * sensors)
+
+    def forward(self, observed: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, inputs) → mean and log-variance, (B, sensors) each."""
+        return self.distribution(self.net(observed))
+
+    @staticmethod
+    def distribution(outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs of the net, (…, 2 sensors) → mean and log-variance, (…, sensors) each."""
+        mean, log_var = outputs.chunk(2, dim=-1)
+        return mean, log_var.clamp(-10.0, 4.0)
+
+    def mean(self, observed: Tensor) -> Tensor:
+        """(B, inputs) → the mean alone, (B, sensors)."""
+        hidden: nn.Module = self.net[:-1]
+        head: Any = self.net[-1]
+        return linear(hidden(observed), head.weight.chunk(2)[0], head.bias.chunk(2)[0])
+
+
+class PaperNet(DeltaNet):
+    """Equations (1) to (4). Inputs are standardised and otherwise as they are: absolute positions and targets.
+
+    `features` (relative to q, standardised) serve the critic of PPO, branch_observation and relative_action.
+
+    Attributes:
+        probes: atanh(e_k / probe_limit) of learned probes, (m, n); else None.
+    """
+
+    def __init__(self, config: ModelConfig, n: int) -> None:
+        super().__init__(config, n)
+        at, sensors, outputs = self.features.layout, config.sensor_dim(n), config.num_basis * n
+        self.seen = at.observation
+        # {P, A}: in x the payload, where it is observed, stands before the action.
+        self.query = slice(at.payload.start if config.payload_trunk else at.action.start, at.action.stop)
+        asked = self.query.stop - self.query.start
+        self.observed, self.asked = Standardise(self.seen.stop), Standardise(asked)
+        self.probes: nn.Parameter | None = None
+        if config.asks_simulator:
+            self.answers = Standardise(sensors)
+        elif config.sensor_source == "learned":
+            start = torch.from_numpy(ProbeOracle.offsets_of(config, n)).float() / config.probe_limit
+            self.probes = nn.Parameter(start.atanh())
+            self.predictor = SensorPredictor(self.seen.stop + n, PREDICTOR, 2 * n)
+        else:
+            self.predictor = SensorPredictor(self.seen.stop, PREDICTOR, sensors)
+        self.real_units = [*(unit for unit in REAL_UNITS for _ in range(n)), 1.0]
+        self.beside = self.seen.stop * config.branch_observation + len(self.real_units) * config.real_state
+        self.branch = nn.Sequential(*dense(self.beside + sensors, BRANCH, outputs), nn.ELU())
+        self.trunk = dense(asked, TRUNK, outputs, zero=True)
+
+    def fit_inputs(self, x: Tensor) -> None:
+        super().fit_inputs(x)
+        self.observed.fit(x[:, self.seen])
+        self.asked.fit(x[:, self.query])
+        if self.config.asks_simulator:
+            self.answers.fit(x[:, self.features.layout.sensors], floor=1e-6)
+
+    def sensor_inputs(self, x: Tensor) -> Tensor:
+        z = self.observed(x[:, self.seen])
+        return z + self.features.noise * torch.randn_like(z) if self.features.noise else z
+
+    def sensors(self, x: Tensor, z: Tensor) -> Tensor:
+        """Equation (1): S, standardised, (B, 2nm): a sample in training, else the mean; or the simulator's answers.
+
+        Probes that are learned change after `prepare`. So this is then the input of `probed`: z = sensor_inputs(x) and,
+        in training, the noise of the sample.
+        """
+        if self.config.asks_simulator:
+            return self.answers(x[:, self.features.layout.sensors])
+        if not self.training:
+            return z if self.probes is not None else self.predictor.mean(z)
+        noise = torch.randn(len(z), self.config.sensor_dim(self.n), device=z.device)
+        if self.probes is not None:
+            return torch.cat([z, noise], dim=1)
+        mean, log_var = self.predictor(z)
+        return mean + noise * (0.5 * log_var).exp()
+
+    def probed(self, given: Tensor) -> Tensor:
+        """What `sensors` returns for learned probes → S, (B, 2nm)."""
+        assert self.probes is not None
+        seen, first = self.seen.stop, self.predictor.net[0]
+        of_state, of_probe = first.weight.split([seen, self.n], dim=1)
+        state, probes = linear(given[:, :seen], of_state), linear(self.probes.tanh(), of_probe, first.bias)
+        mean, log_var = SensorPredictor.distribution(self.predictor.net[1:](state.unsqueeze(1) + probes))  # (B, m, 2n)
+        if not self.training:
+            return mean.flatten(1)
+        return torch.addcmul(mean.flatten(1), given[:, seen:], (0.5 * log_var).exp().flatten(1))
+
+    def prepare(self, x: Tensor) -> Tensor:
+        """x → [query | what the branch sees beside S | S]."""
+        z, config = self.sensor_inputs(x), self.config
+        relative = self.features(x) if config.branch_observation or config.relative_action else x
+        beside = [relative[:, self.seen]] if config.branch_observation else []
+        beside += [x[:, self.features.layout.real] / x.new_tensor(self.real_units)] if config.real_state else []
+        query = relative[:, self.query] if config.relative_action else self.asked(x[:, self.query])
+        return torch.cat([query, *beside, self.sensors(x, z)], dim=1)
+
+    def correct(self, prepared: Tensor) -> Tensor:
+        shape, asked = (-1, self.config.num_basis, self.n), self.query.stop - self.query.start
+        seen = prepared[:, asked:]
+        if self.probes is not None:
+            seen = torch.cat([seen[:, : self.beside], self.probed(seen[:, self.beside :])], dim=1)
+        b = self.branch(seen).reshape(shape)  # (2)
+        y = self.trunk(prepared[:, :asked]).reshape(shape)  # (3)
+        return self.bounded((b * y).sum(1))  # (4)
+
+
+def released_network(weights: dict[str, Array]) -> PaperNet:
+    """Return the network that the authors published (isaac-sim2real/sage, feature/add-plug-in), ten joints.
+
+    Their observation has no present velocities: these columns get weight zero. Their predictor has no variance. Their
+    normaliser of [S | A] is the identity but for its ε: it divides by 1 + 0.01.
+
+    Args:
+        weights: The arrays of their state dict, by its names.
+    """
+    net = PaperNet(ModelConfig(kind="paper", payload_input=False, delta_max=10.0), 10).eval()
+    state = net.state_dict()
+    theirs = {"predictor.net": "sensor_model", "trunk": "trunk_net.net", "branch": "branch_net.branches.0"}
+    for own, name in theirs.items():
+        for layer in (0, 2, 4, 6):
+            fusion = own == "branch" and layer == 6
+            source = "branch_net.fusion.0" if fusion else f"{name}.{layer}"
+            for part in ("weight", "bias"):
+                if f"{source}.{part}" in weights:
+                    state[f"{own}.{layer}.{part}"] = torch.from_numpy(weights[f"{source}.{part}"])
+    first, n = state["predictor.net.0.weight"], net.n
+    state["predictor.net.0.weight"] = torch.cat([first[:, :n], torch.zeros(len(first), n), first[:, n:]], dim=1)
+    for part in ("weight", "bias"):
+        mean = state[f"predictor.net.4.{part}"]
+        state[f"predictor.net.4.{part}"] = torch.cat([mean, torch.zeros_like(mean)])
+    state["branch.0.weight"] = state["branch.0.weight"] / (1 + RELEASED_EPSILON)
+    state["asked.std"] = state["asked.std"] * (1 + RELEASED_EPSILON)
+    net.load_state_dict(state)
+    return net
+
+
+def released_inputs(observation: Array, action: Array) -> Tensor:
+    """Return x = [o_t | a_t] for the published network from its own observation (B, 130) and action (B, 10)."""
+    o, a = torch.from_numpy(observation), torch.from_numpy(action)
+    return torch.cat([o[:, :10], torch.zeros_like(a), o[:, 10:], a], dim=1)

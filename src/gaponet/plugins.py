@@ -1,0 +1,87 @@
+"""Extensions by other packages: log formats, drivers and methods.
+
+A package names them in its metadata, as entry points of one of three groups:
+
+    gaponet.formats   a module that reads logs (gaponet.data.formats says what it has)
+    gaponet.drivers   a function (robot, **options) that returns a Driver (gaponet.hw.control.driver)
+    gaponet.methods   a function that `gaponet bench real --method NAME` compares (docs/benchmark.md)
+
+A built-in name cannot be replaced. A failure of an extension is logged once as a warning, and gaponet continues
+without the extension.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from gaponet.base.errors import UsageError
+from gaponet.base.text import plain
+
+GROUPS = FORMATS, DRIVERS, METHODS = "gaponet.formats", "gaponet.drivers", "gaponet.methods"
+Result = TypeVar("Result")
+_WARNED: set[str] = set()
+
+
+def registry(group: str, builtin: Mapping[str, str]) -> dict[str, str]:
+    """Return name → "module:attribute" of a group: the built-in ones, then those of extensions."""
+    found = dict(builtin)
+    for point in _points(group):
+        if found.setdefault(point.name, point.value) != point.value:
+            _warn(f"{_package(point)}: '{point.name}' of {group}", "exists already and is not replaced")
+    return found
+
+
+def require(group: str, name: str, builtin: Mapping[str, str], what: str) -> Any:
+    """Return the object that a group has under a name.
+
+    Raises:
+        UsageError: There is no such name, or the extension that brings it is broken.
+    """
+    known = registry(group, builtin)
+    if name not in known:
+        raise UsageError(f"no {what} '{name}'; use one of {', '.join(known)}")
+    found = attempt(known[name], lambda: load(known[name]), None)
+    if found is None:
+        raise UsageError(f"the package that brings {what} '{name}' is broken; update or uninstall it")
+    return found
+
+
+def load(where: str) -> Any:
+    """Return the object that `module:attribute` names, or the module without an attribute."""
+    module, _, attribute = where.partition(":")
+    return getattr(import_module(module), attribute) if attribute else import_module(module)
+
+
+def attempt(where: str, call: Callable[[], Result], otherwise: Result) -> Result:
+    """Return call(), or `otherwise` and a warning where it fails and `where` belongs to an extension."""
+    try:
+        return call()
+    except (Exception, SystemExit) as error:
+        package = next((_package(p) for group in GROUPS for p in _points(group) if p.value == where), "")
+        if not package:
+            raise
+        _warn(f"{package}: {where}", f"failed ({type(error).__name__}: {error}); gaponet continues without it")
+        return otherwise
+
+
+@cache
+def _points(group: str) -> tuple[EntryPoint, ...]:
+    return tuple(sorted(entry_points(group=group), key=lambda point: (_package(point), point.name)))
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else point.module
+
+
+def _warn(what: str, text: str) -> None:
+    """Log a warning, the first of each thing, in the main process alone."""
+    from multiprocessing import parent_process
+
+    if what not in _WARNED and parent_process() is None:
+        logging.getLogger("gaponet").warning("%s", plain(f"Warning: {what} {text}"))
+    _WARNED.add(what)

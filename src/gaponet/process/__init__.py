@@ -1,1 +1,0 @@
-"""Processes that gaponet starts, and what they may."""

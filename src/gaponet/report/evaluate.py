@@ -1,0 +1,233 @@
+"""Nominal, identified and learned simulators side by side: free runs with the shipped artifact (ONNX, not torch)."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.base.files import whole, writing
+from gaponet.base.json_file import write_json
+from gaponet.base.progress import Progress, noted, silent
+from gaponet.data.pair import Twin
+from gaponet.data.repeatability import MOVED
+from gaponet.data.sequence import Sequence
+from gaponet.data.store import Dataset
+from gaponet.deploy.transfer import TransferCorrector
+from gaponet.nn import calibration
+from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.report.candidate import Candidate, choose, is_robot
+from gaponet.report.methods import IDENTIFIED, title
+from gaponet.report.verdict import LEARNED
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.metrics import Run, runs, summary
+from gaponet.sim.model import model_hash
+from gaponet.sim.replay import Corrector, replay
+
+T = TypeVar("T")
+SHOWN = 8  # sequences whose trajectories are kept for the report
+ORDER = (
+    "nominal",
+    "delay_offset",
+    "identified",
+    *LEARNED,
+    "calibrated",
+    "uncorrected",
+    "transfer",
+)  # of tables and figures
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Free runs by method, their metrics, and the corrections applied by each learned model.
+
+    Attributes:
+        result: methods → method → metrics (mpjae rad, q_dis rad·s, …), and by_joint, by_motion, … the same; unseen says
+            whether no recording was used in training.
+        runs: Method → free runs, one per sequence.
+        ctrl: Commands, (T, n operated) rad, one array per sequence.
+        deltas: Method → corrections applied, (T, n operated) rad, one array per sequence.
+    """
+
+    result: dict[str, Any]
+    runs: dict[str, list[Run]]
+    ctrl: list[Array]
+    deltas: dict[str, list[Array]]
+
+    def save(self, folder: Path) -> None:
+        """Write metrics.json and trajectories.npz, all that the report needs, into a run or robot folder."""
+        reals = self.runs["nominal"]
+        picked = evenly(list(range(len(reals))), SHOWN)
+        shown = [reals[i].meta for i in picked]
+        result = self.result | {
+            "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+            "shown": [
+                {"motion": m.motion, "unit_id": m.unit_id, "payload_mass": m.payload_mass, "dt": reals[i].dt}
+                for i, m in zip(picked, shown, strict=True)
+            ],
+        }
+        arrays = {}
+        for row, i in enumerate(picked):
+            arrays[f"{row}/recorded"] = reals[i].qpos_real
+            arrays[f"{row}/command"] = self.ctrl[i]
+            for name, part in self.runs.items():
+                arrays[f"{row}/{name}"] = part[i].qpos_sim
+            for name, delta in self.deltas.items():
+                arrays[f"{row}/delta/{name}"] = delta[i]
+        with writing(folder, "robot" if is_robot(folder) else "run"):
+            with whole(folder / "trajectories.npz") as temporary:
+                np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
+            write_json(folder / "metrics.json", result)
+
+
+def evaluate(
+    folders: ListOf[Path],
+    dataset: Dataset,
+    robot: RobotSpec,
+    motions: tuple[str, ...] = (),
+    progress: Progress = silent,
+    target: RobotSpec | None = None,
+    units: tuple[str, ...] = (),
+) -> Evaluation:
+    """Step every method through the chosen sequences, from the recorded start, the recording not looked at again.
+
+    Args:
+        folders: Identified robots and training runs; nothing that one of them was fitted or chosen on is chosen or
+            called unseen. The first one's test motions and delay + offset baseline apply.
+        robot: The dataset's, which must be theirs before identification: the baseline is theirs.
+        motions: Only these; default: the test motions of the dataset trained on; of another, all that was never
+            trained on.
+        target: Another simulator, to be shown as it is and with the first of folders transferred into it.
+        units: Only recordings of these.
+    """
+    dataset.require_robot(robot)
+    known: dict[str, Candidate] = {}
+    for path in folders:
+        one = Candidate.load(path, robot)
+        if one.method in known:
+            raise UsageError(f"{path}: a second run of {title(one.method)}; give runs of different methods")
+        known[one.method] = one
+    first = next(iter(known.values()))
+    models = {name: c.model for name, c in known.items() if c.model is not None}
+    nominal = first.robot.before_identification
+    entries, unseen = choose(list(folders), dataset, motions, units)
+    sequences = dataset.sequences(entries)
+    for (name, model), dt in itertools.product(models.items(), sorted({s.dt for s in sequences})):
+        model.require(known[name].robot, dt)
+    done_runs: dict[str, list[Run]] = {}
+    deltas: dict[str, list[Array]] = {}
+    op = robot.operated_index
+    ctrl = [s.ctrl[:, op] for s in sequences]
+    moved = [np.ptp(c, axis=0) > MOVED for c in ctrl]
+    simulators: dict[str, str] = {}
+    for name, simulator, corrector in itertools.chain(_methods(known, nominal), _transferred(target, first, nominal)):
+        simulators[name] = model_hash(simulator)
+        twins = replay(sequences, simulator, corrector, progress=noted(progress, name), lock_idle=True)
+        done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
+        if name in models:
+            deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
+    calibrated = first.calibrations()
+    if any(s.meta.unit_id in calibrated for s in sequences):
+        twins = _by_unit(sequences, first, calibrated, noted(progress, "calibrated"))
+        done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
+        simulators["calibrated"] = simulators[first.method]
+    methods = {name: summary(part, robot) for name, part in done_runs.items()}
+    result = {
+        "methods": methods,
+        "ratio_to_nominal": {name: m["mpjae"] / methods["nominal"]["mpjae"] for name, m in methods.items()},
+        "dataset": dataset.path.name,
+        "sequences": len(sequences),
+        "motions": sorted({s.meta.motion for s in sequences}),
+        "moves": dict(zip(robot.operated, map(int, np.sum(moved, axis=0)), strict=True)),
+        "unseen": unseen,
+        "virtual": any(s.meta.virtual for s in sequences),
+        "robot": robot.name,
+        "simulator_hash": model_hash(nominal),
+        "simulators": simulators,
+        "delta": {
+            name: _delta_summary(parts, sequences, models[name].config.delta_max) for name, parts in deltas.items()
+        },
+        "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
+        "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
+        "command": _command(folders, dataset.address or dataset.path, motions),
+    }
+    return Evaluation(result, done_runs, ctrl, deltas)
+
+
+def _command(folders: ListOf[Path], dataset: Path | str, motions: tuple[str, ...]) -> str:
+    """What a shell needs to repeat an evaluation."""
+    words = ["gaponet", "eval", str(folders[0]), str(dataset)]
+    words += ["--also", *map(str, folders[1:])] if len(folders) > 1 else []
+    return shlex.join(words + (["--motions", ",".join(motions)] if motions else []))
+
+
+def evenly(items: list[T], most: int) -> list[T]:
+    """All, or so many of them evenly spaced, the first and the last among them."""
+    if len(items) <= most:
+        return items
+    return [items[round(i)] for i in np.linspace(0, len(items) - 1, most)]
+
+
+def _methods(known: dict[str, Candidate], nominal: RobotSpec) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """Name, simulator and corrector of everything compared, in the order of ORDER."""
+    yield "nominal", nominal, None
+    folder = next(iter(known.values())).folder
+    if (folder / "delay_offset.json").is_file():
+        yield "delay_offset", nominal, DelayOffset.read(folder).corrector(nominal)
+    identified = {model_hash(c.robot): c.robot for c in known.values() if c.robot.nominal is not None}
+    if len(identified) > 1:
+        raise UsageError("these start from different identified simulators; compare those of one identification")
+    for robot in identified.values():
+        yield "identified", robot, None
+    for name in sorted(known, key=lambda name: ORDER.index(name.removeprefix(IDENTIFIED))):
+        if known[name].model is not None:
+            yield name, known[name].robot, known[name].corrector()
+
+
+def _transferred(
+    target: RobotSpec | None, first: Candidate, nominal: RobotSpec
+) -> Iterator[tuple[str, RobotSpec, Corrector | None]]:
+    """The same of another simulator, whose gains, where a log says others, change by as much as the nominal ones."""
+    if target is None:
+        return
+    simulator = replace(target, nominal=target.nominal or nominal)
+    if model_hash(target) != model_hash(nominal):
+        yield "uncorrected", simulator, None
+    yield "transfer", simulator, TransferCorrector(first.model or first.robot, simulator)
+
+
+def _by_unit(
+    sequences: list[Sequence],
+    one: Candidate,
+    calibrated: Mapping[str, calibration.Calibration],
+    progress: Callable[[int, int], None],
+) -> list[Twin]:
+    """The model in each unit's own simulator; in the common one where a unit is not calibrated."""
+    twins: dict[int, Twin] = {}
+    for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
+        rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
+        physics = calibrated[unit].robot(one.robot) if unit in calibrated else one.robot
+        part = replay([sequences[i] for i in rows], physics, one.corrector(), lock_idle=True)
+        twins |= dict(zip(rows, part, strict=True))
+        progress(len(twins), len(sequences))
+    return [twins[i] for i in range(len(sequences))]
+
+
+def _delta_summary(parts: list[Array], sequences: list[Sequence], limit: float) -> dict[str, float]:
+    """Size of the corrections: mean and largest |Δa| rad, mean rate rad/s, share of them at the limit Δ_max (rad)."""
+    dt = float(np.median([s.dt for s in sequences]))
+    return {
+        "mean": float(np.mean([np.abs(d).mean() for d in parts])),
+        "max": float(max(np.abs(d).max() for d in parts)),
+        "at_limit": float(np.mean([(np.abs(d) >= limit - 1e-6).mean() for d in parts])),
+        "rate": float(np.mean([np.abs(np.diff(d, axis=0)).mean() for d in parts]) / dt),
+    }

@@ -1,0 +1,1 @@
+"""Figures: style, charts, and what is drawn of datasets, gaps and evaluations."""

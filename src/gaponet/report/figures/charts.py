@@ -1,0 +1,180 @@
+"""What is drawn more than once: bars by group, lines over an amount, motions against a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.spread import Spread
+from gaponet.report.figures.style import DASHED, DOTTED, LETTER, figure, legend, styled
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
+LEAST = 0.06  # rad, of an axis of positions
+
+
+@styled
+def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
+    """Bars with error bars, the methods of each group side by side."""
+    word = max((len(word) for group in groups for word in group.split()), default=0)
+    fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3), 3.3)
+    ax = fig.subplots()
+    draw_bars(ax, groups, methods)
+    ax.set_ylabel(axis)
+    ax.set_title(title)
+    legend(fig)
+    return fig
+
+
+def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
+    """The same into axes that are there, with labels of a size of their own."""
+    width = 0.84 / len(methods)
+    for i, (label, (colour, values)) in enumerate(methods.items()):
+        x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=spreads(values), color=colour, label=label,
+               error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
+    ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
+    ax.tick_params(axis="x", length=0)
+    ax.grid(axis="x", visible=False)
+
+
+def spreads(values: ListOf[Spread]) -> Array | None:
+    """Lengths of error bars; None where nothing was measured twice."""
+    std = np.array([v.std if v.std == v.std else 0.0 for v in values])
+    return std if std.any() else None
+
+
+@dataclass(frozen=True)
+class Course:
+    """How one joint went: rad, (T,)."""
+
+    found: Mapping[str, Array]
+    """Positions by method."""
+    base: Array
+    """The reference's."""
+    command: Array | None = None
+    corrections: Mapping[str, Array] = field(default_factory=dict)
+    """Δa by method, (up to T,)."""
+    zoom: slice | None = None
+    """Rows shown once more, larger; of all joints or of none."""
+
+
+@styled
+def against(
+    time: Array,
+    joints: Mapping[str, Course],
+    looks: Mapping[str, tuple[str, str]],
+    reference: str,
+    title: str = "",
+) -> Figure:
+    """Positions by method over time, a column per joint; below them how far each is from the reference, on one scale.
+
+    Args:
+        time: (T,) s.
+        joints: What the column is called → what it shows.
+        looks: Label and colour of each method, of the reference, and of "command".
+    """
+    some = next(iter(joints.values()))
+    rows = {"position, rad": 1.8, "zoom, rad": 1.6 * (some.zoom is not None), "error, mrad": 1.1,
+            "Δa, mrad": 0.9 * bool(some.corrections)}  # fmt: skip
+    rows = {label: height for label, height in rows.items() if height}
+    fig = figure(3.6 * len(joints), 1.0 + 1.1 * sum(rows.values()))
+    axes = fig.subplots(len(rows), len(joints), squeeze=False, height_ratios=list(rows.values()))
+    for column, (joint, course) in zip(axes.T, joints.items(), strict=True):
+        ax = dict(zip(rows, column, strict=True))
+        _positions(ax["position, rad"], time, course, looks, reference)
+        if course.zoom is not None:
+            _positions(ax["zoom, rad"], time, course, looks, reference, course.zoom)
+            ax["position, rad"].axvspan(*time[course.zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+        for method, values in course.found.items():
+            ax["error, mrad"].plot(time, (values - course.base) * 1e3, color=looks[method][1], lw=1.0)
+        ax["error, mrad"].axhline(0, color="#111111", lw=0.6)
+        for method, values in course.corrections.items():
+            ax["Δa, mrad"].plot(time[: len(values)], values * 1e3, color=looks[method][1], lw=0.9)
+        column[0].set_title(joint)
+        column[-1].set_xlabel("time, s")
+        for other in column:
+            other.set_xlim(time[0], time[-1]) if other is not ax.get("zoom, rad") else None
+    for row, label in zip(axes, rows, strict=True):
+        row[0].set_ylabel(label)
+        if label in ("error, mrad", "Δa, mrad"):
+            seen = max(abs(v) for ax in row for v in ax.dataLim.intervaly)
+            end = 1.08 * seen or 1.0
+            for ax in row:
+                ax.set_ylim(-end, end)
+    fig.align_ylabels(axes[:, 0])
+    legend(fig, title)
+    return fig
+
+
+def _positions(
+    ax: Any,
+    time: Array,
+    course: Course,
+    looks: Mapping[str, tuple[str, str]],
+    reference: str,
+    rows: slice = slice(None),
+) -> None:
+    """Command, methods and reference; a joint that stands still is not magnified until its encoder's steps fill all."""
+    if course.command is not None:
+        label, colour = looks["command"]
+        ax.step(time[rows], course.command[rows], where="post", color=colour, ls=DOTTED, lw=1.1, label=label)
+    for method, values in course.found.items():
+        label, colour = looks[method]
+        ax.plot(time[rows], values[rows], color=colour, label=label)
+    label, colour = looks[reference]
+    ax.plot(time[rows], course.base[rows], color=colour, ls=DASHED, lw=1.0, label=label)
+    low, high = ax.get_ylim()
+    if high - low < LEAST:
+        ax.set_ylim((low + high - LEAST) / 2, (low + high + LEAST) / 2)
+
+
+@styled
+def lines(
+    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
+    axes: tuple[str, str],
+    ticks: ListOf[tuple[float, str]] = (),
+    log: bool = False,
+) -> Figure:
+    """Values over an amount, with error bars, one line per method; those with error bars are drawn a little apart where
+    x is not logarithmic, so that equal ones are all seen.
+
+    Args:
+        panels: (title, {label: (colour, x, values)}), beside each other on one scale.
+        axes: Labels of x and y.
+        ticks: Where x is labelled, and how; default matplotlib's.
+        log: Whether x is logarithmic.
+    """
+    fig = figure(3.6 * len(panels) + 0.6, 3.2)
+    for ax, (title, methods) in zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True):
+        spacing = np.diff(sorted({v for _, x, _ in methods.values() for v in x}))
+        apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
+        drawn = 0  # of those with error bars
+        spreading = sum(spreads(values) is not None for _, _, values in methods.values())
+        for label, (colour, x, values) in methods.items():
+            std = spreads(values)
+            shift = 0.0 if std is None else (drawn - (spreading - 1) / 2) * apart
+            drawn += std is not None
+            ax.errorbar(
+                np.add(x, shift), [v.mean for v in values], yerr=std, fmt="o-", ms=3.5,
+                color=colour, elinewidth=0.9, capsize=2, label=label,
+            )  # fmt: skip
+        if log:
+            ax.set_xscale("log")
+            ax.minorticks_off()
+        if ticks:
+            ax.set_xticks([x for x, _ in ticks], [t for _, t in ticks])
+        ax.set_xlabel(axes[0])
+        ax.set_title(title)
+    fig.axes[0].set_ylim(bottom=0)  # shared, and from now on no longer found from what is drawn
+    fig.axes[0].set_ylabel(axes[1])
+    legend(fig)
+    return fig

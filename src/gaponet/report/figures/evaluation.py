@@ -1,0 +1,136 @@
+"""The figures of a report: one function each, matplotlib in, Figure out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gaponet.base.arrays import Array
+from gaponet.base.spread import Spread
+from gaponet.data.repeatability import MOVED
+from gaponet.data.signals import busiest
+from gaponet.report.figures.charts import Course, against, bars, lines
+from gaponet.report.figures.colours import colour
+from gaponet.report.figures.style import figure, joint_label, legend, styled
+from gaponet.report.methods import title
+
+WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
+CORRECTED = 1e-5  # rad; a network that corrects by less draws noise
+
+
+def by_joint(methods: dict[str, Any]) -> Figure:
+    return _bars(methods, "by_joint", "MPJAE by joint", joint_label)
+
+
+def by_payload(methods: dict[str, Any]) -> Figure:
+    return _bars(methods, "by_payload", "MPJAE by payload", "{} kg".format)
+
+
+def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[str], str]) -> Figure:
+    keys = list(methods["nominal"][group])
+    values = {title(n): (colour(n), [Spread.of([m[group][k]["mpjae"]], 1e3) for k in keys]) for n, m in methods.items()}
+    return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
+
+
+def by_horizon(methods: dict[str, Any]) -> Figure:
+    """MPJAE against the time since the common start: does the error grow?"""
+    keys = [k for k in methods["nominal"]["by_horizon"] if k != "whole"]
+    x = [float(k) for k in keys]
+    ticks = [*((v, f"{v:g} s") for v in x), (4 * x[-1], "whole\nmotion")]
+    drawn = {
+        title(n): (
+            colour(n),
+            [at for at, _ in ticks],
+            [Spread.of([m["by_horizon"][k]["mpjae"]], 1e3) for k in (*keys, "whole")],
+        )
+        for n, m in methods.items()
+    }
+    return _degrees(lines([("MPJAE by horizon of the free run", drawn)], ("", "mrad"), ticks, log=True))
+
+
+@styled
+def _degrees(fig: Figure) -> Figure:
+    """The same figure with degrees on the right."""
+    mrad = 1e3 * np.pi / 180
+    ways: Any = (lambda y: y / mrad, lambda y: y * mrad)
+    right = fig.axes[0].secondary_yaxis("right", functions=ways)
+    right.set_ylabel("degrees")
+    return fig
+
+
+@styled
+def training_curve(progress: list[dict[str, Any]]) -> Figure:
+    """Held-out error after each validation; stages shaded, the kept model marked."""
+    fig = figure(5.0, 3.0)
+    ax = fig.subplots()
+    steps = np.array([p["steps"] for p in progress]) / 1e6
+    value = np.array([p["val_mpjae"] for p in progress]) * 1e3
+    ax.plot(steps, value, "-", color="#555555", lw=0.8)
+    for stage, tint, label in (("warm start", colour("mlp"), "warm start"), ("ppo", colour("gaponet"), "PPO")):
+        at = [i for i, p in enumerate(progress) if p["stage"] == stage]
+        if at:
+            ax.plot(steps[at], value[at], "o", ms=3.5, color=tint, label=label)
+    best = int(value.argmin())
+    ax.plot(steps[best], value[best], "o", ms=9, mfc="none", mec="#111111", label="kept")
+    ax.axhline(progress[0]["nominal_mpjae"] * 1e3, color=colour("nominal"), ls="--", lw=1)
+    ax.annotate("nominal", (1, progress[0]["nominal_mpjae"] * 1e3), xycoords=("axes fraction", "data"), ha="right",
+                va="bottom", color=colour("nominal"))  # fmt: skip
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("control steps, million")
+    ax.set_ylabel("validation MPJAE, mrad")
+    ax.set_title("Training")
+    legend(fig)
+    return fig
+
+
+def trajectories(
+    arrays: dict[str, Array], shown: list[dict[str, Any]], joints: tuple[str, ...], methods: list[str]
+) -> dict[int, Figure]:
+    """Command, recorded and simulated positions of a few joints over each motion shown.
+
+    Args:
+        arrays: For each row ROW/METHOD, recorded, command, delta/METHOD, (T, n) rad.
+
+    Returns:
+        By row, those first in which the robot moved most.
+    """
+    looks = {n: (title(n), colour(n)) for n in (*methods, "recorded", "command")}
+    drawn: dict[int, tuple[Array, dict[str, Course]]] = {}
+    for row, facts in enumerate(shown):
+        recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
+        start = busiest(recorded, rows := round(WINDOW / dt))
+        window = slice(start, min(start + rows, len(recorded)))
+        drawn[row] = np.arange(len(recorded))[window] * dt, _courses(arrays, row, joints, methods, window, dt)
+    travel = {row: np.abs(np.diff(arrays[f"{row}/recorded"], axis=0)).sum() for row in drawn}
+    return {row: against(*drawn[row], looks, "recorded") for row in sorted(drawn, key=lambda row: -travel[row])}
+
+
+def _courses(
+    arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], window: slice, dt: float
+) -> dict[str, Course]:
+    """The three joints with the largest nominal error, of those that are commanded to move while there are any."""
+    command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
+    still = np.ptp(command, axis=0) <= MOVED
+    errors = np.abs(arrays[f"{row}/nominal"] - recorded).mean(axis=0)
+    learned = [n for n in methods if np.abs(arrays.get(f"{row}/delta/{n}", 0.0)).max() > CORRECTED]
+    courses = {}
+    for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
+        name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
+        asked = command[:, j]
+        courses[name] = Course(
+            {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], asked,
+            {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(asked, dt),
+        )  # fmt: skip
+    return courses
+
+
+def _turn(command: Array, dt: float, seconds: float = 2.0) -> slice:
+    """The stretch in whose middle the command turns, stops or starts."""
+    half = round(seconds / 2 / dt)
+    if len(command) <= 2 * half:
+        return slice(0, len(command))
+    start = int(np.abs(2 * command[half:-half] - command[: -2 * half] - command[2 * half :]).argmax())
+    return slice(start, start + 2 * half)

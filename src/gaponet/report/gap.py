@@ -1,0 +1,183 @@
+"""Where the gap comes from: what each step from the nominal simulator to the identified one, and to a model on top of
+it, removes; and the floor."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from collections.abc import Sequence as ListOf
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.progress import Progress, noted, silent
+from gaponet.data.repeatability import Repetitions
+from gaponet.data.sequence import Sequence
+from gaponet.data.signals import encoder_step
+from gaponet.data.store import Dataset
+from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.report.candidate import Candidate, choose
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.metrics import Run, metrics, runs, standard_error
+from gaponet.sim.metrics import summary as errors_of
+from gaponet.sim.model import model_hash
+from gaponet.sim.replay import Corrector, replay
+
+
+def gap_by_step(
+    one: Candidate,
+    dataset: Dataset,
+    motions: tuple[str, ...] = (),
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Mean |error| left after each step, in free run over whole motions that the robot folder or the run never saw.
+
+    Steps: nominal; of a run, delay (fitted on the training motions) and offset (delay and offset); of an identified
+    simulator its CAUSES, one after the other, and that friction holds ("creep": "friction" itself creeps as MuJoCo's
+    does); of a run, its model. Standard errors are over motions, of what a step removes motion by motion (paired);
+    what causes remove depends on their order. "unexplained" is what is left above the floor.
+
+    Args:
+        one: An identified robot, or a run: its recordings, baseline, simulator and model apply.
+
+    Returns:
+        {"methods": {nominal, identified, …: metrics.summary}, "left": {step: rad}, "removed": {step: [rad, standard
+        error]}, "unexplained": rad, "by_joint": {joint: the same and "floor"}, "by_payload": {kg: {step: rad}},
+        "floor": {"encoder": rad, "repeatability": rad, "both": rad}, …}; a floor that is unknown is None, and so is
+        what is left above it.
+    """
+    robot = one.robot
+    dataset.require_robot(robot)
+    nominal = robot.before_identification
+    entries, unseen = choose([one.folder], dataset, motions)
+    sequences = dataset.sequences(entries)
+    found, done = causes(robot), {}
+    for name, physics, corrector in _steps(one, found):
+        told = noted(progress, name)
+        twins = replay(sequences, physics, corrector, lock_idle=True, progress=told, creeps=name == "friction")
+        done[name] = runs(sequences, [t.qpos for t in twins], robot)
+    units = {s.meta.unit_id for s in sequences}
+    others = (dataset.sequences([e])[0] for e in dataset.entries if e.meta.unit_id in units)
+    floors = floor(sequences if any(s.meta.repetition for s in sequences) else others, robot)
+    floors["all"] = {k: _mean([f[k] for f in floors.values()]) for k in ("encoder", "repeatability", "both")}
+    last = list(done)[-1]
+    methods = {"nominal": "nominal"} | ({"delay_offset": "offset"} if "offset" in done else {})
+    methods |= ({"identified": found[-1][0]} if found else {}) | ({one.method: last} if one.model is not None else {})
+    return {
+        "methods": {name: errors_of(done[step], robot) for name, step in methods.items()},
+        "left": {name: metrics(part)["mpjae"] for name, part in done.items()},
+        "removed": removed(done),
+        "unexplained": _above(metrics(done[last])["mpjae"], floors["all"]["both"]),
+        "by_joint": {
+            j: {
+                "left": {n: metrics(part, [i])["mpjae"] for n, part in done.items()},
+                "removed": removed(done, [i]),
+                "unexplained": _above(metrics(done[last], [i])["mpjae"], floors[j]["both"]),
+                "floor": floors[j],
+            }
+            for i, j in enumerate(robot.operated) if metrics(done[last], [i])
+        },
+        "by_payload": {
+            f"{p:g}": {n: metrics([r for r in part if r.meta.payload_mass == p])["mpjae"] for n, part in done.items()}
+            for p in sorted({s.meta.payload_mass for s in sequences})
+        },
+        "floor": floors["all"],
+        "virtual": any(s.meta.virtual for s in sequences),
+        "unseen": unseen,
+        "sequences": len(sequences),
+        "hours": sum(e.rows * e.dt for e in entries) / 3600,
+        "simulator_hash": model_hash(nominal),
+        "simulators": {"nominal": model_hash(nominal)}
+        | ({"identified": model_hash(robot)} if found else {}),
+        "dataset": dataset.path.name,
+        "robot": robot.name,
+    }  # fmt: skip
+
+
+def _steps(one: Candidate, found: list[tuple[str, RobotSpec]]) -> list[tuple[str, RobotSpec, Corrector | None]]:
+    """Name, simulator and correction of each step, from the nominal simulator over the causes to the model."""
+    nominal = one.robot.before_identification
+    start: list[tuple[str, RobotSpec, Corrector | None]] = [("nominal", nominal, None)]
+    middle: list[tuple[str, RobotSpec, Corrector | None]] = [(cause, physics, None) for cause, physics in found]
+    if one.model is None:
+        return start + middle
+    fitted = DelayOffset.read(one.folder)
+    only_delay = DelayOffset(fitted.delay, dict.fromkeys(fitted.offset, 0.0))
+    start += [("delay", nominal, only_delay.corrector(nominal)), ("offset", nominal, fitted.corrector(nominal))]
+    return [*start, *middle, (one.method, one.robot, one.corrector())]
+
+
+# What an identified simulator differs in from the nominal one, in the order in which steps adopt it.
+CAUSES = {
+    "gain": ("kp", "kd", "damping", "armature", "delay", "target_speed", "offset", "effort_limit"),
+    "friction": ("frictionloss",),
+    "stribeck": ("stribeck", "stribeck_speed"),
+    "load": ("friction_motor", "friction_external"),
+    "servo": ("min_torque", "encoder_step"),
+    "contact": ("zero", "stop_low", "stop_high"),
+    "hand": (),
+}
+
+
+def causes(simulator: RobotSpec) -> list[tuple[str, RobotSpec]]:
+    """The simulators between the nominal and the identified one; the last one is the identified one itself."""
+    if simulator.nominal is None:
+        return []
+    robot, steps = simulator.before_identification, []
+    for cause, fields in CAUSES.items():
+        servos = {
+            joint: {f: float(getattr(simulator, f)[i]) for f in fields if np.isfinite(getattr(simulator, f)[i])}
+            for i, joint in enumerate(simulator.joint_names)
+        }
+        changed = robot.with_servos(servos)
+        more = {"contact": "table", "hand": "payload_mounts"}.get(cause)
+        changed = replace(changed, **{more: getattr(simulator, more)}) if more else changed
+        if model_hash(changed) != model_hash(robot):
+            steps += [(cause, changed)] if cause != "friction" else [(cause, changed), ("creep", changed)]
+        robot = changed
+    return steps
+
+
+def removed(done: dict[str, list[Run]], columns: list[int] | None = None) -> dict[str, list[float]]:
+    """How far each step lowers the error, and its standard error over motions, rad."""
+    held = {name: [(r, c) for r in part if (c := r.holds(columns)) is None or c] for name, part in done.items()}
+    errors = {name: np.array([np.abs(r.error if c is None else r.error[:, c]).mean() for r, c in part])
+              for name, part in held.items()}  # fmt: skip
+    less = {after: errors[before] - errors[after] for before, after in pairwise(errors)}
+    return {name: [float(x.mean()), standard_error(x)] for name, x in less.items()}
+
+
+def floor(sequences: Iterable[Sequence], robot: RobotSpec) -> dict[str, dict[str, float | None]]:
+    """Mean |error| that no simulator can remove, by joint: {"encoder", "repeatability", "both"}, rad; None if unknown.
+
+    An encoder of step s reads wrong by s/4 on average. A robot that differs from itself by σ from one repetition, or
+    from one period of a motion, to the next differs from its own mean by √(2/π)·σ on average, encoder included.
+    """
+    groups: dict[Any, Repetitions] = defaultdict(Repetitions)
+    angles: list[Array] = []
+    for s in sequences:
+        angles.append(s.qpos[:, robot.operated_index])
+        same = (*s.meta.slot, round(s.dt * 1e6))
+        groups[same].add(s)
+        for period in Repetitions.periods(s):
+            groups[*same, "period"].add(period)
+    repeated = [g.result() for g in groups.values() if g.count > 1]
+    spread = Repetitions.summary(repeated, robot.joint_names)["channels"]["qpos"]["joints"] if repeated else {}
+    found: dict[str, dict[str, float | None]] = {}
+    for i, joint in enumerate(robot.operated):
+        encoder = encoder_step([a[:, i] for a in angles]) / 4 or None
+        again = spread[joint] * np.sqrt(2 / np.pi) if joint in spread else None
+        found[joint] = {"encoder": encoder, "repeatability": again, "both": max(encoder or 0.0, again or 0.0) or None}
+    return found
+
+
+def _mean(values: ListOf[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
+
+
+def _above(left: float, floor: float | None) -> float | None:
+    return None if floor is None else max(left - floor, 0.0)

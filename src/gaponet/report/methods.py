@@ -1,0 +1,58 @@
+"""One name and one colour per method, in every figure, table and scene.
+
+A method is a key of METHODS, or a word of study.variant: [identified+]KIND[:FIELD=VALUE]…
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gaponet.robot.spec import RobotSpec
+
+METHODS = {  # name, colour
+    "target": ("target", "#00838f"),
+    "command": ("command", "#00838f"),
+    "recorded": ("recorded", "#111111"),
+    "nominal": ("nominal simulator", "#8c8c8c"),
+    "delay_offset": ("delay + offset", "#d99000"),
+    "identified": ("identification", "#2a9d6f"),
+    "inverse": ("labels alone", "#12465b"),
+    "shared_mlp": ("MLP", "#3b7dd8"),
+    "mlp": ("MLP, full coupling", "#7a8fe0"),
+    "transformer": ("Transformer", "#56c1e8"),
+    "gaponet": ("GAPONet", "#c8102e"),
+    "paper": ("GAPONet, the paper's form", "#8e1b3a"),
+    "calibrated": ("calibrated to the unit", "#6a1b9a"),
+    "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),
+    "transfer": ("transferred into the other simulator", "#e07a1f"),
+    "delay": ("delay", "#d99000"),
+    "offset": ("offset", "#b36b00"),
+    "gain": ("gains, inertia, delay", "#2a9d6f"),
+    "friction": ("friction", "#24845d"),
+    "creep": ("creep", "#7fb8a0"),
+    "stribeck": ("friction at rest", "#1d6b4c"),
+    "load": ("friction by load", "#17543c"),
+    "servo": ("least torque, encoder", "#113f2d"),
+    "contact": ("table, stops, zeros", "#6b4f2a"),
+    "hand": ("where payloads hang, the hand", "#8d6e44"),
+    "raw": ("raw targets", "#5c5c5c"),
+    "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
+    "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),
+}
+SAID = {"mlp_match=on": "as many weights", "payload_input=off": "mass not told"}
+IDENTIFIED = "identified+"  # in front of the kind of a model that corrects an identified simulator
+
+
+def method(kind: str, simulator: RobotSpec) -> str:
+    """The method that a model of this kind is: identified+KIND where it corrects an identified simulator."""
+    return (IDENTIFIED if simulator.nominal is not None else "") + kind
+
+
+def title(method: str) -> str:
+    """The method's name for people: identification + MLP, as many weights (history 8)."""
+    kind, *changes = method.removeprefix(IDENTIFIED).split(":")
+    start = f"{METHODS['identified'][0]} + " if method.startswith(IDENTIFIED) else ""
+    name = ", ".join([start + METHODS.get(kind, (kind,))[0], *(SAID[c] for c in changes if c in SAID)])
+    others = ", ".join(c.replace("=", " ") for c in changes if c not in SAID)
+    return f"{name} ({others})" if others else name

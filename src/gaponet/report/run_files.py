@@ -1,0 +1,216 @@
+"""What a run folder says about its training and its newest evaluation, read and checked for those who show it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NotRequired
+
+import numpy as np
+from annotated_types import Interval, Len, Predicate
+from typing_extensions import TypedDict
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import ModelError
+from gaponet.base.structure import Count, Json, Number, parse_json, read_json, read_npz
+from gaponet.report.methods import IDENTIFIED, METHODS
+
+MEND = "give a complete run folder of gaponet train, or evaluate again"
+Method = Annotated[str, Predicate(lambda name: name.removeprefix(IDENTIFIED) in METHODS)]
+GROUPS = ("by_joint", "by_payload", "by_horizon", "by_motion")
+
+
+class _Error(TypedDict):
+    """The error of a payload, a horizon or a motion, rad."""
+
+    mpjae: Number
+
+
+class _JointError(_Error):
+    """The errors of a joint, rad."""
+
+    static: Number
+    dynamic: Number
+
+
+Joints = Annotated[dict[str, _JointError], Len(1)]
+Groups = Annotated[dict[str, _Error], Len(1)]
+Scores = TypedDict(  # one method's metrics, and those of its parts
+    "Scores",
+    {
+        "mpjae": Number, "rmse": Number, "q_dis": Number, "static": Number, "dynamic": Number, "large_0.05": Number,
+        "large_0.1": Number, "correlation": Number, "by_joint": Joints, "by_payload": Groups, "by_horizon": Groups,
+        "by_motion": Groups,
+    },
+)  # fmt: skip
+
+
+class _Shown(TypedDict):
+    """A sequence whose trajectories are kept."""
+
+    motion: str
+    unit_id: str
+    payload_mass: Annotated[float, Interval(ge=0, le=100)]
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]
+
+
+class _Artifact(TypedDict):
+    """A model that was evaluated."""
+
+    weights: str
+    seed: Json
+
+
+class _Delta(TypedDict):
+    """Size of a model's corrections, rad."""
+
+    max: Number
+
+
+class _Metrics(TypedDict):
+    methods: dict[Method, Scores]
+    ratio_to_nominal: dict[Method, Number]
+    dataset: str
+    sequences: Count
+    motions: list[str]
+    unseen: bool
+    virtual: bool
+    robot: str
+    simulator_hash: str
+    simulators: NotRequired[dict[Method, str]]
+    """In which simulator each method ran."""
+    delta: dict[Method, _Delta]
+    artifacts: dict[Method, _Artifact]
+    shown: NotRequired[Annotated[list[_Shown], Len(0, 100)]]
+    moves: NotRequired[dict[str, Count]]
+    date: NotRequired[str]
+    command: NotRequired[str]
+
+
+class _PPO(TypedDict):
+    """What a report says of PPO."""
+
+    num_envs: int
+    epochs: int
+    std: float
+
+
+class _Model(TypedDict):
+    """What a list of runs says of the model."""
+
+    kind: Method
+
+
+class _Config(TypedDict):
+    model: _Model
+    ppo: _PPO
+    seed: int
+    robot: str
+    dataset: str
+    dataset_hash: str
+    command: NotRequired[str]
+
+
+class _Validation(TypedDict):
+    """One line of progress.jsonl."""
+
+    stage: str
+    steps: Count
+    seconds: float
+    val_mpjae: Number
+    nominal_mpjae: Number
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """config.json of a run.
+
+    Raises:
+        ModelError: Missing or damaged, as of all functions here; with file and field.
+    """
+    return dict(read_json(_Config, run / "config.json", ModelError, MEND, more=True))
+
+
+def read_metrics(run: Path) -> dict[str, Any]:
+    """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
+    file = run / "metrics.json"
+    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, more=True)}
+    methods = metrics["methods"]
+    if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
+        raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {MEND}")
+    for name, scores in methods.items():
+        for group in GROUPS:
+            if set(scores[group]) != set(methods["nominal"][group]):
+                raise ModelError(f"{file}: methods.{name}.{group}: should have what nominal has; {MEND}")
+        for group in ("by_payload", "by_horizon"):
+            if not all(_is_number(key) for key in scores[group] if key != "whole"):
+                raise ModelError(f"{file}: methods.{name}.{group}: should be named by numbers; {MEND}")
+        if "whole" not in scores["by_horizon"]:
+            raise ModelError(f"{file}: methods.{name}.by_horizon.whole: is missing; {MEND}")
+    return metrics
+
+
+def read_trajectories(run: Path, metrics: dict[str, Any], joints: int) -> dict[str, Array]:
+    """trajectories.npz of a run: for each sequence shown row/METHOD, recorded and command, (T, joints) rad."""
+    file = run / "trajectories.npz"
+    arrays = read_npz(file, ModelError, MEND)
+    for row in range(len(metrics.get("shown", []))):
+        names = [f"{row}/{m}" for m in ("recorded", "command", *metrics["methods"])]
+        shapes = {arrays[name].shape if name in arrays else () for name in names}
+        shape = max(shapes, key=len)
+        if len(shapes) != 1 or len(shape) != 2 or shape[0] < 2 or shape[1] != joints:
+            raise ModelError(f"{file}: sequence {row} has arrays of {joints} joints missing or of other sizes; {MEND}")
+    if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays.values()):
+        raise ModelError(f"{file}: holds NaN or other types than float32; {MEND}")
+    return arrays
+
+
+def read_progress(run: Path) -> list[dict[str, Any]]:
+    """The validations of a run so far; a last line cut short by a crash is none."""
+    file = run / "progress.jsonl"
+    if not file.is_file():
+        return []
+    lines = file.read_bytes().split(b"\n")[:-1]
+    return [
+        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, MEND, more=True)}
+        for number, line in enumerate(lines, 1)
+        if line.strip()
+    ]
+
+
+class _Floor(TypedDict):
+    """The error that encoder and repeatability hide together, rad."""
+
+    both: Number
+
+
+class _Panel(TypedDict):
+    """What is left of the error after each step, and what no simulator can remove; rad."""
+
+    left: dict[Method, Number]
+    floor: _Floor
+
+
+class _Gap(_Panel):
+    by_joint: dict[str, _Panel]
+    virtual: bool
+    unseen: bool
+    sequences: Count
+    robot: str
+
+
+def read_gap(run: Path) -> dict[str, Any] | None:
+    """gap.json of a run; None where there is none."""
+    file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
+    if not file.is_file():
+        return None
+    gap = read_json(_Gap, file, ModelError, again, more=True)
+    steps = list(gap["left"])
+    if not steps or any(list(panel["left"]) != steps for panel in gap["by_joint"].values()):
+        raise ModelError(f"{file}: by_joint: should have the steps of left; {again}")
+    return dict(gap)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return bool(np.isfinite(float(text)))
+    except ValueError:
+        return False

@@ -1,0 +1,198 @@
+"""A scene as pictures: rendered off screen by MuJoCo, labelled by Pillow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.report.view.gl import CURE
+from gaponet.report.view.scene import Scene
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+
+INK, FAINT, ALARM = "#222222", "#777777", "#c8102e"
+DOT = "  ·  "  # Pillow's own font has this, but no ×
+TALLEST = 0.8  # of the width
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Pixels: a head line, the robots, their labels, and the course of the error, from top to bottom."""
+
+    width: int
+    head: int
+    robots: int
+    labels: int
+    course: int
+    scale: float  # pixels per metre
+
+    @property
+    def height(self) -> int:
+        """Height of the whole picture, pixels."""
+        return self.head + self.robots + self.labels + self.course
+
+    @classmethod
+    def of(cls, scene: Scene, width: int, course: bool) -> Tiles:
+        """The height that the robots need at this width."""
+        if not 160 <= width <= 3840:
+            raise UsageError(f"--width is {width}; give 160 to 3840 pixels")
+        tall = scene.box[3] - scene.box[2]
+        unit = max(width / 960, 0.5)
+        head, labels = round(34 * unit), round(54 * unit)
+        strip = round(96 * unit) if course else 0
+        scale = min(width / (scene.spacing * len(scene.base)), (TALLEST * width - head - labels - strip) / tall)
+        robots = round(1.1 * tall * scale)
+        robots += (head + robots + labels + strip) % 2  # h264 wants even sizes
+        return cls(width, head, robots, labels, strip, scale)
+
+
+class Camera:
+    """Renders the frames of a scene. Close it, or use it in a with block."""
+
+    def __init__(self, scene: Scene, width: int = 960, speed: float = 1.0, magnify: float = 1.0, course: bool = True,
+                 span: tuple[float, float] = (0.0, np.inf)) -> None:  # fmt: skip
+        """Open a GL context.
+
+        Args:
+            width: Width of the picture, pixels, even; the height follows from the robots.
+            speed, magnify: Said on the picture.
+            course: Draw the error against time below.
+            span: Time on that axis, s.
+        """
+        self.scene, self.speed, self.magnify = scene, speed, magnify
+        self.layout = Tiles.of(scene, width - width % 2, course)
+        self.span = (span[0], min(span[1], (len(scene.shown.real) - 1) * scene.shown.real.dt))
+        self.lens = self._lens()
+        self.renderer = renderer(scene.model, self.layout.robots, self.layout.width)
+        self.fonts = {size: font(size * max(width / 960, 0.5)) for size in (13, 15, 17)}
+
+    def __enter__(self) -> Camera:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.renderer.close()
+
+    def picture(self, time: float) -> Any:
+        """The labelled frame at a time of the recording, s: a PIL image."""
+        from PIL import Image, ImageDraw
+
+        self.scene.pose(time)
+        self.renderer.update_scene(self.scene.data, self.lens)
+        rendered = Image.fromarray(self.renderer.render())
+        image = Image.new("RGB", (self.layout.width, self.layout.height), rendered.getpixel((0, 0)))
+        image.paste(rendered, (0, self.layout.head))
+        self._write(image, ImageDraw.Draw(image), time)
+        return image
+
+    def _lens(self) -> mujoco.MjvCamera:
+        """Orthographic, so that every copy is seen from the same side."""
+        scene, layout = self.scene, self.layout
+        lens = mujoco.MjvCamera()
+        lens.orthographic = scene.model.vis.global_.orthographic = 1  # MuJoCo 3 looks at the model alone
+        lens.azimuth, lens.elevation = scene.view.azimuth, scene.view.elevation
+        lens.lookat[:] = scene.middle
+        lens.distance = 4 * scene.extent
+        scene.model.vis.global_.fovy = layout.robots / layout.scale  # m, of an orthographic picture
+        scene.model.vis.map.znear, scene.model.vis.map.zfar = 0.01, 20
+        return lens
+
+    def _write(self, image: Any, draw: ImageDraw, time: float) -> None:
+        shown, layout, k = self.scene.shown, self.layout, len(self.scene.base)
+        row, small, large = self.scene.row(time), self.fonts[13], self.fonts[17]
+        self._head(draw, time)
+        top = layout.height - layout.course - layout.labels
+        pitch = self.scene.spacing * layout.scale
+        for i, m in enumerate(shown.motions):
+            x = layout.width / 2 + (i - (k - 1) / 2) * pitch
+            draw.text((x, top), m.name, m.colour, large, anchor="ma", stroke_width=0.3, stroke_fill=m.colour)
+            if m.method != "recorded":
+                text = f"{m.error[row] * 1e3:.1f} mrad now, {m.mpjae * 1e3:.1f} mean"
+                draw.text((x, top + 1.5 * large.size), text, FAINT, small, anchor="ma")
+        if layout.course:
+            self._course(image, draw, row)
+
+    def _head(self, draw: ImageDraw, time: float) -> None:
+        """What is shown, on the left; the time on the right; VIRTUAL first, where it is."""
+        shown, pad, font = self.scene.shown, self.layout.head // 3, self.fonts[15]
+        meta = shown.real.meta
+        facts = [meta.robot, meta.motion, f"unit {meta.unit_id}", _payload(meta.payload_mass, meta.payload_side)]
+        facts += [] if shown.seen is None else ["seen in training" if shown.seen else "held out"]
+        clock = [f"speed {self.speed:g}x"] if self.speed != 1 else []
+        clock += [f"differences drawn {self.magnify:g}x"] if self.magnify != 1 else []
+        left, right = DOT.join(facts), DOT.join([*clock, f"{time:6.2f} s"])
+        mark = "VIRTUAL ROBOT   " if meta.virtual else ""
+        while font.getlength(mark + left + right) > self.layout.width - 4 * pad and font.size > 8:
+            font = font.font_variant(size=font.size - 0.5)
+        draw.text((pad, pad * 0.8), mark, ALARM, font, stroke_width=0.4, stroke_fill=ALARM)
+        draw.text((pad + font.getlength(mark), pad * 0.8), left, INK, font)
+        draw.text((self.layout.width - pad, pad * 0.8), right, INK, font, anchor="ra")
+
+    def _course(self, image: Any, draw: ImageDraw, row: int) -> None:
+        """|error| against time of each motion, with a line at the present."""
+        strip, x, (high, low) = self.strip
+        top = self.layout.height - self.layout.course
+        image.paste(strip, (0, top), strip)
+        now = x[np.clip(row - self.scene.row(self.span[0]), 0, len(x) - 1)]
+        draw.line([(now, top + high), (now, top + low)], INK, 1)
+
+    @cached_property
+    def strip(self) -> tuple[Any, Array, tuple[float, float]]:
+        """The curves, the same in every picture; x of each row, and the axis' top and bottom, pixels."""
+        from PIL import Image, ImageDraw
+
+        layout, real, small = self.layout, self.scene.shown.real, self.fonts[13]
+        pad = layout.head // 3
+        first, last = (self.scene.row(t) for t in self.span)
+        rows = np.arange(first, max(last, first + 1) + 1).clip(max=len(real) - 1)
+        errors = {m.colour: m.error[rows] * 1e3 for m in self.scene.shown.motions if m.method != "recorded"}
+        peak = max([float(e.max()) for e in errors.values()] + [1e-3])
+        unit = f"{peak:.2g} mrad" if peak < 10 else f"{peak:.0f} mrad"
+        bottom, high = layout.course - pad - small.size, 1.2 * pad
+        left, right = pad + small.getlength(unit) + pad / 2, layout.width - pad
+        x = left + np.arange(len(rows)) / max(len(rows) - 1, 1) * (right - left)
+        fine = 4  # Pillow's lines have hard edges
+        strip = Image.new("RGBA", (layout.width * fine, layout.course * fine), (255, 255, 255, 0))
+        draw = ImageDraw.Draw(strip)
+        draw.line([(left * fine, bottom * fine), (right * fine, bottom * fine)], "#bbbbbb", fine)
+        for colour, error in errors.items():
+            y = bottom - error / peak * (bottom - high)
+            points = (np.stack([x, y], axis=1) * fine).ravel().tolist()
+            draw.line(points, colour, round(fine * max(1.4 * layout.width / 960, 1)), joint="curve")
+        strip = strip.resize((layout.width, layout.course), Image.Resampling.BOX)
+        draw = ImageDraw.Draw(strip)
+        draw.text((left - pad / 2, high), unit, FAINT, small, anchor="rm")
+        draw.text((left - pad / 2, bottom), "0", FAINT, small, anchor="rm")
+        draw.text((left, bottom + 3), f"{rows[0] * real.dt:.1f} s", FAINT, small)
+        draw.text((right, bottom + 3), f"{rows[-1] * real.dt:.1f} s", FAINT, small, anchor="ra")
+        draw.text(((left + right) / 2, bottom + 3), "mean |error| of the operated joints", FAINT, small, anchor="ma")
+        return strip, x, (high, bottom)
+
+
+def _payload(mass: float, side: str) -> str:
+    return "empty-handed" if mass == 0 else f"{mass:g} kg " + ("in each hand" if side == "both" else f"in {side} hand")
+
+
+def font(size: float) -> Any:
+    """Pillow's own, of a size in pixels."""
+    from PIL import ImageFont
+
+    return ImageFont.load_default(max(size, 9))
+
+
+def renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    """MuJoCo's, off screen.
+
+    Raises:
+        UsageError: With what is missing here.
+    """
+    try:
+        return mujoco.Renderer(model, height, width)
+    except Exception as error:  # GL libraries raise whatever they like; all of it means: no picture here
+        raise UsageError(f"cannot render off screen ({type(error).__name__}: {error}). {CURE}") from None

@@ -1,0 +1,273 @@
+"""Several copies of a robot side by side in one MuJoCo scene, one colour per method, made to be looked at.
+
+Nothing is stepped here: joint angles are given, positions follow from them. The robots of the package have no meshes;
+what is added to their lines is what is known of them: housings about the joints, and the shells of look.toml or
+collision.toml.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.base.structure import read_toml
+from gaponet.report.view.side_by_side import SideBySide
+from gaponet.robot.collision import Shapes
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import build_spec
+from gaponet.sysid.motion.posture import carriers
+
+PAYLOAD = (0.93, 0.60, 0.10, 1.0)
+GHOST = (0.07, 0.07, 0.07, 0.4)  # the recording inside each other copy
+THIN = 0.9  # of a ghost's limbs: where the copy is right, it covers the ghost
+BEHIND = 0.12  # of the robot's height: how far behind its copy a ghost stands on a flat picture
+FLOOR = 0.96  # grey of the ground
+SAMPLES = 60  # frames looked at when the camera is set
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the camera stands. Robots face +x; the row runs from left to right on the picture."""
+
+    azimuth: float = 145.0
+    """Degrees: 180 looks at the robot's front, 90 at its right side."""
+    elevation: float = -14.0
+    """Degrees, negative from above."""
+
+    @property
+    def axes(self) -> tuple[Array, Array]:
+        """Unit vectors to the right and up on the picture, (3) each."""
+        a, e = np.radians([self.azimuth, self.elevation])
+        right = np.array([np.sin(a), -np.cos(a), 0.0])
+        forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        return right, np.cross(right, forward)
+
+
+class Scene:
+    """The copies of a SideBySide, and where they are.
+
+    Attributes:
+        model, data: MuJoCo model and data of all copies together; copy i's bodies and joints are called METHOD/NAME.
+        spacing: Between neighbours along the picture, m.
+        extent: Half the size of it all, m.
+        box: Outline of one robot on the picture over all frames, relative to its base: (left, right, bottom, top), m.
+        base: Base of each copy, (k, 3), m.
+    """
+
+    def __init__(
+        self,
+        shown: SideBySide,
+        view: View = View(),
+        ghost: bool = True,
+        rows: slice = slice(None),
+        flat: bool = False,
+        closeup: bool = False,
+    ) -> None:
+        """Build and fit.
+
+        Args:
+            view: The camera's direction decides the direction of the row.
+            ghost: Draw the recording, translucent, into each other copy.
+            rows: Frames that have to fit.
+            flat: For an orthographic picture, on which a ghost can stand behind its copy and still be in place: what is
+                seen of it is what differs.
+            closeup: Limbs without an operated joint need not fit.
+        """
+        self.shown, self.view = shown, view
+        self.ghosts = ghost and any(m.method == "recorded" for m in shown.motions) and len(shown.motions) > 1
+        self.box, self.floor = self._fit(rows, closeup)
+        self.spacing = 1.1 * (self.box[1] - self.box[0])
+        k = len(shown.motions)
+        self.base = (np.arange(k) - (k - 1) / 2)[:, None] * self.spacing * view.axes[0]
+        self.extent = max(0.5 * k * self.spacing, self.box[3] - self.box[2])
+        across, up = view.axes
+        behind = BEHIND * (self.box[3] - self.box[2]) * np.cross(up, across) if flat else np.zeros(3)
+        self.model = self._compose(self.base, behind)
+        self.data = mujoco.MjData(self.model)
+        self.address = [(i, self._address(m.method)) for i, m in enumerate(shown.motions)]
+        if self.ghosts:
+            last = next(i for i, m in enumerate(shown.motions) if m.method == "recorded")
+            self.address += [
+                (last, self._address(f"{m.method}-ghost")) for m in shown.motions if m.method != "recorded"
+            ]
+
+    def pose(self, time: float) -> None:
+        """Put every copy where it is at a time of the recording, s; between rows positions are interpolated."""
+        dt, rows = self.shown.real.dt, len(self.shown.real)
+        x = float(np.clip(time / dt, 0, rows - 1))
+        i = min(int(x), rows - 2)
+        for motion, address in self.address:
+            q = self.shown.motions[motion].qpos
+            self.data.qpos[address] = q[i] + (x - i) * (q[i + 1] - q[i])
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+
+    def row(self, time: float) -> int:
+        """The newest row at a time of the recording, s."""
+        return int(np.clip(time / self.shown.real.dt + 1e-6, 0, len(self.shown.real) - 1))
+
+    @property
+    def middle(self) -> Array:
+        """Centre of the row of robots, (3), m."""
+        left, right, bottom, top = self.box
+        across, up = self.view.axes
+        return across * (left + right) / 2 + up * (bottom + top) / 2
+
+    def _address(self, prefix: str) -> Array:
+        names = self.shown.robot.joint_names
+        return np.array([self.model.joint(f"{prefix}/{name}").qposadr[0] for name in names])
+
+    def _fit(self, rows: slice, closeup: bool) -> tuple[tuple[float, float, float, float], float]:
+        """Extent of one robot on the picture over all motions, and its lowest point."""
+        robot, meta = self.shown.robot, self.shown.real.meta
+        model = dressed(robot, "#808080", meta.payload_mass, meta.payload_side).compile()
+        data = mujoco.MjData(model)
+        seen = np.flatnonzero((model.geom_group < 3) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE))
+        if not len(seen):
+            raise UsageError(f"{robot.mjcf}: has no visible geom; add one to each body to look at it")
+        near = _operated_bodies(model, robot) if closeup else set(range(model.nbody))
+        fits = np.array([model.geom_bodyid[g] in near for g in seen])
+        middle, half = model.geom_aabb[seen, None, :3], model.geom_aabb[seen, None, 3:]
+        corners = middle + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T  # (k, 8, 3)
+        address = [model.joint(name).qposadr[0] for name in robot.joint_names]
+        low, high, floor = np.full(2, np.inf), np.full(2, -np.inf), np.inf
+        axes = np.stack(self.view.axes)
+        for motion in self.shown.motions:
+            part = motion.qpos[rows]
+            for q in part[np.unique(np.linspace(0, len(part) - 1, SAMPLES).astype(int))]:
+                data.qpos[address] = q
+                mujoco.mj_kinematics(model, data)
+                points = data.geom_xpos[seen, None] + corners @ data.geom_xmat[seen].reshape(-1, 3, 3).mT
+                floor = min(floor, float(points[..., 2].min()))
+                places = points[fits].reshape(-1, 3) @ axes.T
+                low, high = np.minimum(low, places.min(axis=0)), np.maximum(high, places.max(axis=0))
+        return (float(low[0]), float(high[0]), float(low[1]), float(high[1])), floor
+
+    def _compose(self, base: Array, behind: Array) -> mujoco.MjModel:
+        scene, meta = mujoco.MjSpec(), self.shown.real.meta
+        scene.compiler.degree = False
+        _light(scene, self.floor, self.extent)
+        for motion, place in zip(self.shown.motions, base, strict=True):
+            coats = {motion.method: (motion.colour, place)}
+            if self.ghosts and motion.method != "recorded":
+                coats[f"{motion.method}-ghost"] = ("", place + behind)
+            for prefix, (colour, pos) in coats.items():
+                spec = dressed(self.shown.robot, colour, meta.payload_mass, meta.payload_side)
+                scene.nuser_actuator = spec.nuser_actuator  # of the servos' law; one that differs is warned of
+                scene.attach(spec, prefix=f"{prefix}/", frame=scene.worldbody.add_frame(pos=pos))
+        return scene.compile()
+
+
+def dressed(robot: RobotSpec, colour: str, payload_mass: float, payload_side: str = "both") -> mujoco.MjSpec:
+    """A robot to look at: one colour, housings, shells, payload; "" for a ghost."""
+    spec = build_spec(robot, payload_mass, payload_side)
+    spec.option = mujoco.MjSpec().option  # nothing is stepped; all copies must agree
+    for part in (*spec.actuators, *spec.lights, *spec.cameras, *spec.sensors, *spec.keys, *spec.pairs, *spec.excludes):
+        spec.delete(part)
+    for geom in [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+        spec.delete(geom)  # the scene has a ground of its own
+    payload = {f"payload_{m.side}" for m in robot.payload_mounts}
+    rgba = rgb(colour) if colour else GHOST
+    dark = (*(0.55 * np.array(rgba[:3])), rgba[3])
+    meshes = any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in spec.geoms)
+    for geom in spec.geoms:
+        geom.material = ""
+        geom.rgba = (PAYLOAD if colour else GHOST) if geom.parent.name in payload else rgba
+    if not meshes:
+        for body in spec.bodies[1:]:  # asked for the world's parent, MuJoCo 3.10 ends the process
+            _add_housings(body, dark)
+        _add_shells(spec, robot, rgba)
+    if not colour:
+        for geom in spec.geoms:
+            geom.size = THIN * np.array(geom.size)
+            _cast_no_shadow(geom)
+    return spec
+
+
+def rgb(colour: str) -> tuple[float, float, float, float]:
+    """#rrggbb as rgba; black a little lighter, since a black body shows no shape."""
+    parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    return (*(0.14 + 0.86 * p for p in parts), 1.0)  # type: ignore[return-value]
+
+
+def _add_housings(body: mujoco.MjsBody, rgba: tuple[float, ...]) -> None:
+    """A short cylinder about each joint axis, a third wider than the limb."""
+    around = [*body.geoms, *body.parent.geoms]
+    sizes = [g.size[0] for g in around if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
+    if not sizes:
+        return
+    radius = 1.35 * max(sizes)
+    for joint in body.joints:
+        middle, half = np.array(joint.pos), 1.1 * radius * np.array(joint.axis) / np.linalg.norm(joint.axis)
+        _add(body, mujoco.mjtGeom.mjGEOM_CYLINDER, [*(middle - half), *(middle + half)], radius, rgba)
+
+
+def _add_shells(spec: mujoco.MjSpec, robot: RobotSpec, rgba: tuple[float, ...]) -> None:
+    """Capsules and boxes of look.toml, or else the capsules of collision.toml, which are generous."""
+    for name, share in (("look.toml", 1.0), ("collision.toml", 0.85)):
+        path = robot.folder / name
+        if path.is_file():
+            table = read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields")
+            for part in (*(c["body"] for c in table.capsule), *(b.body for b in table.box)):
+                if spec.body(part) is None:
+                    raise RobotError(f"{path}: names body '{part}', which {robot.mjcf.name} lacks")
+            for c in table.capsule:
+                ends = [*c["from"], *c["to"]]
+                _add(spec.body(c["body"]), mujoco.mjtGeom.mjGEOM_CAPSULE, ends, share * c["radius"], rgba)
+            for b in table.box:
+                spec.body(b.body).add_geom(
+                    type=mujoco.mjtGeom.mjGEOM_BOX, pos=b.pos, size=b.size, mass=0, contype=0, conaffinity=0, rgba=rgba
+                )
+            return
+
+
+def _add(body: mujoco.MjsBody, kind: mujoco.mjtGeom, ends: list[float], radius: float, rgba: tuple[float, ...]) -> None:
+    body.add_geom(type=kind, fromto=ends, size=(radius, 0, 0), mass=0, contype=0, conaffinity=0, rgba=rgba)
+
+
+def _operated_bodies(model: mujoco.MjModel, robot: RobotSpec) -> set[int]:
+    """Bodies that carry operated joints, that these move, and that carry those."""
+    moving = {int(model.jnt_bodyid[model.joint(name).id]) for name in robot.operated}
+    found: set[int] = set()
+    for body in range(1, model.nbody):
+        chain = carriers(model, body)
+        if moving & chain:
+            found |= chain
+    return found
+
+
+def _cast_no_shadow(geom: mujoco.MjsGeom) -> None:
+    if hasattr(geom, "castshadow"):  # from MuJoCo 4 on
+        geom.castshadow = False
+
+
+def _light(scene: mujoco.MjSpec, floor: float, extent: float) -> None:
+    """White ground, one light that casts shadows and one that fills them."""
+    world = scene.worldbody
+    ground = world.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), pos=(0, 0, floor), rgba=(FLOOR, FLOOR, FLOOR, 1),
+        contype=0, conaffinity=0,
+    )  # fmt: skip
+    _cast_no_shadow(ground)  # onto itself
+    scene.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[FLOOR] * 3, rgb2=[FLOOR] * 3, width=8, height=48,
+    )  # fmt: skip
+    sun, fill = np.array([-0.25, 0.15, -1.0]), np.array([-0.6, -0.5, -0.4])
+    for direction, bright, shadow in ((sun, 0.5, True), (fill, 0.3, False)):
+        world.add_light(
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, pos=[0, 0, floor] - 2 * extent * direction, dir=direction,
+            diffuse=[bright] * 3, specular=[0.3 * bright] * 3, castshadow=shadow,
+        )  # fmt: skip
+    scene.visual.headlight.ambient = [0.32] * 3
+    scene.visual.headlight.diffuse = [0.1] * 3
+    scene.visual.headlight.specular = [0.0] * 3
+    scene.visual.map.shadowclip = 1.2
+    scene.visual.quality.shadowsize, scene.visual.quality.numslices, scene.visual.quality.numstacks = 2048, 18, 10
+    scene.visual.global_.offwidth = scene.visual.global_.offheight = 4096
+    scene.stat.extent = extent
+    scene.stat.center = [0, 0, floor]

@@ -1,0 +1,154 @@
+"""One sequence as it was asked for, simulated, corrected and recorded: the joint angles that `gaponet view` shows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError, UsageError
+from gaponet.base.progress import Progress, noted, silent
+from gaponet.data.sequence import Sequence
+from gaponet.data.signals import busiest
+from gaponet.data.store import Dataset, Entry
+from gaponet.report.candidate import Candidate, Seen
+from gaponet.report.figures.colours import colour
+from gaponet.report.methods import title
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.replay import Corrector, replay
+
+
+@dataclass(frozen=True)
+class Copy:
+    """One copy of the robot.
+
+    Attributes:
+        method: Key of plot.methods.
+        qpos: (T, n), rad; row t at t·dt.
+        error: Mean |q − q_real| over the operated joints, (T), rad; row 0 is the common start.
+    """
+
+    method: str
+    qpos: Array
+    error: Array
+
+    @property
+    def name(self) -> str:
+        """Name of the copy for people."""
+        return title(self.method)
+
+    @property
+    def colour(self) -> str:
+        """#rrggbb."""
+        return colour(self.method)
+
+    @property
+    def mpjae(self) -> float:
+        """Mean error over the whole motion, rad: what eval calls MPJAE."""
+        return float(self.error[1:].mean())
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """The motions of one recording.
+
+    Attributes:
+        motions: Target, nominal, corrected, recorded, in this order.
+        seen: Whether a shown model was trained or chosen on this recording; None without a model.
+    """
+
+    real: Sequence
+    robot: RobotSpec
+    motions: tuple[Copy, ...]
+    seen: bool | None
+
+    def only(self, methods: tuple[str, ...]) -> SideBySide:
+        """Some of the motions, in the order asked for; "aligned" means every model's."""
+        have = {m.method: m for m in self.motions}
+        wanted: list[str] = []
+        for name in methods:
+            models = [m for m in have if m not in ("target", "nominal", "recorded")]
+            wanted += models if name == "aligned" else [name]
+        for name in wanted:
+            if name not in have:
+                raise UsageError(f"--show {name}: here are {', '.join(have)}; models are given with --model RUN")
+        if not wanted:
+            raise UsageError("--show leaves nothing to look at; aligned motion needs --model RUN")
+        return replace(self, motions=tuple(have[name] for name in dict.fromkeys(wanted)))
+
+    def magnified(self, factor: float) -> SideBySide:
+        """Every difference from the recording times a factor, so that an eye can see it; errors stay as they are."""
+        if not factor > 0:
+            raise UsageError(f"--magnify is {factor}; give a positive factor, 1 for the truth")
+        grow = lambda m: replace(m, qpos=self.real.qpos + factor * (m.qpos - self.real.qpos))  # noqa: E731
+        return replace(self, motions=tuple(grow(m) for m in self.motions))
+
+    def busiest(self, seconds: float) -> float:
+        """Start of the stretch of this length with the most motion, s."""
+        rows = max(round(seconds / self.real.dt), 1)
+        return busiest(self.real.qpos[:, self.robot.operated_index], rows) * self.real.dt
+
+
+def pick(
+    dataset: Dataset, runs: ListOf[Path], motion: str = "", unit: str = "", payload_mass: float | None = None
+) -> Entry:
+    """The first sequence that fits; among those that no run has seen, where one of them fits."""
+    entries = dataset.select((motion,) if motion else ())
+    entries = sorted(entries, key=lambda e: was_seen(e, runs))
+    asked = [
+        e for e in entries
+        if unit in ("", e.meta.unit_id) and (payload_mass is None or abs(payload_mass - e.meta.payload_mass) < 1e-6)
+    ]  # fmt: skip
+    if not asked:
+        there = sorted({f"{e.meta.unit_id} with {e.meta.payload_mass:g} kg" for e in entries})
+        raise DatasetError(
+            f"{dataset.path}: no such recording of {motion or 'any motion'}; there are {', '.join(there)}. "
+            "Change --unit or --payload-mass"
+        )
+    return asked[0]
+
+
+def side_by_side(
+    dataset: Dataset,
+    entry: Entry,
+    robot: RobotSpec,
+    runs: ListOf[Path] = (),
+    progress: Progress = silent,
+) -> SideBySide:
+    """Replay a recording in the nominal simulator, in identified ones, and under each run's shipped model.
+
+    Args:
+        robot: Identified, it is shown beside the nominal one.
+        runs: Run folders, or folders of identified robots.
+    """
+    dataset.require_robot(robot)
+    real = dataset.read(entry)
+    simulators: dict[str, tuple[RobotSpec, Corrector | None]] = {"nominal": (robot.before_identification, None)}
+    if robot.nominal is not None:
+        simulators["identified"] = (robot, None)
+    for run in runs:
+        one = Candidate.load(run, robot)
+        if one.model is not None:
+            one.model.require(one.robot, real.dt)
+        if one.method in simulators:
+            raise UsageError(f"{run}: a second run of {title(one.method)}; give runs of different methods")
+        simulators[one.method] = (one.robot, one.corrector())
+    target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
+    shown = {"target": target}
+    for name, (simulator, corrector) in simulators.items():
+        told = noted(progress, name)
+        shown[name] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
+    shown["recorded"] = real.qpos
+    op = robot.operated_index
+    motions = tuple(Copy(k, q, np.abs(q - real.qpos)[:, op].mean(axis=1)) for k, q in shown.items())
+    known = [*runs, *([robot.folder] if robot.nominal is not None else [])]
+    return SideBySide(real, robot, motions, was_seen(entry, known) if known else None)
+
+
+def was_seen(entry: Entry, folders: ListOf[Path]) -> bool:
+    """Whether any of the runs or robot folders was fitted or chosen on a recording, or does not say."""
+    seen = [Seen.by(folder) for folder in folders]
+    return any(s is None or entry in s for s in seen)

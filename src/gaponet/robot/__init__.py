@@ -1,0 +1,1 @@
+"""Robots: robot.toml and MJCF, robot folders, vendors' models, collision shapes."""

@@ -1,0 +1,176 @@
+"""Whether a robot would hit itself, or what it stands on: distances between capsules, and to a plane, along a command.
+
+Shapes come from `collision.toml` in the robot's folder: capsules per body, groups of bodies that are not compared, and
+the height of the floor or table. A robot without that file is not checked.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import mujoco
+import numpy as np
+from annotated_types import Interval, Len
+from typing_extensions import TypedDict
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import RobotError
+from gaponet.base.structure import read_toml
+from gaponet.robot.spec import RobotSpec
+
+Metres = Annotated[float, Interval(ge=-100, le=100)]
+Point = tuple[Metres, Metres, Metres]
+CLEARANCE = 0.03  # m kept between shells: a loaded arm sags by centimetres below what it is told
+FINE = 0.03  # rad between postures that are looked at: a hand 0.7 m away moves by less than the clearance
+
+
+Radius = Annotated[float, Interval(ge=0, le=100)]
+Capsule = TypedDict("Capsule", {"body": str, "from": Point, "to": Point, "radius": Radius})
+
+
+@dataclass(frozen=True)
+class Box:
+    """Half lengths along the axes of the body, for looking at only."""
+
+    body: str
+    pos: Point
+    size: Point
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Floor or table, level: its height in the MJCF's world, and the bodies (beginnings of names) that stand on it."""
+
+    height: Metres = 0.0
+    stands: str = ""
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """collision.toml, or look.toml, which may hold boxes too."""
+
+    capsule: Annotated[tuple[Capsule, ...], Len(0, 1000)] = ()
+    same_limb: tuple[str, ...] = ()
+    plane: Plane | None = None
+    clearance: Annotated[float, Interval(ge=0, le=1)] = CLEARANCE
+    box: Annotated[tuple[Box, ...], Len(0, 1000)] = ()
+
+
+class Collision:
+    """Capsules of one robot, the pairs of them that may meet, and those that may meet the plane.
+
+    Attributes:
+        checked: Whether there are shapes at all.
+        clearance: Free space that a command keeps, m.
+        height: Where the plane is, m in the MJCF's world; None without one.
+    """
+
+    def __init__(
+        self, robot: RobotSpec, model: mujoco.MjModel, height: float | None = None, unchecked: bool = False
+    ) -> None:
+        """
+        Args:
+            height: Where the plane is, m, instead of what collision.toml says.
+            unchecked: Do without shapes.
+        """
+        self.model = model
+        self.data = mujoco.MjData(model)
+        shapes = Shapes() if unchecked else read_shapes(robot.folder)
+        _require_bodies(robot, model, shapes)
+        groups = [group.split() for group in shapes.same_limb]
+        self.checked, self.clearance = bool(shapes.capsule), shapes.clearance
+        self.names = [c["body"] for c in shapes.capsule]
+        self.body = np.array([model.body(name).id for name in self.names], int)
+        self.ends = np.array([[c["from"], c["to"]] for c in shapes.capsule], float).reshape(-1, 2, 3)
+        self.radius = np.array([c["radius"] for c in shapes.capsule], float)
+        self.pairs = np.array(
+            [
+                (i, k)
+                for i, k in itertools.combinations(range(len(self.names)), 2)
+                if self.names[i] != self.names[k] and not _grouped(self.names[i], self.names[k], groups)
+            ],
+            int,
+        ).reshape(-1, 2)
+        plane = shapes.plane
+        self.height = plane.height if height is None and plane else height
+        stands = tuple(plane.stands.split()) if plane else ()
+        above = [i for i, n in enumerate(self.names) if self.height is not None and not n.startswith(stands)]
+        self.above = np.array(above, int)
+
+    def distances(self, qpos: Array) -> Array:
+        """Free space of every pair, then of every shell above the plane, (T, n) rad → (T, pairs + shells) m."""
+        position, turn = np.empty((len(qpos), len(self.body), 3)), np.empty((len(qpos), len(self.body), 9))
+        data, body = self.data, self.body
+        for t, q in enumerate(qpos):
+            data.qpos = q
+            mujoco.mj_kinematics(self.model, data)
+            position[t], turn[t] = data.xpos[body], data.xmat[body]
+        ends = self.ends @ turn.reshape(*turn.shape[:2], 3, 3).swapaxes(-1, -2) + position[:, :, None]
+        i, k = self.pairs.T
+        between = segment_distance(ends[:, i, 0], ends[:, i, 1], ends[:, k, 0], ends[:, k, 1])
+        low = ends[:, self.above][..., 2].min(axis=-1) - (self.height or 0.0)
+        return np.concatenate([between - self.radius[i] - self.radius[k], low - self.radius[self.above]], axis=1)
+
+    def distance(self, qpos: Array) -> Array:
+        """The least free space at each posture, (T, n) rad → (T,) m; inf without shapes."""
+        return self.distances(qpos).min(axis=1, initial=np.inf)
+
+    def along(self, ctrl: Array) -> Array:
+        """Free space (pairs + shells,) m that a command (T, n) rad leaves, wherever that is; rows are thinned out."""
+        return self.distances(thinned(ctrl)).min(axis=0, initial=np.inf)
+
+    def nearest(self, free: Array) -> str:
+        """Which two come nearest, of free space (pairs + shells,) m, for messages."""
+        at = int(np.argmin(free))
+        if at < len(self.pairs):
+            return " and ".join(self.names[c] for c in self.pairs[at])
+        return f"{self.names[self.above[at - len(self.pairs)]]} and the plane at {self.height:g} m"
+
+
+def thinned(ctrl: Array, step: float = FINE) -> Array:
+    """Rows of a command (T, n) rad between which no joint goes further than `step` rad, if its own rows allow that."""
+    gone = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
+    marks = np.searchsorted(gone, np.arange(0.0, gone[-1], step))
+    return ctrl[np.unique(np.append(marks, len(ctrl) - 1))]
+
+
+def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
+    """Distance between segments a0–a1 and b0–b1, (…, 3) each → (…).
+
+    The nearest points of the two lines, clamped to the segments one after the other (Ericson, Real-Time Collision
+    Detection, 5.1.9).
+    """
+    u, v, w = a1 - a0, b1 - b0, a0 - b0
+    uu, vv, uv, uw, vw = (np.einsum("...i,...i", x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
+    tiny = 1e-12
+    s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, tiny), 0.0, 1.0)
+    t = np.clip((uv * s + vw) / np.maximum(vv, tiny), 0.0, 1.0)
+    s = np.clip((uv * t - uw) / np.maximum(uu, tiny), 0.0, 1.0)
+    gap = w + s[..., None] * u - t[..., None] * v
+    return np.sqrt(np.einsum("...i,...i", gap, gap))
+
+
+def read_shapes(folder: Path) -> Shapes:
+    """collision.toml of a robot folder; without the file, no shapes.
+
+    Raises:
+        RobotError: With the file and the field.
+    """
+    path = folder / "collision.toml"
+    return read_toml(Shapes, path, RobotError, "docs/new-robot.md lists the fields") if path.is_file() else Shapes()
+
+
+def _require_bodies(robot: RobotSpec, model: mujoco.MjModel, shapes: Shapes) -> None:
+    bodies = [model.body(b).name for b in range(model.nbody)]
+    for capsule in shapes.capsule:
+        if capsule["body"] not in bodies:
+            path, there = robot.folder / "collision.toml", ", ".join(bodies)
+            raise RobotError(f"{path}: capsule names body '{capsule['body']}', the MJCF has: {there}")
+
+
+def _grouped(a: str, b: str, groups: list[list[str]]) -> bool:
+    """Whether both bodies begin with words of one group."""
+    return any(a.startswith(tuple(group)) and b.startswith(tuple(group)) for group in groups)

@@ -1,0 +1,385 @@
+"""A robot: joint names, gains, limits, control period and payload mounts, read from one folder.
+
+A folder holds `robot.toml` (what a log and a controller need to know) and `robot.xml` (MJCF: kinematics, inertia, joint
+friction; its actuators, if any, are replaced by position actuators with the gains of `robot.toml`). A user adds a robot
+by writing such a folder; no code is needed.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import difflib
+import functools
+import re
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import JointMismatchError, RobotError
+from gaponet.base.structure import read_toml
+from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoType, Table, Tip
+
+__all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "available", "load_robot"]
+
+BUILTIN = Path(__file__).parent / "robots"
+LOG_UNITS = ("rad", "deg", "fraction")
+STOPS = ("stop_low", "stop_high")
+MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
+LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
+FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *LAW)
+MAX_SUGGESTIONS = 3  # similar joints that an error lists
+GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
+SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
+SIGNED = ("qpos_home", "offset", "zero", *STOPS)
+
+
+@dataclass(frozen=True)
+class RobotSpec:
+    """What is known about a robot without stepping it. n joints, always in the order of `joint_names`.
+
+    Attributes:
+        name: Folder name, e.g. "so101".
+        mjcf: Path of the MJCF.
+        folder: Where robot.toml is.
+        joint_names: All actuated joints, (n).
+        operated: The subset that the operator corrects, in the same order.
+        kp, kd: PD gains, (n), N·m/rad and N·m·s/rad.
+        effort_limit: Torque limit, (n), N·m.
+        qpos_home: Rest position, (n), rad.
+        log_units: Unit in which public logs hold each joint, (n): rad, deg, or fraction (0..1 of the MJCF range).
+        aliases: Other names of a joint in logs → its name here.
+        payload_mounts: Where payloads go.
+        dt: Control period, s.
+        timestep: Physics step at that control period, s; dt / timestep is an exact integer.
+        damping, armature, frictionloss: Identified values that replace the MJCF's, (n), N·m·s/rad, kg·m², N·m; NaN
+            where the MJCF's stands.
+        delay: Time from command to servo, (n), s.
+        offset: Offset of the servo's zero, (n), rad: it aims at command + offset.
+        zero: The encoder's: the MJCF's angle is reading + zero, (n), rad.
+        target_speed: Speed of the ramp that the servo's own generator makes of targets, (n), rad/s; 0 if it makes none.
+        stop_low, stop_high: Joint stops that narrow the MJCF's range, (n), rad; NaN where the MJCF's stands.
+        stribeck, stribeck_speed: Friction at rest beyond frictionloss, (n), N·m, and the speed at which a third of it
+            is left, rad/s.
+        friction_motor, friction_external: Friction per N·m of the motor's torque and of gravity's, (n).
+        min_torque: Least torque of a motor that turns at all, (n), N·m.
+        encoder_step: Steps in which the servo sees its angle, (n), rad; 0 if fine.
+        servos: Type of each joint's servo, (n); None where robot.toml does not say.
+        tips, table: What may touch a table, and the table; with one nothing else touches.
+        carries_payload: Whether the simulator has the payload that the robot has.
+        gain_scale: kp and kd of operated joints over those of [[joint]]; they are in kp and kd.
+        contacts: Whether links touch as the MJCF says. Off, nothing touches but tips a table: links welded to the world
+            collide for ever with their neighbours, which shows as a gap.
+        nominal: The robot before identification, where parameters were identified (sysid/identify.py).
+    """
+
+    name: str
+    description: str
+    mjcf: Path
+    folder: Path
+    joint_names: tuple[str, ...]
+    operated: tuple[str, ...]
+    kp: Array
+    kd: Array
+    effort_limit: Array
+    qpos_home: Array
+    log_units: tuple[str, ...]
+    aliases: dict[str, str]
+    payload_mounts: tuple[PayloadMount, ...]
+    dt: float
+    timestep: float
+    damping: Array = field(default_factory=lambda: np.array(np.nan))
+    armature: Array = field(default_factory=lambda: np.array(np.nan))
+    frictionloss: Array = field(default_factory=lambda: np.array(np.nan))
+    stop_low: Array = field(default_factory=lambda: np.array(np.nan))
+    stop_high: Array = field(default_factory=lambda: np.array(np.nan))
+    delay: Array = field(default_factory=lambda: np.array(0.0))
+    offset: Array = field(default_factory=lambda: np.array(0.0))
+    zero: Array = field(default_factory=lambda: np.array(0.0))
+    target_speed: Array = field(default_factory=lambda: np.array(0.0))
+    stribeck: Array = field(default_factory=lambda: np.array(0.0))
+    stribeck_speed: Array = field(default_factory=lambda: np.array(0.0))
+    friction_motor: Array = field(default_factory=lambda: np.array(0.0))
+    friction_external: Array = field(default_factory=lambda: np.array(0.0))
+    min_torque: Array = field(default_factory=lambda: np.array(0.0))
+    encoder_step: Array = field(default_factory=lambda: np.array(0.0))
+    servos: tuple[ServoType | None, ...] = ()
+    tips: tuple[Tip, ...] = ()
+    table: Table | None = None
+    contacts: bool = False
+    carries_payload: bool = True
+    gain_scale: float = 1.0
+    nominal: RobotSpec | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.joint_names)
+        for name in ("kp", "kd", "effort_limit", "qpos_home"):
+            if np.shape(getattr(self, name)) != (n,):
+                shape = np.shape(getattr(self, name))
+                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
+        for name in ("kp", "kd", "effort_limit", "qpos_home", *FITTED):
+            value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
+            if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
+                raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
+            if name not in SIGNED and (value < 0).any():
+                raise RobotError(f"{self.name}: {name} must not be negative, got {value}")
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "servos", self.servos or (None,) * n)
+        if len(set(self.joint_names)) != n:
+            raise RobotError(f"{self.name}: a joint name appears twice in {', '.join(self.joint_names)}")
+        if not self.operated:
+            raise RobotError(f"{self.name}: no joint has operated = true; the operator needs at least one")
+        ratio = self.dt / self.timestep
+        if abs(ratio - round(ratio)) > 1e-9 or ratio < 1:
+            raise RobotError(
+                f"{self.name}: dt / timestep = {self.dt} / {self.timestep} = {ratio:.4g} is not a whole number; "
+                "choose a timestep that divides the control period"
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The robot with its files: another process may be on a machine that has not this folder."""
+        files = [self.mjcf, *self.folder.glob("*.toml")]
+        return vars(self) | {"files": {file.name: file.read_bytes() for file in files if file.is_file()}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        files: dict[str, bytes] = state.pop("files")
+        vars(self).update(state)
+        if {f.name: f.read_bytes() for f in map(self.mjcf.parent.joinpath, files) if f.is_file()} != files:
+            folder = _unpacked(tuple(sorted(files.items())))
+            vars(self).update(folder=folder, mjcf=folder / self.mjcf.name)
+
+    @property
+    def decimation(self) -> int:
+        """Physics steps per control period of dt."""
+        return self.steps_per(self.dt)
+
+    def steps_per(self, dt: float) -> int:
+        """Physics steps per control period of another length, s: as many as keep a step close to `timestep`."""
+        return max(1, round(dt / self.timestep))
+
+    @property
+    def has_law(self) -> bool:
+        """Whether a servo does more than MuJoCo's position actuator (sim/servo.py)."""
+        return any(getattr(self, name).any() for name in LAW)
+
+    @property
+    def before_identification(self) -> RobotSpec:
+        """The nominal robot: this one, or what it was identified from."""
+        return self.nominal or self
+
+    def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
+        """The same robot with identified values: joint → any of SERVO. A damping below zero is taken from kd."""
+        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO}
+        for joint, values in servos.items():
+            i = self.index([joint])[0]
+            for name, value in values.items():
+                changed[name][i] = value
+            if changed["damping"][i] < 0:
+                changed["kd"][i] = max(changed["kd"][i] + changed["damping"][i], 0.0)
+                changed["damping"][i] = 0.0
+        return dataclasses.replace(self, **changed, nominal=self.nominal or self)
+
+    def with_gains(self, kp: tuple[float, ...] | None, kd: tuple[float, ...] | None) -> RobotSpec:
+        """The same robot with its servos set to other gains, (n) N·m/rad and N·m·s/rad; None leaves them as they are.
+
+        The nominal robot has these gains; what identification found is kept as a ratio to the nominal kp and kd.
+        """
+        if kp is None and kd is None:
+            return self
+        nominal = self.nominal or self
+        known = np.array(nominal.kp if kp is None else kp), np.array(nominal.kd if kd is None else kd)
+        if np.allclose(known, (nominal.kp, nominal.kd), rtol=GAIN_TOLERANCE, atol=0.0):
+            return self
+        stiffer = np.divide(known[0], nominal.kp, out=np.ones_like(nominal.kp), where=nominal.kp > 0)
+        found = np.divide(self.kd, nominal.kd, out=np.ones_like(nominal.kd), where=nominal.kd > 0)
+        nominal = dataclasses.replace(nominal, kp=known[0], kd=known[1])
+        own = self.nominal and nominal
+        return dataclasses.replace(self, kp=self.kp * stiffer, kd=known[1] * found, nominal=own)
+
+    def with_gain_scale(self, scale: float) -> RobotSpec:
+        """Return the same robot with the operated joints set to `scale` times the kp and kd of [[joint]]."""
+        ratio = np.ones(len(self.joint_names))
+        ratio[self.operated_index] = scale / self.gain_scale
+        nominal = self.nominal and self.nominal.with_gain_scale(scale)
+        return dataclasses.replace(self, kp=self.kp * ratio, kd=self.kd * ratio, gain_scale=scale, nominal=nominal)
+
+    @functools.cached_property
+    def qpos_range(self) -> Array:
+        """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited. Compiles the MJCF on first use."""
+        from gaponet.robot.mjcf import compiled, read_mjcf
+
+        model = compiled(read_mjcf(self.mjcf), self.mjcf)
+        try:
+            joints = [model.joint(name) for name in self.joint_names]
+        except KeyError as error:
+            raise RobotError(f"{self.mjcf}: lacks a joint of robot.toml: {error.args[0]}") from None
+        limited = np.array([model.jnt_limited[j.id] for j in joints], bool)[:, None]
+        return self.stopped(np.where(limited, [j.range for j in joints], [-np.inf, np.inf]))
+
+    def stopped(self, ranges: Array) -> Array:
+        """Joint ranges (n, 2) of the MJCF, rad, narrowed by identified stops; these never widen a range."""
+        return np.stack([np.fmax(ranges[:, 0], self.stop_low), np.fmin(ranges[:, 1], self.stop_high)], axis=1)
+
+    @property
+    def operated_index(self) -> Array:
+        """Positions of the operated joints in `joint_names`, (n_operated,)."""
+        return self.index(self.operated)
+
+    def index(self, names: tuple[str, ...] | list[str]) -> Array:
+        """Positions of `names` in `joint_names`; raises with the nearest names on a stranger."""
+        for name in names:
+            if name not in self.joint_names:
+                raise JointMismatchError(self._unknown(name, "a request")[0])
+        return np.array([self.joint_names.index(name) for name in names], int)
+
+    def resolve(self, name: str, where: str, extra: dict[str, str] | None = None) -> str:
+        """The robot's own name of a joint called `name` in a log.
+
+        Args:
+            name: Name in the log; of left/waist the robot has left_waist, or else the last part. kLeftElbow and
+                left_elbow are left_elbow_joint.
+            where: File, for the error.
+            extra: The user's --map, tried first.
+        """
+        full, short = name.strip(), name.strip().split("/")[-1]
+        for table in (extra or {}, self.aliases):
+            mapped = table.get(full, table.get(short))
+            if mapped is not None:
+                full = short = mapped
+        found = next((n for n in (full.replace("/", "_"), short) if n in self.joint_names), None)
+        same = [found] if found else [joint for joint in self.joint_names if _letters(joint) == _letters(short)]
+        if len(same) != 1:
+            told, near = self._unknown(short, where)
+            raise JointMismatchError(f"{told}. Map it with --map {short}={near}")
+        return same[0]
+
+    def _unknown(self, name: str, where: str) -> tuple[str, str]:
+        """Return the error text for an unknown joint name, and the most similar joint."""
+        near = difflib.get_close_matches(name, self.joint_names, n=MAX_SUGGESTIONS, cutoff=0.0)
+        said = f"{where} names joint '{name}', which robot '{self.name}' does not have; nearest: {', '.join(near)}"
+        return said, near[0]
+
+
+def _letters(joint: str) -> str:
+    """What names of one joint have in common in the styles of C, of ROS and of Python."""
+    return re.sub(r"[^a-z0-9]|joint", "", re.sub(r"^k(?=[A-Z])", "", joint).lower())
+
+
+@functools.cache
+def _unpacked(files: tuple[tuple[str, bytes], ...]) -> Path:
+    """A folder with these files until this process ends."""
+    folder = Path(tempfile.mkdtemp(prefix="gaponet-robot-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for name, content in files:
+        (folder / name).write_bytes(content)
+    return folder
+
+
+def available() -> list[str]:
+    """Names of the robots in the package."""
+    return sorted(p.parent.name for p in BUILTIN.glob("*/robot.toml"))
+
+
+def load_robot(name_or_path: str | Path) -> RobotSpec:
+    """Read a robot from the package by name, or from a folder by path.
+
+    A text without a slash is a name and never a folder of that name in the current directory; a Path, or a text with
+    a slash such as "./g1", is a folder.
+
+    Raises:
+        RobotError: With the folder, the field and what to write there.
+    """
+    folder = _folder(name_or_path)
+    toml = folder / "robot.toml"
+    if not toml.is_file():
+        raise RobotError(f"{folder}: no robot.toml there; put robot.toml and robot.xml there, or choose another")
+    table = read_toml(RobotTable, toml, RobotError, "docs/new-robot.md lists the fields")
+    mjcf = folder / table.mjcf
+    if not mjcf.is_file():
+        raise RobotError(f'{toml}: {mjcf.name} is missing beside it; put the MJCF there or name it with mjcf = "..."')
+    try:
+        return _spec(table, mjcf, folder)
+    except RobotError as error:
+        raise RobotError(f"{toml}: {error}") from None
+
+
+def as_option(folder: Path) -> str:
+    """What to write after --robot for a robot folder: with a slash, as a text without one is a name."""
+    return f"./{folder}" if folder.name == str(folder) else str(folder)
+
+
+def _folder(name_or_path: str | Path) -> Path:
+    """Where a robot is; refuses a name that could mean two."""
+    text, folder = str(name_or_path), Path(name_or_path)
+    if isinstance(name_or_path, Path) or folder.name != text or text == "..":
+        return folder
+    packaged, here = BUILTIN / text, (folder / "robot.toml").is_file()
+    if text not in available():
+        what = f"for the folder here write ./{text}" if here else "or give a folder, with a slash: ./my_robot"
+        raise RobotError(f"no robot '{text}': in the package are {', '.join(available())}; {what}")
+    if here and not packaged.samefile(folder):
+        raise RobotError(f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}")
+    return packaged
+
+
+def _servo_types(table: RobotTable) -> tuple[ServoType | None, ...]:
+    """One number of each joint."""
+    known: dict[str, ServoType | None] = {"": None} | {servo.name: servo for servo in table.servo}
+    for joint in table.joint:
+        if joint.servo not in known:
+            there = ", ".join(s.name for s in table.servo) or "none"
+            raise RobotError(f"joint '{joint.name}': servo '{joint.servo}' is no [[servo]]; there are: {there}")
+    return tuple(known[joint.servo] for joint in table.joint)
+
+
+def _spec(table: RobotTable, mjcf: Path, folder: Path) -> RobotSpec:
+    joints = table.joint
+    robot = RobotSpec(
+        name=table.name,
+        description=table.description or table.name,
+        mjcf=mjcf,
+        folder=folder.absolute(),  # told to other processes
+        joint_names=tuple(j.name for j in joints),
+        operated=tuple(j.name for j in joints if j.operated),
+        kp=np.array([j.kp for j in joints]),
+        kd=np.array([j.kd for j in joints]),
+        effort_limit=np.array([j.effort_limit for j in joints]),
+        qpos_home=np.array([j.home for j in joints]),
+        log_units=tuple(j.log_unit for j in joints),
+        aliases={alias: j.name for j in joints for alias in j.aliases},
+        payload_mounts=table.payload_mount,
+        dt=table.dt,
+        timestep=table.timestep,
+        servos=_servo_types(table),
+        tips=table.tip,
+        table=table.table,
+        contacts=table.contacts,
+        carries_payload=table.carries_payload,
+    ).with_gain_scale(table.gain_scale)
+    found = table.identified_table
+    if (robot.table or found) and not robot.tips:
+        raise RobotError("[table] is touched by nothing; name what may touch it in a [[tip]] with body, pos and radius")
+    for joint in table.identified:
+        if joint not in robot.joint_names:
+            raise RobotError(f"[identified.{joint}] names no joint; joints are {', '.join(robot.joint_names)}")
+    servos = {
+        joint: {name: value for name, value in vars(servo).items() if value is not None}
+        for joint, servo in table.identified.items()
+    }
+    identified = robot.with_servos(servos) if servos else robot
+    if found is not None:
+        identified = dataclasses.replace(identified, table=found, nominal=robot)
+    sides = [mount.side for mount in robot.payload_mounts]
+    for side in table.identified_mount:
+        if side not in sides:
+            raise RobotError(f"[identified_mount.{side}] names no [[payload_mount]]; sides are {', '.join(sides)}")
+    if moved := {side: vars(mount) for side, mount in table.identified_mount.items()}:
+        mounts = tuple(dataclasses.replace(m, **moved.get(m.side, {})) for m in robot.payload_mounts)
+        identified = dataclasses.replace(identified, payload_mounts=mounts, nominal=robot)
+    return identified

@@ -1,0 +1,128 @@
+"""The fields of a robot.toml, with their ranges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from annotated_types import Interval, Len
+
+from gaponet.base.structure import Angle, Name
+
+Gain = Annotated[float, Interval(ge=0, le=1e6)]
+Share = Annotated[float, Interval(ge=0, le=1)]
+Metres = Annotated[float, Interval(ge=-100, le=100)]
+
+
+@dataclass(frozen=True)
+class _Joint:
+    name: Name
+    kp: Gain  # N·m/rad
+    effort_limit: Gain  # N·m
+    kd: Gain = 0.0  # N·m·s/rad
+    home: Angle = 0.0  # rad
+    operated: bool = True
+    log_unit: Literal["rad", "deg", "fraction"] = "rad"
+    servo: str = ""  # name of a [[servo]]
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ServoType:
+    """One [[servo]]: a type that joints name, and what others measured of it, with the source."""
+
+    name: Name
+    source: str = ""
+    damping: Gain | None = None  # N·m·s/rad
+    armature: Gain | None = None  # kg·m²
+    frictionloss: Gain | None = None  # N·m
+    gain: Gain | None = None  # N·m/rad for a firmware kp of 1
+    gain_volts: Annotated[float, Interval(ge=0.1, le=1000)] | None = None  # … at this supply, which it goes with
+
+    @property
+    def published(self) -> dict[str, float]:
+        """Field → value, where there is one."""
+        found = {"damping": self.damping, "armature": self.armature, "frictionloss": self.frictionloss}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class PayloadMount:
+    """One [[payload_mount]], where a payload is attached: its centre at `pos` (m) in the frame of MJCF body `body`;
+    `mass` (kg) hangs there always, as a hand that the MJCF lacks."""
+
+    side: Name
+    body: str
+    pos: tuple[Metres, Metres, Metres]
+    mass: Annotated[float, Interval(ge=0, le=100)] = 0.0
+
+
+@dataclass(frozen=True)
+class _Mount:
+    """One [identified_mount.SIDE]."""
+
+    pos: tuple[Metres, Metres, Metres]
+    mass: Annotated[float, Interval(ge=0, le=100)]
+
+
+@dataclass(frozen=True)
+class _Servo:
+    """One [identified.JOINT]: values that replace the MJCF's and the nominal gain."""
+
+    kp: Gain | None = None
+    kd: Gain | None = None
+    effort_limit: Gain | None = None
+    damping: Gain | None = None
+    armature: Gain | None = None
+    frictionloss: Gain | None = None
+    delay: Annotated[float, Interval(ge=0, le=1)] | None = None  # s
+    offset: Angle | None = None  # rad
+    zero: Angle | None = None
+    target_speed: Gain | None = None  # rad/s
+    stop_low: Angle | None = None
+    stop_high: Angle | None = None
+    stribeck: Gain | None = None  # N·m
+    stribeck_speed: Gain | None = None  # rad/s
+    friction_motor: Share | None = None
+    friction_external: Share | None = None
+    min_torque: Gain | None = None  # N·m
+    encoder_step: Share | None = None  # rad
+
+
+@dataclass(frozen=True)
+class Tip:
+    """One [[tip]], a sphere of `radius` (m) that may touch the table, at `pos` (m) in the frame of MJCF body `body`."""
+
+    body: str
+    pos: tuple[Metres, Metres, Metres]
+    radius: Annotated[float, Interval(ge=1e-4, le=1)] = 1e-3
+
+
+@dataclass(frozen=True)
+class Table:
+    """[table], a level plane at `height` (m, MJCF world); its friction coefficient, its stiffness under a tip, N/m."""
+
+    height: Metres
+    friction: Annotated[float, Interval(ge=0, le=10)] = 0.3
+    stiffness: Annotated[float, Interval(ge=1, le=1e7)] = 2000.0
+
+
+@dataclass(frozen=True)
+class RobotTable:
+    name: Name
+    dt: Annotated[float, Interval(ge=1e-4, le=1)]  # s
+    timestep: Annotated[float, Interval(ge=1e-6, le=1)]  # s
+    joint: Annotated[tuple[_Joint, ...], Len(1, 500)]
+    servo: Annotated[tuple[ServoType, ...], Len(0, 50)] = ()
+    payload_mount: Annotated[tuple[PayloadMount, ...], Len(0, 20)] = ()
+    tip: Annotated[tuple[Tip, ...], Len(0, 20)] = ()
+    table: Table | None = None
+    contacts: bool = False  # links touch as the MJCF says; without it nothing touches but tips a table
+    carries_payload: bool = True  # false: the robot's payload is not in the simulator
+    gain_scale: Annotated[float, Interval(gt=0, le=1000)] = 1.0  # kp and kd of operated joints over those of [[joint]]
+    identified: dict[str, _Servo] = field(default_factory=dict)
+    identified_table: Table | None = None
+    identified_mount: dict[str, _Mount] = field(default_factory=dict)
+    description: str = ""
+    license: str = ""
+    mjcf: str = "robot.xml"

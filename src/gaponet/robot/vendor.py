@@ -1,0 +1,165 @@
+"""A vendor's model, MJCF or URDF, as it lies in its repository: with what it names, and without what is not there."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from gaponet.base.errors import RobotError
+from gaponet.base.sandbox import inside
+from gaponet.robot.finding import some
+from gaponet.robot.mjcf import compiled, read_mjcf, require_moderate, require_size, said
+
+MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
+KEEP = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
+        "boundmass": "1e-6", "boundinertia": "1e-9", "autolimits": "true"}  # fmt: skip
+DENSITY = 1000.0  # kg/m³, of links whose inertia is impossible
+
+
+def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
+    """A model file as a specification, and what was left out of it.
+
+    Args:
+        path: .xml (MJCF) or .urdf.
+        packages: Folders of package://NAME; one that is not named is looked for around the file.
+
+    Raises:
+        RobotError: Neither MJCF nor URDF, or broken.
+    """
+    if path.is_dir():
+        inside = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
+        raise RobotError(f"{path}: is a folder; name the model in it: {some(inside) or 'there is no .xml or .urdf'}")
+    if path.suffix == ".xacro":
+        raise RobotError(f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf")
+    require_size(path)
+    packages = {name: folder.absolute() for name, folder in packages.items()}
+    _try(path, packages)
+    return _read(path, packages)
+
+
+@inside(RobotError, "mujoco", 0.5)
+def _try(path: Path, packages: dict[str, Path]) -> None:
+    spec, _ = _read(path, packages)
+    require_moderate(compiled(spec, path), path)
+
+
+def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
+    root = ET.parse(path).getroot()
+    return _urdf(root, path, packages) if root.tag == "robot" else _mjcf(path)
+
+
+def _mjcf(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
+    spec = read_mjcf(path, tried=True)
+    place = path.parent / spec.meshdir
+    missing = {m.name or Path(m.file).stem: m for m in spec.meshes if m.file and not (place / m.file).is_file()}
+    for geom in [g for g in spec.geoms if g.meshname in missing]:
+        spec.delete(geom)
+    for mesh in missing.values():
+        spec.delete(mesh)
+    return spec, _left_out(sorted(missing), f"are not in {place}") + _unreadable(spec)
+
+
+def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
+    missing: list[str] = []
+    unread: list[str] = []
+    for element in [e for e in root if e.tag in ("transmission", "gazebo", "ros2_control")]:
+        root.remove(element)
+    for link in root.iter("link"):
+        for shape in [s for s in link if s.tag in ("visual", "collision")]:
+            mesh = shape.find("geometry/mesh")
+            if mesh is None:
+                continue
+            name = mesh.get("filename", "")
+            file = _resolve(name, path, packages)
+            if file is None or file.suffix.lower() not in MESHES:
+                (missing if file is None else unread).append(name)
+                link.remove(shape)
+            else:
+                mesh.set("filename", str(file.resolve()))
+    mended = _inertias(root)
+    own = root.find("mujoco")
+    own = ET.SubElement(root, "mujoco") if own is None else own
+    for compiler in own.findall("compiler"):
+        own.remove(compiler)
+    ET.SubElement(own, "compiler", KEEP)
+    with said(path, "not valid URDF"):
+        spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+    hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
+    notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
+    return spec, notes + _unreadable(spec) + mended
+
+
+def _left_out(names: list[str], why: str) -> list[str]:
+    return [f"{len(names)} mesh(es) {why}; left out: {some(names)}"] if names else []
+
+
+def _inertias(root: ET.Element) -> list[str]:
+    """Give links with mass whose inertia no body can have (URDFs often hold zeros) that of a ball; says which."""
+    impossible, light = [], []
+    for link in root.iter("link"):
+        inertial = link.find("inertial")
+        mass, inertia = (None, None) if inertial is None else (inertial.find("mass"), inertial.find("inertia"))
+        m = _number(mass, "value")
+        if inertial is not None and mass is not None and m <= 0:
+            link.remove(inertial)
+        if inertial is None or mass is None or m <= 0:
+            light.append(link.get("name", ""))
+            continue
+        xx, yy, zz, xy, xz, yz = (_number(inertia, f"i{axes}") for axes in ("xx", "yy", "zz", "xy", "xz", "yz"))
+        matrix = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if inertia is None or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] > 0:
+            continue
+        ball = 0.4 * m * (3 * m / (4 * np.pi * DENSITY)) ** (2 / 3)
+        for axes in ("xx", "yy", "zz", "xy", "xz", "yz"):
+            inertia.set(f"i{axes}", repr(float(ball)) if axes[0] == axes[1] else "0")
+        impossible.append(link.get("name", ""))
+    moved = {j.find("child").get("link", "") for j in root.iter("joint")  # type: ignore[union-attr]
+             if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
+    said = [f"inertia that no body has, taken as a ball's of the link's mass: {some(impossible)}"] if impossible else []
+    light = [name for name in light if name in moved]
+    return said + ([f"links without mass behind a joint, taken as 1 mg: {some(light)}"] if light else [])
+
+
+def _number(element: ET.Element | None, name: str) -> float:
+    try:
+        return float(element.get(name, "0")) if element is not None else 0.0
+    except ValueError:
+        return float("nan")
+
+
+def _unreadable(spec: mujoco.MjSpec) -> list[str]:
+    """Leave out meshes that MuJoCo cannot read, for all but their looks are in the links' own inertias; says which."""
+    said = []
+    for mesh in spec.meshes:
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
+    while len(spec.meshes):
+        try:
+            spec.copy().compile()
+            break
+        except (ValueError, mujoco.FatalError) as error:
+            why = " ".join(str(error).split())
+            bad = next((m for m in spec.meshes if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why), None)
+            if bad is None:
+                break
+            said.append(f"mesh left out: {why}")
+            for geom in [g for g in spec.geoms if g.meshname == bad.name]:
+                spec.delete(geom)
+            spec.delete(bad)
+    return said
+
+
+def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:
+    """Where a mesh is, or None."""
+    kind, _, rest = name.rpartition("://")
+    if kind not in ("package", "model"):
+        places = [path.parent / rest]
+    else:
+        package, _, inner = rest.partition("/")
+        above = path.resolve().parents
+        places = [packages[package] / inner] if package in packages else []
+        places += [p / inner for p in above if p.name == package] + [p / rest for p in above]
+        places += [p / inner for p in above if (p / "package.xml").is_file()]
+    return next((p for p in places if p.is_file()), None)

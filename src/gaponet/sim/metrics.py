@@ -1,0 +1,152 @@
+"""How far a simulator is from the robot: the metrics, in free run, grouped as people ask for them.
+
+e = q_sim − q_real after each step, operated joints only. A motion counts as one whatever its length; a group's
+number is the mean over its sequences.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.robot.spec import RobotSpec
+
+THRESHOLDS = (0.05, 0.1, 0.5)  # rad, of the large-gap ratio
+HORIZONS_S = (0.02, 0.2, 1.0, 5.0)  # 1, 10, 50, 250 steps at 50 Hz
+_Row = dict[str, float]  # metrics of a sequence, or their means
+
+
+def standard_error(values: Array) -> float:
+    """The standard error of the mean of values that belong to motions; nan for a single one.
+
+    For a difference of methods give their differences motion by motion (paired)."""
+    values = np.asarray(values)
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One simulated sequence beside its recording: real and sim positions of the operated joints, (T, n) rad."""
+
+    meta: SequenceMeta
+    dt: float
+    qpos_real: Array
+    qpos_sim: Array
+    recorded: tuple[int, ...] | None = None  # columns that the recording holds; None for all
+
+    @classmethod
+    def of(cls, real: Sequence, simulated: Array, robot: RobotSpec) -> Run:
+        """A recording and simulated positions of all joints, (T, n_all) rad; keeps neither."""
+        op = robot.operated_index
+        unknown = real.meta.unrecorded
+        held = tuple(i for i, j in enumerate(robot.operated) if j not in unknown) if unknown else None
+        return cls(real.meta, real.dt, real.qpos[:, op], np.asarray(simulated)[:, op], held)
+
+    @property
+    def error(self) -> Array:
+        """e after each step, (T − 1, n), rad: row 0 is the common start and is no error."""
+        return (self.qpos_sim - self.qpos_real)[1:]
+
+    def holds(self, columns: list[int] | None) -> list[int] | None:
+        """Those of these columns (None: all) that the recording holds; None where it holds all."""
+        if self.recorded is None:
+            return columns
+        return [i for i in self.recorded if columns is None or i in columns]
+
+
+def runs(sequences: ListOf[Sequence], simulated: ListOf[Array], robot: RobotSpec) -> list[Run]:
+    """Put recordings and simulated positions (T, n_all) together, operated joints only."""
+    return [Run.of(s, q, robot) for s, q in zip(sequences, simulated, strict=True)]
+
+
+def summary(part: Iterable[Run], robot: RobotSpec) -> dict[str, Any]:
+    """All metrics of a method: totals, and by joint, motion, payload, unit and horizon; one run in memory at a time.
+
+    Joints that no recording holds are left out of by_joint.
+    """
+    joints: dict[str, list[int]] = {j: [i] for i, j in enumerate(robot.operated)}
+    no_wrist = [i for i, j in enumerate(robot.operated) if "wrist" not in j]  # the paper's figure 3 is without wrists
+    rows: dict[str, dict[str, list[_Row]]] = defaultdict(lambda: defaultdict(list))
+    for run in part:
+        meta = run.meta
+        whole = _row(run)
+        for row, arm in zip(whole, _row(run, no_wrist), strict=False):
+            row["mpjae_no_wrist"] = arm["mpjae"]
+        names = {"": "", "motion": meta.motion, "payload": f"{meta.payload_mass:g}", "unit": meta.unit_id}
+        for group, name in names.items():
+            rows[group][name] += whole
+        for j, column in joints.items():
+            rows["joint"][j] += _row(run, column)
+        for horizon, error in _horizons(run).items():
+            rows["horizon"][horizon].append({"mpjae": error})
+    held = [j for j in joints if rows["joint"][j]]
+    order = {"joint": held, **{g: sorted(rows[g]) for g in ("motion", "payload", "unit")}}
+    order["horizon"] = [h for h in (*(f"{s:g}" for s in HORIZONS_S), "whole") if h in rows["horizon"]]
+    total = {"mpjae_no_wrist": float("nan")} | _mean(rows[""][""])
+    return total | {f"by_{g}": {name: _mean(rows[g][name]) for name in names} for g, names in order.items()}
+
+
+def metrics(part: ListOf[Run], columns: list[int] | None = None) -> dict[str, float]:
+    """Metrics averaged over sequences, over all joints or over some columns.
+
+    Returns:
+        mpjae rad, rmse rad, q_dis rad·s (Δt Σ|e| per joint), static and dynamic rad (the median error; the rest),
+        iqr and range of |e| rad, large_0.05 … shares of |e| beyond a threshold, correlation, cosine, mape % (those that
+        SAGE and the paper report, tables show the first few).
+    """
+    return _mean([row for run in part for row in _row(run, columns)])
+
+
+def _mean(rows: list[_Row]) -> _Row:
+    return {k: float(np.mean([row[k] for row in rows if k in row])) for k in dict.fromkeys(k for r in rows for k in r)}
+
+
+def _row(run: Run, columns: list[int] | None = None) -> list[_Row]:
+    """One sequence's metrics over these columns; none where it holds none of them."""
+    if (held := run.holds(columns)) == []:
+        return []
+    c = slice(None) if held is None else held
+    error = run.error[:, c].astype(float)
+    size = np.abs(error)
+    real, sim = run.qpos_real[1:, c].astype(float), run.qpos_sim[1:, c].astype(float)
+    low, high = np.percentile(size, [25, 75], axis=0)
+    bias = np.median(error, axis=0)
+    out = {
+        "mpjae": size.mean(),
+        "rmse": np.sqrt((error**2).mean(axis=0)).mean(),
+        "q_dis": (size.sum(axis=0) * run.dt).mean(),
+        "static": np.abs(bias).mean(),
+        "dynamic": np.abs(error - bias).mean(),
+        "iqr": (high - low).mean(),
+        "range": np.ptp(size, axis=0).mean(),
+        "correlation": _mean_correlation(real, sim),
+        "cosine": (
+            (real * sim).sum(0) / np.maximum(np.linalg.norm(real, axis=0) * np.linalg.norm(sim, axis=0), 1e-12)
+        ).mean(),
+        "mape": (size / np.maximum(np.abs(real), 0.01)).mean() * 100,
+    }
+    return [out | {f"large_{t:g}": (size >= t).mean() for t in THRESHOLDS}]
+
+
+def _mean_correlation(real: Array, sim: Array) -> float:
+    """Pearson's r, averaged over joints that moved; 1 where none did."""
+    moved = (np.ptp(real, axis=0) > 0.01) & (np.ptp(sim, axis=0) > 1e-6)
+    values = [np.corrcoef(real[:, j], sim[:, j])[0, 1] for j in np.flatnonzero(moved)]
+    return float(np.mean(values)) if values else 1.0
+
+
+def _horizons(run: Run) -> _Row:
+    """mpjae at times after the common start, as far as the motion lasts; and over the whole motion.
+
+    The error at a horizon is that of the steps in its last half, so that one frame does not decide.
+    """
+    error = np.abs(run.error if run.recorded is None else run.error[:, list(run.recorded)])
+    lasts = {f"{s:g}": last for s in HORIZONS_S if (last := max(round(s / run.dt), 1)) <= len(error)}
+    return {h: error[last // 2 : last].mean() for h, last in lasts.items()} | {"whole": error.mean()}

@@ -1,0 +1,281 @@
+"""What compiles and is still likely a mistake: the simulator is stepped, and each finding says what to write where."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import replace
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from gaponet.robot.collision import Collision
+from gaponet.robot.finding import LEVELS, Finding, some
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model
+
+Array = np.ndarray
+
+SECONDS = 60.0  # of a hold
+NUDGE = 0.01  # rad from home at its start
+RESTS = 0.05  # rad/s: faster in the last ten seconds, it does not rest
+CREEP = 1e-3  # rad in its second half
+SAG = 0.1  # rad
+GROWTH = 1e-3  # of a small motion in one physics step, beyond which it grows
+TURNS = 0.1  # rad a step: an unstable step turns a motion round, one that falls goes on
+POSTURES = 8  # at random, in which small motions are looked at
+ARMATURE = 1e-5  # kg·m²; less is none
+BURIED = 1e-4  # m inside each other: they collide
+
+
+class Growth(NamedTuple):
+    """Factor by which a small motion grows in a physics step, the joint that moves most, whether it turns back."""
+
+    factor: float
+    joint: int
+    turns: bool
+
+
+def check_robot(robot: RobotSpec, payloads: tuple[float, ...] = (0.0,), postures: Array | None = None) -> list[Finding]:
+    """Step the nominal simulator of a robot and judge it, worst first.
+
+    Args:
+        robot: Loaded by load_robot.
+        payloads: kg in every mount.
+        postures: Postures from the logs, (k, n) rad; default random ones within the joint ranges.
+
+    Raises:
+        RobotError: It does not compile.
+    """
+    models = {mass: build_model(replace(robot, delay=np.zeros(len(robot.kp))), mass) for mass in payloads}
+    model = models[payloads[0]]
+    if (robot.folder / "collision.toml").is_file():
+        Collision(robot, model)  # raises where it is wrong
+    places = _random_postures(robot) if postures is None else postures
+    found = [
+        *_joints(robot), *_loads(robot, models), *_limits(robot, model), *_couplings(robot, model),
+        *_contacts(robot, places, postures is not None), *_steps(robot, models, places),
+    ]  # fmt: skip
+    if not any(f.level == "error" for f in found):
+        found += _hold(robot, payloads)
+    if not robot.payload_mounts:
+        text = "no [[payload_mount]]: payloads other than 0 will be refused; add one to robot.toml if it carries any"
+        found.append(Finding("warning", "payload", text))
+    return sorted(found, key=lambda f: -LEVELS.index(f.level))
+
+
+def _joints(robot: RobotSpec) -> Iterator[Finding]:
+    for i, name in enumerate(robot.joint_names):
+        low, high = robot.qpos_range[i]
+        if robot.kp[i] <= 0:
+            text = f"{name}: kp is {robot.kp[i]:g}; a position-controlled joint needs kp > 0 in robot.toml"
+            yield Finding("warning", "gains", text, (name,))
+        if not low <= robot.qpos_home[i] <= high:
+            text = f"{name}: home {robot.qpos_home[i]:g} lies outside its range [{low:.2f}, {high:.2f}]: write home"
+            yield Finding("warning", "home", f"{text} in robot.toml, or range in robot.xml", (name,))
+        if not np.isfinite(low):
+            text = (
+                f"{name}: has no range in the MJCF; commands are not clipped and doctor cannot judge positions: write "
+                "range in robot.xml"
+            )
+            yield Finding("warning", "range", text, (name,))
+
+
+def _loads(robot: RobotSpec, models: dict[float, mujoco.MjModel]) -> Iterator[Finding]:
+    """Can each joint hold its home?"""
+    for mass, model in models.items():
+        load = np.abs(static_torque(model, robot.qpos_home[None])[0])
+        for i in np.flatnonzero(load > robot.effort_limit):
+            carrying = f" with {mass:g} kg" if mass else ""
+            text = (
+                f"{robot.joint_names[i]}: needs {load[i]:.3g} N·m to hold its home{carrying}, its limit is "
+                f"{robot.effort_limit[i]:g}: check effort_limit in robot.toml, masses and home"
+            )
+            yield Finding("warning", "load", text, (robot.joint_names[i],), {"torque": load[i], "payload_mass": mass})
+
+
+def _limits(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
+    """Torque limits that override each other."""
+    for i, name in enumerate(robot.joint_names):
+        j = model.joint(name).id
+        most = np.abs(model.jnt_actfrcrange[j]).min() if model.jnt_actfrclimited[j] else np.inf
+        if most < 0.999 * robot.effort_limit[i]:
+            text = (
+                f"{name}: actuatorfrcrange in robot.xml stops the motor at {most:g} N·m, before effort_limit = "
+                f"{robot.effort_limit[i]:g} in robot.toml does: delete one, or write the right figure at both"
+            )
+            yield Finding("warning", "limits", text, (name,), {"actuatorfrcrange": most})
+
+
+def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
+    """What else moves or holds a joint, and what is missing."""
+    names = np.array(robot.joint_names)
+    for count, kind in ((model.neq, "equality"), (model.ntendon, "tendon")):
+        if count:
+            text = f"robot.xml has {count} <{kind}> constraint(s): the simulator obeys them; delete what is no part"
+            yield Finding("note", "couplings", f"{text} of the robot")
+    springs = names[model.jnt_stiffness > 0]
+    if len(springs):
+        yield Finding(
+            "note", "couplings", f"springs at {some(springs.tolist())}: stiffness in robot.xml", tuple(springs)
+        )
+    if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
+        text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
+        yield Finding("warning", "couplings", text)
+    if (model.body_gravcomp != 0).any():
+        text = "gravcomp in robot.xml takes weight off bodies: right where the controller compensates gravity; else "
+        yield Finding("note", "couplings", f"{text}delete it")
+    bare = names[model.dof_armature < ARMATURE]
+    if len(bare):
+        text = (
+            f"no armature at {some(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times ratio "
+            "squared); write armature in robot.xml, gaponet identify finds it"
+        )
+        yield Finding("note", "inertia", text, tuple(bare))
+    free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9)]
+    if len(free):
+        text = (
+            f"no damping, kd or friction at {some(free.tolist())}: it swings for ever; write kd in robot.toml, or "
+            "damping and frictionloss in robot.xml"
+        )
+        yield Finding("warning", "damping", text, tuple(free))
+
+
+def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Finding]:
+    """Which links lie inside each other?"""
+    model = build_model(replace(robot, contacts=True, table=None))
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        yield Finding("ok", "contacts", "robot.xml has contacts off: nothing touches but tips a table")
+        return
+    data = mujoco.MjData(model)
+    name = lambda geom: model.body(model.geom_bodyid[geom]).name  # noqa: E731
+
+    def pairs(qpos: Array) -> set[str]:
+        data.qpos[:] = qpos
+        mujoco.mj_fwdPosition(model, data)
+        return {" and ".join(sorted((name(c.geom1), name(c.geom2)))) for c in data.contact if c.dist < -BURIED}
+
+    home = pairs(robot.qpos_home)
+    seen = [pairs(q) for q in postures]
+    always = sorted({*home, *(set.intersection(*seen) if seen else ())})
+    if always:
+        level, so = "ok", "they do not touch: contacts are off in robot.toml"
+        if robot.contacts:
+            level = "warning"
+            so = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
+        text = f"at home {some(always)} lie inside each other; {so}"
+        yield Finding(level, "contacts", text, values={"pairs": always})
+    share = float(np.mean([bool(s - set(always)) for s in seen])) if seen else 0.0
+    if share and (logged or robot.contacts):
+        what = "of the logs' postures" if logged else "of random postures"
+        often = sorted(set().union(*seen) - set(always))
+        does = "and touch: the logs' robot did not go through itself" if robot.contacts else "(contacts are off)"
+        level = "warning" if robot.contacts and logged else "note"
+        yield Finding(level, "contacts", f"in {share:.0%} {what} {some(often)} lie inside each other {does}",
+                      values={"pairs": often, "share": share})  # fmt: skip
+    if not always and not share:
+        yield Finding("ok", "contacts", f"no links lie inside each other at home and in {len(postures)} postures")
+
+
+def _steps(robot: RobotSpec, models: dict[float, mujoco.MjModel], postures: Array) -> Iterator[Finding]:
+    """Do small motions die away under these gains, inertias and this step? Without friction, which hides it."""
+    thin = [robot.qpos_home, *postures[:: max(1, len(postures) // POSTURES)][:POSTURES]]
+    cases = [(mass, model, q) for mass, model in models.items() for q in thin]
+    found = [_growth(model, q) for _, model, q in cases]
+    k = max(range(len(found)), key=lambda k: found[k][0])
+    (growth, joint, turns), mass = found[k], cases[k][0]
+    name = robot.joint_names[joint]
+    if growth <= 1 + GROWTH:
+        yield Finding("ok", "step", "gains, inertias and physics step go together", values={"growth": growth})
+    elif not turns:
+        load = f" with {mass:g} kg" if mass else ""
+        text = (
+            f"{name}: kp {robot.kp[joint]:g} is too little to hold it up{load}: it falls away from its target; check "
+            "kp in robot.toml"
+        )
+        yield Finding("warning", "step", text, (name,), {"growth": growth})
+    else:
+        stable = lambda h, a: all(_growth(m, q, h, a)[0] <= 1 + GROWTH for _, m, q in cases)  # noqa: E731
+        step = next((h for h in (robot.timestep / 2**k for k in range(1, 7)) if stable(h, 0.0)), None)
+        armature = next((a for a in (1e-4 * 2**k for k in range(14)) if stable(robot.timestep, a)), None)
+        cures = [f"timestep = {step:g} in robot.toml"] if step else []
+        cures += [f"armature = {armature:g} in robot.xml where it is less"] if armature else []
+        text = (
+            f"{name}: kp {robot.kp[joint]:g} and kd {robot.kd[joint]:g} on so little inertia are unstable in physics "
+            f"steps of {robot.timestep * 1e3:g} ms: write {' or '.join([*cures, 'a smaller kp'])}"
+        )
+        yield Finding("error", "step", text, (name,), {"growth": growth, "timestep": step, "armature": armature})
+
+
+def _growth(model: mujoco.MjModel, q: Array, timestep: float | None = None, armature: float = 0.0) -> Growth:
+    """How the worst small motion about a posture goes on, which targets hold against gravity."""
+    model = copy(model)
+    model.opt.timestep = timestep or model.opt.timestep
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.actuator_forcelimited[:] = False
+    model.dof_armature[:] = np.maximum(model.dof_armature, armature)
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    kp = model.actuator_gainprm[:, 0]
+    data.ctrl[:] = q + np.divide(data.qfrc_bias, kp, out=np.zeros_like(kp), where=kp > 0)
+    slopes = np.zeros((2 * model.nv, 2 * model.nv))
+    mujoco.mjd_transitionFD(model, data, 1e-6, True, slopes, None, None, None)
+    if not np.isfinite(slopes).all():
+        return Growth(np.inf, 0, True)
+    values, vectors = np.linalg.eig(slopes)
+    k = int(np.abs(values).argmax())
+    joint = int(np.abs(vectors[: model.nv, k]).argmax())
+    return Growth(float(np.abs(values[k])), joint, bool(abs(np.angle(values[k])) > TURNS))
+
+
+def _hold(robot: RobotSpec, payloads: tuple[float, ...]) -> Iterator[Finding]:
+    """A minute at home at every payload: does it rest, and where?"""
+    sim = BatchSim(robot, [Condition(mass, "both", robot.dt) for mass in payloads], nthread=1)
+    home = np.tile(robot.qpos_home, (len(payloads), 1))
+    low, high = robot.qpos_range.T
+    sim.reset(slice(None), np.clip(home + NUDGE, low, high), np.zeros_like(home), past=home[:, None])
+    rows = round(SECONDS / robot.dt)
+    speed, full, middle = np.zeros_like(home), np.zeros(home.shape, bool), home
+    for t in range(rows):
+        sim.step(home)
+        if t >= rows * 5 // 6:
+            speed = np.fmax(speed, np.abs(sim.qvel))
+            full |= np.abs(sim.torque) > 0.999 * robot.effort_limit
+        if t == rows // 2:
+            middle = sim.qpos.copy()
+    creep, sag = np.abs(sim.qpos - middle), np.abs(sim.qpos - home)
+    light = " where its armature is small: write armature = 0.003 or more in robot.xml"
+    swings = "check kp and kd; write more damping in robot.xml"
+    if (full & (speed > RESTS)).any():
+        swings = (
+            "its motor gives all it can, one way and the other, and MuJoCo's motors brake no more then: write kd as "
+            "damping in robot.xml and kd = 0 in robot.toml, a shorter timestep, or armature"
+        )
+    quiet = True
+    for what, amount, most, level, mend in (
+        ("does not come to rest: {:.2g} rad/s after a minute", speed, RESTS, "error", swings),
+        ("creeps {:.2g} rad in half a minute of a hold", creep, CREEP, "warning", f"friction gives way{light}"),
+        ("hangs {:.2g} rad from its target", sag, SAG, "note", "check kp and effort_limit against masses"),
+    ):
+        wrong = np.argwhere(~(amount <= most))
+        if not len(wrong) or (level != "error" and not quiet):
+            continue
+        quiet = False
+        p, j = max(wrong, key=lambda k: float(np.nan_to_num(amount[*k], nan=np.inf)))
+        names = tuple(dict.fromkeys(robot.joint_names[i] for _, i in wrong))
+        load = f" with {payloads[p]:g} kg" if payloads[p] else ""
+        more = f" ({len(names) - 1} more joints do)" if len(names) > 1 else ""
+        text = f"{robot.joint_names[j]} {what.format(amount[p, j])}{load}{more}: {mend}"
+        yield Finding(level, "hold", text, names, {"payload_mass": payloads[p], "amount": float(amount[p, j])})
+    if quiet:
+        masses = ", ".join(f"{p:g}" for p in payloads)
+        yield Finding("ok", "hold", f"home is held for {SECONDS:g} s with {masses} kg without creeping or swinging")
+
+
+def _random_postures(robot: RobotSpec) -> Array:
+    low, high = np.clip(robot.qpos_range.T, -np.pi, np.pi)
+    return np.random.default_rng(0).uniform(low, high, (100, len(robot.kp)))

@@ -1,0 +1,1 @@
+"""System identification: fit, calibration, torque, uncertainty, drift, and motions worth recording."""

@@ -1,0 +1,367 @@
+"""Labels that recordings lack, estimated: which payload each carried, and by which unit it was made.
+
+Recordings in which one joint moves, asked for the same again and again, differ by load and by unit. Held torque at
+equal commands is a + b·m: m is one of the payloads that were in the room, b is common, a is the unit's. Each joint and
+command is fitted on its own, by expectation and maximisation over all pairs of unit and payload, each as likely.
+Recordings that follow each other with equal torque are repetitions of one unit, and units are told by the order of
+their torques, which is thought to be the same at every payload; one joint's first unit need not be another's.
+
+Torque also tells the time: it is kp (command − position) − kd velocity of the command in force, so a recording whose
+commands were written down late, or early, shows to a quarter of a period, whatever it carries.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError
+from gaponet.base.files import write_text
+from gaponet.base.text import measured
+from gaponet.data.log import Log
+from gaponet.sysid.torque import Gains, servo_gains
+
+MOVED = 0.05  # rad that a command moves a joint
+SAME_END = 0.05  # of the widest command of a joint: ends that are nearer are one command
+SETTLE = 0.1  # s
+ALIKE = 3.0  # standard deviations of a repetition within which neighbours are repetitions
+LEVER, APART = 0.3, 2.5  # N·m per kg, and bands apart in their widths, from which a joint tells its payload
+FEW, ROUNDS, EXPLAINED = 4, 4, 0.9  # recordings; of the search; of the torque's variance, by the servo's law
+NEAR = 0.5  # kg that a payload may be off its label
+LATE, STEP, WIDEST = 0.015, 0.005, 0.08  # s: beside the others; steps and range of the search
+KILOGRAMS = re.compile(r"_(\d+(?:[.p]\d+)?)kg(?:_|$)")
+
+
+@dataclass
+class Labelled:
+    """One recording.
+
+    Attributes:
+        name: The name that import gives it.
+        joint, command: The joint that moves, and where to, rad.
+        torque: Each row's torque, with its command, (k,) N·m and rad; gain times error where none was recorded.
+        known: kg, where a file's name says it.
+        payload, unit: Estimated, kg and a number from 0 on within the joint; told: whether the joint tells its payload.
+        held: What its torque says of the payload where nobody knows the unit, kg.
+        copy: The name of a recording with the same samples that came before.
+        follows: Time, command, position, velocity and torque of each row, (5, k), where torque was recorded.
+        late: How much later its torque follows the command than in the other recordings of the joint, s.
+    """
+
+    name: str
+    joint: str
+    command: float
+    torque: tuple[Array, Array]
+    known: float | None
+    payload: float = 0.0
+    unit: int = 0
+    told: bool = False
+    held: float = 0.0
+    copy: str = ""
+    follows: Array | None = field(default=None, repr=False)
+    late: float = 0.0
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One joint and command: recordings, N·m per kg, bands apart in their widths, N·m of each unit without payload."""
+
+    joint: str
+    command: float
+    count: int
+    slope: float
+    apart: float
+    units: Array
+    told: bool
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What was estimated; `agreement` is of the recordings whose payload a file's name says, where joints tell it;
+    `gains` are what the torque of a joint's recordings says of its servo, in all and at their ends."""
+
+    recordings: list[Labelled]
+    cells: list[Cell]
+    payloads: tuple[float, ...]
+    agreement: dict[str, float] = field(default_factory=dict)
+    gains: dict[str, tuple[Gains, Gains]] = field(default_factory=dict)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is to be said of them, in sentences."""
+        a, late = self.agreement, [r for r in self.recordings if abs(r.late) > LATE]
+        told = [
+            f"of {a['said']} recordings whose payload the file's name says, {a['within_half_a_kg']:.0%} are within "
+            f"0.5 kg of it; of {a['not_said']} others {a['taken_for_one_of_these']:.0%} are taken for one of these"
+        ] if a else []  # fmt: skip
+        loaded = [r for r in self.recordings if r.told and not r.copy and abs(r.late) <= LATE]
+        near = f"{sum(abs(r.held - r.payload) < NEAR for r in loaded)} of {len(loaded)}"
+        if loaded:
+            told += [f"torque alone, whichever the unit, says {near} payloads within {NEAR:g} kg of their label"]
+        told += [
+            f"{joint}: torque is kp (command − position) − kd velocity, kp {measured(g.kp, g.error)} N·m/rad ("
+            f"{measured(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: {g.explained:.1%} of "
+            "its variance"
+            for joint, (g, end) in self.gains.items()
+            if g.trusted
+        ]
+        return told + [
+            f"{r.name}: its torque follows the command {abs(r.late) * 1e3:.0f} ms {'later' if r.late > 0 else 'sooner'}"
+            f" than in the other recordings of {r.joint}: clocks of command and state are apart; it is left out"
+            for r in late
+        ]
+
+
+def estimate(logs: Iterable[tuple[str, Log]], payloads: Sequence[float], units: int, gain: dict[str, float]) -> Labels:
+    """Estimate payload and unit of every recording; a file's name is never looked at for that, only to be compared.
+
+    Args:
+        logs: Name and recording, one moving joint each.
+        payloads: The masses that were in the room, kg.
+        units: How many robots there were.
+        gain: Joint → N·m/rad, for recordings without torque.
+
+    Raises:
+        LogError: More than one joint moves.
+    """
+    found: list[Labelled] = []
+    seen: dict[tuple[str, str], Labelled] = {}
+    for name, log in logs:
+        one = _look(name, log, gain)
+        digest = hashlib.sha256(b"".join(log.channels[c].values.tobytes() for c in ("ctrl", "qpos"))).hexdigest()
+        first = seen.setdefault((one.joint, digest), one)
+        if first is not one:
+            one.copy = first.name
+            first.known = one.known if first.known is None else first.known
+        found.append(one)
+    own = [r for r in found if not r.copy]
+    for joint in dict.fromkeys(r.joint for r in own):
+        _clocks([r for r in own if r.joint == joint and r.follows is not None])
+    timely = [r for r in own if abs(r.late) <= LATE]
+    cells = [_fit(part, payloads, units) for part in _by_command(timely)]
+    follows: dict[str, list[Array]] = {}
+    for r in timely:
+        follows.setdefault(r.joint, []).extend([] if r.follows is None else [r.follows[1:]])
+    first_of = {r.name: r for r in own}
+    for r in found:
+        if r.copy:
+            r.payload, r.unit, r.told = (getattr(first_of[r.copy], f) for f in ("payload", "unit", "told"))
+    said = [r for r in own if r.known is not None and r.told]
+    agreement = {}
+    if said:
+        near = lambda r, m: abs(r.payload - m) < NEAR  # noqa: E731
+        masses = {r.known for r in said}
+        others = [r for r in own if r.known is None and r.told]
+        agreement = {
+            "said": len(said), "within_half_a_kg": float(np.mean([near(r, r.known) for r in said])),
+            # What a file's name does not list is none of these either, where such files list all of a payload.
+            "not_said": len(others),
+            "taken_for_one_of_these": float(np.mean([r.payload in masses for r in others] or [False])),
+        }  # fmt: skip
+    gains = {j: (servo_gains(each), servo_gains(each, 1)) for j, each in follows.items() if len(each) >= FEW}
+    return Labels(found, cells, tuple(payloads), agreement, gains)
+
+
+def _look(name: str, log: Log, gain: dict[str, float]) -> Labelled:
+    ctrl, qpos = log.channels["ctrl"], log.channels["qpos"]
+    moved = np.flatnonzero(np.ptp(ctrl.values, axis=0) > MOVED)
+    if len(moved) != 1:
+        raise LogError(
+            f"{log.source}: {len(moved)} joints are commanded to move; labels are told from recordings of one"
+        )
+    j, after = int(moved[0]), SETTLE
+    joint = log.joint_names[j]
+    if "tau" in log.channels:
+        time, values = log.channels["tau"].time, log.channels["tau"].values[:, j]
+    else:
+        time, values = (
+            qpos.time,
+            gain[joint] * (ctrl.values[: len(qpos.values), j] - qpos.values[: len(ctrl.values), j]),
+        )
+    later = time[: len(values)] >= time[0] + after
+    told = np.interp(time[: len(values)][later], ctrl.time, ctrl.values[:, j])
+    follows = None
+    if "tau" in log.channels:
+        clock = ctrl.time
+        at = lambda c: np.interp(clock, log.channels[c].time, log.channels[c].values[:, j])  # noqa: E731
+        speed = at("qvel") if "qvel" in log.channels else np.gradient(at("qpos"), clock)
+        follows = np.stack([clock, ctrl.values[:, j], at("qpos"), speed, at("tau")])
+    kilograms = KILOGRAMS.search(Path(log.source.partition("#")[0]).stem)
+    known = float(kilograms[1].replace("p", ".")) if kilograms else None
+    return Labelled(name, joint, float(ctrl.values[-1, j]), (values[later], told), known, follows=follows)
+
+
+def _clocks(part: list[Labelled]) -> None:
+    """Say of each recording of a joint how much later than in the others its torque follows the command."""
+    shifts = np.arange(-WIDEST, WIDEST + STEP / 2, STEP)
+
+    def rows(r: Labelled, shift: float) -> Array:  # command − position, −velocity, 1, torque
+        time, ctrl, qpos, qvel, tau = r.follows  # type: ignore[misc]
+        inside = (time - WIDEST >= time[0]) & (time + WIDEST <= time[-1])
+        return np.stack([np.interp(time - shift, time, ctrl) - qpos, -qvel, np.ones_like(tau), tau])[:, inside]
+
+    def left(x: Array) -> Array:  # N·m, of each recording and shift
+        return np.array([np.abs(np.tensordot(m[:, :3], x, (1, 0)) - m[:, 3]).mean(axis=1) for m in every])
+
+    def law(k: int) -> tuple[float, Array]:  # kp, kd and a constant, of the half that they suit best
+        suited = np.arange(len(part))
+        for _ in range(ROUNDS):
+            rows = np.concatenate([every[i][k] for i in suited], axis=1)
+            x = np.linalg.lstsq(rows[:3].T, rows[3])[0]
+            costs = left(x)[:, k]
+            suited = np.argsort(costs)[: max(FEW, len(part) // 2)]
+        return float(np.median(costs)), x
+
+    if len(part) < FEW:
+        return
+    every = [np.stack([rows(r, s) for s in shifts]) for r in part]  # (shifts, 4, k) each
+    _, x = min((law(k) for k in range(len(shifts))), key=lambda one: one[0])
+    late = left(x).argmin(axis=1).tolist()
+    rest = np.concatenate([x @ m[k, :3] - m[k, 3] for m, k in zip(every, late, strict=True)])
+    torque = np.concatenate([m[0, 3] for m in every])
+    if rest.var() < (1 - EXPLAINED) * torque.var() and x[0] > 0:
+        for r, k in zip(part, late, strict=True):
+            r.late = round(float(shifts[k] - np.median(shifts[late])), 4)
+
+
+def _by_command(recordings: list[Labelled]) -> list[list[Labelled]]:
+    """Recordings of one joint that end in one place, in their order; `command` becomes that of them all."""
+    parts = []
+    for joint in dict.fromkeys(r.joint for r in recordings):
+        mine = [r for r in recordings if r.joint == joint]
+        ends = np.array([r.command for r in mine])
+        order = np.argsort(ends)
+        cut = np.diff(ends[order]) > SAME_END * max(float(np.ptp(ends)), 1.0)
+        for group in np.split(order, np.flatnonzero(cut) + 1):
+            part = [mine[i] for i in sorted(group)]
+            for r in part:
+                r.command = round(float(ends[group].mean()), 2)
+            parts.append(part)
+    return parts
+
+
+def _fit(part: list[Labelled], payloads: Sequence[float], units: int) -> Cell:
+    """Label the recordings of one joint and command."""
+    raw = _at_equal_commands([r.torque for r in part])
+    sign = float(np.sign(np.median(raw))) or 1.0
+    x = sign * raw  # gravity's torque grows with what hangs on it
+    masses = np.asarray(payloads, float)
+    if len(x) < len(masses):
+        return _untold(part, masses)
+    step = float(np.median(np.abs(np.diff(x)))) / 0.954  # most neighbours are repetitions
+    width, slope, base = _bands(x, masses)
+    start = [base + np.array(d) * width for d in itertools.combinations(np.linspace(-2, 2, 9), units)]
+    fits = [_mixture(x, masses, a, slope, 0.5 * width, max(step / 2, 0.04 * slope)) for a in start]
+    _, zero, slope, _ = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
+    load = masses[np.abs(x[:, None] - (zero[:, None] + slope * masses).ravel()).argmin(axis=1) % len(masses)]
+    new = (np.abs(np.diff(x)) > ALIKE * max(step, 1e-6)) | (np.diff(load) != 0)
+    group = np.concatenate([[0], np.cumsum(new)])
+    mean = np.bincount(group, x) / np.bincount(group)
+    first = np.unique(group, return_index=True)[1]
+    unit, own = _ranked(mean - slope * load[first], load[first], units)
+    told = bool(slope >= LEVER and slope / width >= APART)
+    held = (x - own.mean()) / slope
+    for r, g, m, kg in zip(part, group, load, held, strict=True):
+        r.payload, r.held = float(m), float(kg)
+        r.unit, r.told = int(unit[g]), told
+    return Cell(part[0].joint, part[0].command, len(part), sign * slope, float(slope / width), sign * own, told)
+
+
+def _at_equal_commands(recordings: list[tuple[Array, Array]]) -> Array:
+    """Mean torque of each, (k,) N·m, where all were told the same: one may have begun a period later than another."""
+    way = 1.0 if np.mean([told[-1] - told[0] for _, told in recordings]) > 0 else -1.0
+    risen = [np.maximum.accumulate(way * told) for _, told in recordings]
+    low, high = max(r[0] for r in risen), min(r[-1] for r in risen)
+    if not high > low:
+        return np.array([torque.mean() for torque, _ in recordings])
+    grid = np.linspace(low, high, 50)
+    return np.array([np.interp(grid, r, torque).mean() for r, (torque, _) in zip(risen, recordings, strict=True)])
+
+
+def _ranked(rest: Array, load: Array, units: int) -> tuple[Array, Array]:
+    """Units, (k,), of groups by what payload leaves of their torque, N·m, and that of each unit, (units,).
+
+    At each payload the units stand in one order; where there are not as many groups as units, the nearest one.
+    """
+    bands = [np.flatnonzero(load == m) for m in np.unique(load)]
+    whole = [np.sort(rest[b]) for b in bands if len(b) == units]
+    own = np.mean(whole, axis=0) if whole else np.quantile(rest, (np.arange(units) + 0.5) / units)
+    unit = np.abs(rest[:, None] - own).argmin(axis=1)
+    for b in bands:
+        if len(b) == units:
+            unit[b[np.argsort(rest[b])]] = np.arange(units)
+    return unit, own
+
+
+def _untold(part: list[Labelled], masses: Array) -> Cell:
+    for r in part:
+        r.payload = float(masses[0])
+    return Cell(part[0].joint, part[0].command, len(part), 0.0, 0.0, np.zeros(0), False)
+
+
+def _bands(x: Array, masses: Array) -> tuple[float, float, float]:
+    """Width, distance per kg and first of evenly spaced bands, all units together."""
+    span = float(np.ptp(x)) / float(np.ptp(masses))
+    fits = [
+        _mixture(x, masses, np.array([a]), b * span, 0.3 * b * span, 0.02 * b * span)
+        for b in np.linspace(0.4, 1.1, 15)
+        for a in np.percentile(x, [0, 5, 10, 15, 20, 25])
+    ]
+    _, zero, slope, width = max((f for f in fits if f[2] > 0), key=lambda f: f[0], default=fits[0])
+    return max(width, 1e-9), slope, float(zero[0])
+
+
+def _mixture(
+    x: Array, masses: Array, zero: Array, slope: float, width: float, least: float
+) -> tuple[float, Array, float, float]:
+    """Expectation and maximisation of normals of one width at zero + slope·masses, all as likely.
+
+    Args:
+        x: Torque of each recording, (k,) N·m.
+        masses: kg, (p,).
+        zero, slope, width, least: Where to start, (units,) and scalars; no width below `least`.
+
+    Returns:
+        Log likelihood, zero, slope, width.
+    """
+    for _ in range(60):
+        apart = x[:, None, None] - zero[:, None] - slope * masses  # (k, units, masses)
+        w = np.exp(-0.5 * (apart**2 - (apart**2).min(axis=(1, 2), keepdims=True)) / width**2)
+        w /= w.sum(axis=(1, 2), keepdims=True)
+        n = np.maximum(w.sum(axis=(0, 2)), 1e-9)
+        m, mean = (w * masses).sum(axis=(0, 2)) / n, (w * x[:, None, None]).sum(axis=(0, 2)) / n
+        aside = masses - m[:, None]
+        slope = float((w * aside * (x[:, None, None] - mean[:, None])).sum() / max((w * aside**2).sum(), 1e-12))
+        zero = mean - slope * m
+        apart = x[:, None, None] - zero[:, None] - slope * masses
+        width = max(float(np.sqrt((w * apart**2).sum() / len(x))), least, 1e-9)
+    likely = np.log(np.exp(-0.5 * (apart / width) ** 2).sum(axis=(1, 2)) + 1e-300) - np.log(width)
+    return float(likely.sum()), zero, slope, width
+
+
+def write(labels: Labels, folder: Path, rate: float | None = None) -> None:
+    """logs.toml and labels.csv in a folder, which `gaponet import LOGS --logs FOLDER/logs.toml` takes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = io.StringIO()
+    sheet = csv.writer(text)
+    sheet.writerow(["file", "motion", "unit", "payload", "estimated", "leave_out"])
+    for r in labels.recordings:
+        payload = r.payload if r.known is None else r.known
+        what = (
+            "unit" if r.known is not None else "unit, payload" if r.told else "unit, payload (not told by this joint)"
+        )
+        sheet.writerow([r.name, f"{r.joint}-to{r.command:+.2f}", f"unit-{r.unit + 1}", f"{payload:g}", what,
+                        "yes" if r.copy or abs(r.late) > LATE else "no"])  # fmt: skip
+    write_text(folder / "labels.csv", text.getvalue())
+    lines = ["# gaponet data labels: units and payloads are estimated from held torque", 'manifest = "labels.csv"']
+    lines += [f"rate = {rate:g}"] if rate else []
+    write_text(folder / "logs.toml", "\n".join(lines) + "\n")

@@ -1,0 +1,143 @@
+"""Whether a robot can follow a command, and the nearest command that it can.
+
+Four limits: joint range, joint speed, free space between limbs and above floor or table, and torque by inverse dynamics
+of the nominal model at every payload. For a given motion the torque is an affine function of the payload mass (up to
+the payload ball's own radius), so the lightest and the heaviest payload bound all between.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.robot.collision import Collision
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.dynamics import inverse_dynamics
+from gaponet.sim.model import build_model
+from gaponet.sysid.motion.motion import GRID, Motion
+
+MAX_PAYLOAD = 3.0  # kg per hand: the heaviest of the SimLifter recipe, and the default
+MAX_SPEED = 4.0  # rad/s: under half of the 9 of the slowest H1-2 arm joint (unitreerobotics/unitree_ros, h1_2.urdf)
+RANGE_MARGIN = 0.02  # rad kept from a hard stop
+STILL_SHARE = 0.95  # of the usable torque that may go into standing still; beyond it no time is slow enough
+TORQUE_SHARE = 0.85  # of the effort limit that a command may ask for; the rest is for feedback and heavier real links
+
+
+@dataclass(frozen=True)
+class Demand:
+    """The worst that a command asks of any joint: 1.0 is the limit."""
+
+    position: float
+    speed: float
+    torque: float
+    gravity: float  # the part of torque that remains however slowly the motion is played
+    worst_joint: str  # by torque
+    clearance: float  # m of free space where it is least, …
+    nearest: str  # … and between what
+    clear: bool  # whether that is enough
+
+    @property
+    def met(self) -> bool:
+        """Within all limits."""
+        return max(self.position, self.speed, self.torque) <= 1.0 + 1e-9 and self.clear
+
+
+class Feasibility:
+    """Limits of one robot at payloads from zero to max_payload."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        max_payload: float = MAX_PAYLOAD,
+        height: float | None = None,
+        unchecked: bool = False,
+    ) -> None:
+        """
+        Args:
+            height: Where the floor or table is, m, instead of what collision.toml says.
+            unchecked: Do without shapes.
+        """
+        self.robot = robot
+        self.low, self.high = robot.qpos_range[:, 0] + RANGE_MARGIN, robot.qpos_range[:, 1] - RANGE_MARGIN
+        self.max_payload = max_payload if robot.payload_mounts else 0.0
+        self.models: list[mujoco.MjModel] = [build_model(robot, p, dt=GRID) for p in sorted({0.0, self.max_payload})]
+        self.limit = TORQUE_SHARE * robot.effort_limit
+        self.collision = Collision(robot, self.models[0], height, unchecked)
+
+    def demand(self, ctrl: Array, dt: float, named: Array | slice = slice(None), need: Array | None = None) -> Demand:
+        """What a command (T, n) rad at period dt asks for.
+
+        Args:
+            named: The joints that must be within their ranges.
+            need: Free space to be kept, (pairs + shells,) m; default the clearance.
+        """
+        qvel = np.gradient(ctrl, dt, axis=0)
+        qacc = np.gradient(qvel, dt, axis=0)
+        zero = np.zeros_like(ctrl)
+        share = np.max([np.abs(inverse_dynamics(m, ctrl, qvel, qacc)) for m in self.models], axis=0) / self.limit
+        still = np.max([np.abs(inverse_dynamics(m, ctrl, zero, zero)) for m in self.models], axis=0) / self.limit
+        free = self.collision.along(ctrl)
+        least = float(free.min(initial=np.inf))
+        centre, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        with np.errstate(invalid="ignore"):
+            position = np.nan_to_num(np.abs(ctrl - centre) / half, nan=0.0)  # unlimited joints: inf / inf
+        return Demand(
+            position=float(position[:, named].max()),
+            speed=float(np.abs(qvel).max() / MAX_SPEED),
+            torque=float(share.max()),
+            gravity=float(still.max()),
+            worst_joint=self.robot.joint_names[int(share.max(axis=0).argmax())],
+            clearance=least,
+            nearest=self.collision.nearest(free) if len(free) else "",
+            clear=bool((free >= (self.collision.clearance if need is None else need)).all()),
+        )
+
+    def fit(self, motion: Motion, tries: int = 40, need: Array | None = None) -> Motion:
+        """Slow the motion down, or bring it nearer to a posture that is fine, until it fits.
+
+        It is slowed where speed or acceleration asks too much, and brought nearer where even standing still does or
+        where limbs meet: to its own start if that is fine, else to the robot's home. Joints that it does not name stay.
+
+        Raises:
+            UsageError: It does not fit after `tries` changes; the message says what it still asks for.
+        """
+        named = self.robot.index(motion.named(self.robot))
+        low, high = np.full_like(self.low, -np.inf), np.full_like(self.high, np.inf)
+        low[named], high[named] = self.low[named], self.high[named]
+        ctrl = np.clip(motion.ctrl, low, high)
+        anchor = ctrl[0].copy()
+        if not self.still(anchor, need):  # of all joints, those that are only held too
+            anchor[named] = np.clip(self.robot.qpos_home, low, high)[named]
+        for _ in range(tries):
+            asks = self.demand(ctrl, motion.dt, named, need)
+            if asks.met:
+                return replace(motion, ctrl=ctrl)
+            if asks.gravity > STILL_SHARE or not asks.clear:
+                ctrl = anchor + 0.93 * (ctrl - anchor)
+            else:
+                ctrl = stretch(ctrl, min(max(asks.speed, asks.torque**0.5, 1.03), 1.5))
+            ctrl = np.clip(ctrl, low, high)
+        raise UsageError(
+            f"motion '{motion.name}' does not fit {self.robot.name} after {tries} changes: {asks.worst_joint} needs "
+            f"{asks.torque:.2f} of its usable torque at {self.max_payload:g} kg, speed is {asks.speed:.2f} of "
+            f"{MAX_SPEED:g} rad/s, {asks.nearest or 'limbs'} come as near as {asks.clearance * 100:.1f} cm (at least "
+            f"{self.collision.clearance * 100:g}). Start it from a posture that is easier to hold, or collect with a "
+            "lighter payload"
+        )
+
+    def still(self, posture: Array, need: Array | None = None) -> bool:
+        """Whether a posture (n,) rad can be held at every payload, clear of the body; need as in `demand`."""
+        asks = self.demand(np.repeat(posture[None], 2, axis=0), GRID, need=need)
+        return asks.gravity <= STILL_SHARE and asks.clear
+
+
+def stretch(ctrl: Array, factor: float) -> Array:
+    """The same path (T, n), `factor` times slower, on the same grid."""
+    from scipy.interpolate import CubicSpline
+
+    rows = round((len(ctrl) - 1) * factor) + 1
+    return CubicSpline(np.arange(len(ctrl)), ctrl)(np.linspace(0, len(ctrl) - 1, rows))

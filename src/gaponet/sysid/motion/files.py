@@ -1,0 +1,143 @@
+"""Motion files: SAGE motion txt, csv and npz, read into a Motion, or written from one.
+
+SAGE txt: a line of joint names (comma separated, each a name or a path /robot/link/joint), then one row per sample in
+rad at 50 Hz. csv: the same with a `time` column (s) that sets the period. npz: joint_names, ctrl (T, k) rad and dt s.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import LogError, UsageError
+from gaponet.base.files import whole, write_text
+from gaponet.data.describe.limits import refuse_degrees
+from gaponet.data.sequence import LONGEST, SHORTEST
+from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.motion.motion import Motion
+
+SAGE_DT = 0.02  # s: the format has no time column, its files are at 50 Hz
+LARGEST = 64 << 20  # bytes of a file, unpacked: 10 hours of 27 joints at 10 Hz
+SUFFIXES = (".txt", ".csv", ".npz")
+
+
+def read_motion(path: str | Path, robot: RobotSpec) -> Motion:
+    """A motion from a file; joints that the file does not name are at home, and stay where they are found on a robot.
+
+    Args:
+        path: .txt, .csv or .npz.
+        robot: Decides names, order and home.
+
+    Raises:
+        LogError: Unreadable; with file, line and what is wrong.
+        JointMismatchError: A joint that the robot does not have.
+    """
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise LogError(f"{path}: motion files end in {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
+    if path.stat().st_size > LARGEST:
+        raise LogError(f"{path}: has more than {LARGEST >> 20} MiB; cut it into shorter motions")
+    names, rows, period = _npz(path) if path.suffix == ".npz" else _text(path)
+    period = period or SAGE_DT
+    if not SHORTEST <= period <= LONGEST:
+        raise LogError(f"{path}: its period is {period:g} s; expected {SHORTEST} to {LONGEST:g}")
+    joints = tuple(robot.resolve(name, str(path)) for name in names)
+    columns = robot.index(joints)
+    if len(set(joints)) != len(joints):
+        raise LogError(f"{path}: two columns are the same joint of {robot.name}; delete one")
+    refuse_degrees(rows, joints, robot, lambda row: f"{path}: command {row + 1}")
+    ctrl = np.repeat(robot.qpos_home[None], len(rows), axis=0)
+    ctrl[:, columns] = rows
+    return Motion(path.stem, level_of(ctrl, robot), period, ctrl, joints)
+
+
+def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> None:
+    """The joints that a motion names, at a control rate, Hz, as a file that read_motion reads.
+
+    Raises:
+        UsageError: A .txt, which has no time column, at another rate than 50 Hz.
+    """
+    names = list(motion.named(robot))
+    rows = motion.sample(1 / rate)[:, robot.index(names)]
+    if path.suffix == ".npz":
+        with whole(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, joint_names=np.array(names), ctrl=rows, dt=1 / rate)
+        return
+    if path.suffix == ".txt" and abs(rate * SAGE_DT - 1) > 1e-9:
+        raise UsageError(f"{path}: SAGE motion files are at {1 / SAGE_DT:g} Hz; write csv or npz at {rate:g} Hz")
+    if path.suffix == ".csv":
+        rows, names = np.column_stack([np.arange(len(rows)) / rate, rows]), ["time", *names]
+    text = "\n".join([", ".join(names), *(", ".join(f"{x:.6f}" for x in row) for row in rows)])
+    write_text(path, text + "\n")
+
+
+def level_of(ctrl: Array, robot: RobotSpec) -> str:
+    """joint when one joint moves, upper_body when only operated joints and torso move, else whole_body."""
+    moved = [name for name, span in zip(robot.joint_names, np.ptp(ctrl, axis=0), strict=True) if span > 1e-6]
+    if len(moved) <= 1:
+        return "joint"
+    upper = {name for name in robot.joint_names if name in robot.operated or name.startswith(("torso", "waist"))}
+    return "upper_body" if set(moved) <= upper and len(upper) < len(robot.joint_names) else "whole_body"
+
+
+def _text(path: Path) -> tuple[list[str], Array, float | None]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: not a text file") from None
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    rows = []
+    for number, line in enumerate(lines[1:], 2):
+        if not line.strip():
+            continue
+        cells = line.replace(",", " ").split()
+        try:
+            row = [float(cell) for cell in cells]
+        except ValueError:
+            raise LogError(f"{path}:{number}: not a row of numbers: {line[:60]}") from None
+        if len(row) != len(names) or not np.isfinite(row).all():
+            raise LogError(f"{path}:{number}: {len(row)} values for {len(names)} names, or one is not finite")
+        rows.append(row)
+    if len(rows) < 2:
+        raise LogError(f"{path}: {len(rows)} rows after the line of joint names; a motion needs two or more")
+    table = np.array(rows)
+    if "time" not in names:
+        return names, table, None
+    at = names.index("time")
+    period = np.diff(table[:, at])
+    if not (period > 0).all() or np.ptp(period) > 0.01 * period.mean():
+        raise LogError(f"{path}: time must rise evenly; it steps by {period.min():.4g} to {period.max():.4g} s")
+    return names[:at] + names[at + 1 :], np.delete(table, at, axis=1), float(period.mean())
+
+
+def _npz(path: Path) -> tuple[list[str], Array, float | None]:
+    arrays: dict[str, Any] = {}
+    try:
+        with zipfile.ZipFile(path) as packed:
+            size = sum(part.file_size for part in packed.infolist())
+        if size <= LARGEST:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in ("joint_names", "ctrl", "dt") if name in file}
+    # Nothing in the block is ours. Of a damaged file zipfile, zlib, struct, tokenize and NumPy raise whatever they
+    # stumble over (fuzzing met six kinds), and document none: a list would turn the next kind into a traceback.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise LogError(f"{path}: not a readable npz file ({reason}); write it again") from None
+    if size > LARGEST:
+        raise LogError(f"{path}: unpacks to more than {LARGEST >> 20} MiB; cut it into shorter motions")
+    for name, kind, dimensions in (("joint_names", "U", 1), ("ctrl", "fiu", 2), ("dt", "fiu", 0)):
+        if name not in arrays and name != "dt":
+            raise LogError(f"{path}: array '{name}' is missing; it holds {', '.join(arrays) or 'no other either'}")
+        if name in arrays and (arrays[name].dtype.kind not in kind or arrays[name].ndim != dimensions):
+            what = "text" if kind == "U" else "numbers"
+            raise LogError(f"{path}: array '{name}' must hold {what} in {dimensions} dimensions; write it again")
+    names, rows = arrays["joint_names"].tolist(), arrays["ctrl"].astype(float)
+    if rows.shape[1] != len(names) or len(rows) < 2 or not np.isfinite(rows).all():
+        raise LogError(f"{path}: ctrl has shape {rows.shape} or holds NaN; {len(names)} joint names")
+    return names, rows, float(arrays["dt"]) if "dt" in arrays else None

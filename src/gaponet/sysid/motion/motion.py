@@ -1,0 +1,71 @@
+"""Motion: commanded joint positions on a fine grid, to be played at any control rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.data.sequence import LEVELS
+from gaponet.robot.spec import RobotSpec
+
+GRID = 0.01  # s: motions are made at 100 Hz; 50 Hz plays every second row
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What is asked of a robot.
+
+    Attributes:
+        name: Unique in a recipe.
+        level: joint, upper_body or whole_body.
+        dt: Grid period of ctrl, s.
+        ctrl: Targets of all joints in the robot's order, (T, n), rad.
+        joints: Names of those that it is about; on a robot the others stay where they are found. None: all.
+    """
+
+    name: str
+    level: str
+    dt: float
+    ctrl: Array
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        ctrl = np.ascontiguousarray(self.ctrl, float)
+        if ctrl.ndim != 2 or len(ctrl) < 2 or not np.isfinite(ctrl).all():
+            raise UsageError(f"motion '{self.name}': ctrl must be (T ≥ 2, n) finite numbers, got shape {ctrl.shape}")
+        if self.level not in LEVELS:
+            raise UsageError(f"motion '{self.name}': level '{self.level}' is not one of {', '.join(LEVELS)}")
+        ctrl.flags.writeable = False
+        object.__setattr__(self, "ctrl", ctrl)
+
+    @property
+    def duration(self) -> float:
+        """s."""
+        return len(self.ctrl) * self.dt
+
+    def sample(self, dt: float) -> Array:
+        """Targets at a control period, (T', n): every k-th row where dt is k grid periods, else linear between rows."""
+        stride = dt / self.dt
+        if abs(stride - round(stride)) < 1e-9:
+            return self.ctrl[:: round(stride)].copy()
+        time = np.arange(len(self.ctrl)) * self.dt
+        grid = np.arange(int(time[-1] / dt + 1e-9) + 1) * dt
+        return np.stack([np.interp(grid, time, column) for column in self.ctrl.T], axis=1)
+
+    def named(self, robot: RobotSpec) -> tuple[str, ...]:
+        """Names of the joints that it is about."""
+        return robot.joint_names if self.joints is None else self.joints
+
+    def held_at(self, qpos: Array, robot: RobotSpec) -> Motion:
+        """The same with the joints that it does not name where they are in a posture (n,) rad."""
+        ctrl, named = np.repeat(qpos[None], len(self.ctrl), axis=0), robot.index(self.named(robot))
+        ctrl[:, named] = self.ctrl[:, named]
+        return replace(self, ctrl=ctrl)
+
+    def moved(self, robot: RobotSpec) -> tuple[str, ...]:
+        """Names of the joints that are asked to move."""
+        span = np.ptp(self.ctrl, axis=0)
+        return tuple(name for name, s in zip(robot.joint_names, span, strict=True) if s > 1e-9)

@@ -1,0 +1,195 @@
+"""Coordinated motions of arms and torso: what people use arms for, with a load in the hands.
+
+Each function takes a Kit, the sides that act and a seeded generator, and returns targets (T, n) rad on the motion grid.
+World frame: x forward, y left, z up; the H1-2 shoulder stands at z = 1.45 m and a hand reaches 0.6 m from it. Sideways
+numbers are given for the left arm and mirrored for the right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.sysid.motion.arm import Arm, HandIK, arms
+from gaponet.sysid.motion.feasible import Feasibility
+from gaponet.sysid.motion.minjerk import fade, through
+from gaponet.sysid.motion.motion import GRID
+
+Sides = tuple[str, ...]
+
+# Elbows bent, hands in front of the belly: the posture from which people start; (ROLES), rad, left arm.
+READY = np.array([0.15, 0.25, 0.0, 0.35, 0.0])
+MIRROR = np.array([1.0, -1.0, -1.0, 1.0, -1.0])  # roll, yaw and wrist roll change sign on the right
+
+
+class Kit:
+    """A robot's arms, their kinematics and the ready posture."""
+
+    def __init__(self, limits: Feasibility) -> None:
+        self.limits = limits
+        self.robot = limits.robot
+        self.arms = arms(limits.robot)
+        self.ik = {side: HandIK(limits, arm) for side, arm in self.arms.items()}
+        self.ready = limits.robot.qpos_home.copy()
+        for arm in self.arms.values():
+            self.ready[arm.columns] = READY * (MIRROR if arm.sign < 0 else 1.0)
+
+    def posture(self, **values: Array | list[float]) -> Array:
+        """The ready posture with some arms at left-arm angles (ROLES), mirrored where needed; (n,) rad."""
+        q = self.ready.copy()
+        for side, angles in values.items():
+            q[self.arms[side].columns] = np.asarray(angles) * (MIRROR if self.arms[side].sign < 0 else 1.0)
+        return np.clip(q, self.limits.low, self.limits.high)
+
+    def at(self, q: Array, side: str, point: Array | list[float], roll: float = 0.0) -> Array:
+        """Posture q with that hand at a point given for the left arm, (3,) m, and the wrist rolled by so many rad."""
+        arm = self.arms[side]
+        q = self.ik[side].solve(q, np.asarray(point) * [1.0, arm.sign, 1.0])
+        q[arm.columns[4]] = arm.sign * roll
+        return q
+
+
+def reach(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Hands to four random places in front, with a rest at each."""
+    stops = [kit.ready]
+    for _ in range(4):
+        q = kit.ready
+        for side in sides:
+            q = kit.at(q, side, rng.uniform([0.25, 0.08, 0.95], [0.5, 0.45, 1.45]), rng.uniform(-1.2, 1.2))
+        stops.append(q)
+    return _stops(stops, rng.uniform(0.8, 1.4), 0.4)
+
+
+def pick_and_place(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Over a table: lower, lift, move across, lower, leave."""
+    height = rng.uniform(0.92, 1.05)
+    stops = [kit.ready]
+    for _ in range(2):
+        start, stop = (rng.uniform([0.3, 0.1], [0.45, 0.4]) for _ in range(2))
+        roll = rng.uniform(-1.0, 1.0)
+        for xy, z in ((start, 0.15), (start, 0.0), (start, 0.18), (stop, 0.18), (stop, 0.0), (stop, 0.15)):
+            q = stops[-1]
+            for side in sides:
+                q = kit.at(q, side, [*xy, height + z], roll)
+            stops.append(q)
+    return _stops(stops, 0.7, 0.15)
+
+
+def lift(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Lift from the waist to the shoulder and down again, twice, to random heights."""
+    stops = [kit.ready]
+    x, y = rng.uniform(0.3, 0.4), rng.uniform(0.15, 0.3)
+    for z in rng.uniform([0.9, 1.3, 0.9, 1.35], [1.0, 1.5, 1.05, 1.55]):
+        q = stops[-1]
+        for side in sides:
+            q = kit.at(q, side, [x, y, z])
+        stops.append(q)
+    return _stops([*stops, kit.ready], 1.4, 0.5)
+
+
+def punch(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Four quick stretches forward from a guard, sides in turn."""
+    guard = kit.posture(**{s: [-0.5, 0.25, 0.1, -0.4, 0.0] for s in sides})
+    stops = [kit.ready, guard]
+    for i in range(4):
+        side = sides[i % len(sides)]
+        stops += [kit.at(guard, side, rng.uniform([0.48, 0.1, 1.25], [0.56, 0.25, 1.45])), guard]
+    return _stops(stops, 0.5, 0.25)
+
+
+def wave(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Upper arm out and up, then forearm from side to side."""
+    raised = kit.posture(**{s: [rng.uniform(-0.6, -0.2), rng.uniform(1.0, 1.4), 0.0, -0.5, 0.0] for s in sides})
+    ctrl = _stops([kit.ready, raised], 1.6, 0.4)
+    columns = [kit.arms[s].columns for s in sides]
+    steps = round(rng.uniform(4.0, 5.0) / GRID)
+    phase = 2 * np.pi * rng.uniform(0.5, 0.9) * np.arange(steps) * GRID
+    swing = np.repeat(raised[None], steps, axis=0)
+    for c in columns:
+        swing[:, c[2]] += 0.4 * np.sin(phase) * fade(steps, GRID, 1.0)
+        swing[:, c[3]] += 0.25 * np.sin(phase + 1.0) * fade(steps, GRID, 1.0)
+    return np.concatenate([ctrl, swing, _stops([raised, kit.ready], 1.6, 0.4)])
+
+
+def stir(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Circles over a table, growing and shrinking."""
+    steps = round(6.5 / GRID)
+    centre = rng.uniform([0.32, 0.15, 1.0], [0.4, 0.3, 1.15])
+    phase = 2 * np.pi * rng.uniform(0.4, 0.7) * np.arange(steps) * GRID
+    radius = rng.uniform(0.07, 0.11) * fade(steps, GRID, 1.5)
+    circle = centre + radius[:, None] * np.stack([np.cos(phase), np.sin(phase), 0.2 * np.sin(phase / 2)], axis=1)
+    return _along(kit, dict.fromkeys(sides, circle))
+
+
+def mirror(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Both hands on upright ovals, together or in turn."""
+    steps = round(6.5 / GRID)
+    centre = rng.uniform([0.33, 0.2, 1.15], [0.4, 0.3, 1.3])
+    phase = 2 * np.pi * rng.uniform(0.3, 0.5) * np.arange(steps) * GRID
+    size = rng.uniform(0.08, 0.14) * fade(steps, GRID, 1.5)
+    lag = rng.choice([0.0, np.pi])
+    paths = {}
+    for i, side in enumerate(sides):
+        p = phase + i * lag
+        paths[side] = centre + size[:, None] * np.stack([0.5 * np.cos(p), 0.6 * np.sin(p), np.cos(p)], axis=1)
+    return _along(kit, paths)
+
+
+def carry(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Load before the chest while the torso turns and the arms give a little at walking pace."""
+    held = kit.ready
+    for side in sides:
+        held = kit.at(held, side, rng.uniform([0.33, 0.12, 1.1], [0.42, 0.22, 1.25]))
+    steps = round(6.0 / GRID)
+    time = np.arange(steps) * GRID
+    window = fade(steps, GRID, 1.5)
+    ctrl = np.repeat(held[None], steps, axis=0)
+    torso = [i for i, n in enumerate(kit.robot.joint_names) if n.startswith("torso")]
+    ctrl[:, torso] += (rng.uniform(0.2, 0.4) * np.sin(2 * np.pi * 0.25 * time) * window)[:, None]
+    bounce = 0.05 * np.sin(2 * np.pi * rng.uniform(0.8, 1.2) * time) * window
+    for side in sides:
+        columns = kit.arms[side].columns
+        ctrl[:, columns[0]] += bounce
+        ctrl[:, columns[3]] -= 0.7 * bounce
+    return np.concatenate([_stops([kit.ready, held], 1.2, 0.3), ctrl, _stops([held, kit.ready], 1.2, 0.3)])
+
+
+def wander(kit: Kit, sides: Sides, rng: np.random.Generator) -> Array:
+    """Move all joints of the arms at once, on slow sines with random phases: states that no task passes through."""
+    steps = round(8.0 / GRID)
+    time = np.arange(steps) * GRID
+    ctrl = np.repeat(kit.ready[None], steps, axis=0)
+    size = np.array([0.5, 0.35, 0.6, 0.6, 0.9])
+    for side in sides:
+        for column, amplitude in zip(kit.arms[side].columns, size, strict=True):
+            frequency = rng.uniform(0.1, 0.6, 3)
+            sines = np.sin(2 * np.pi * np.outer(time, frequency) + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
+            ctrl[:, column] += amplitude * sines * fade(steps, GRID, 2.0)
+    return ctrl
+
+
+BUILDERS: dict[str, Callable[[Kit, Sides, np.random.Generator], Array]] = {
+    f.__name__: f for f in (reach, pick_and_place, lift, punch, wave, stir, mirror, carry, wander)
+}
+
+
+def _stops(stops: list[Array], move: float, hold: float) -> Array:
+    """Move all joints to each posture in turn: `move` s for the way, `hold` s of rest at each."""
+    count = len(stops)
+    return through(np.array(stops), np.full(count - 1, move), np.full(count, hold), GRID)
+
+
+def _along(kit: Kit, paths: dict[str, Array], every: int = 10) -> Array:
+    """Hands along left-arm paths (T, 3), between two moves from and to the ready posture."""
+    from scipy.interpolate import CubicSpline
+
+    rows = len(next(iter(paths.values())))
+    knots = np.unique(np.append(np.arange(0, rows, every), rows - 1))
+    q = np.repeat(kit.ready[None], len(knots), axis=0)
+    for side, path in paths.items():
+        arm: Arm = kit.arms[side]
+        q[:, arm.columns] = kit.ik[side].path(kit.ready, path[knots] * [1.0, arm.sign, 1.0])[:, arm.columns]
+    middle = CubicSpline(knots, q)(np.arange(rows))
+    return np.concatenate([_stops([kit.ready, q[0]], 1.2, 0.3), middle, _stops([q[-1], kit.ready], 1.2, 0.3)])

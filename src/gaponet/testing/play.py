@@ -1,0 +1,148 @@
+"""Play takes on virtual robots and record what their sensors report: takes in, Sequences out, nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.model import build_model, idle_joints
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.motion import Motion
+from gaponet.sysid.motion.recipe import Recipe, Take
+from gaponet.testing.fleet import Fleet
+from gaponet.testing.physics import Physics
+from gaponet.testing.unit import UnitEvent, VirtualRobot
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Job:
+    """Takes to be recorded together, all at one rate. A take's result does not depend on its company."""
+
+    robot: RobotSpec
+    fleet: Fleet
+    recipe: Recipe
+    files: tuple[Motion, ...]
+    """The motions of the recipe's files."""
+    seed: int
+    takes: tuple[Take, ...]
+
+
+_LIBRARIES: dict[tuple[str, int, float, tuple[str, ...]], Library] = {}  # of this process: what they found is kept
+
+
+def library(robot: RobotSpec, seed: int, recipe: Recipe, files: tuple[Motion, ...]) -> Library:
+    """The motions that a recipe chooses from."""
+    key = (str(robot.mjcf), seed, max(recipe.payloads), recipe.files)
+    if key not in _LIBRARIES:
+        motions = Library(robot, seed, max(recipe.payloads))
+        for motion in files:
+            motions.add(motion)
+        _LIBRARIES[key] = motions
+    return _LIBRARIES[key]
+
+
+def play(job: Job) -> list[Sequence]:
+    """Record the takes of a job, in order."""
+    source = library(job.robot, job.seed, job.recipe, job.files)
+    motions = {name: source.make(name) for name in dict.fromkeys(t.motion for t in job.takes)}
+    locked = {name: _standing(job.robot, motion) for name, motion in motions.items()}
+    done: dict[Take, Sequence] = {}
+    for limbs in dict.fromkeys(locked.values()):
+        group = [t for t in job.takes if locked[t.motion] == limbs]
+        group.sort(key=lambda t: -len(motions[t.motion].ctrl))
+        done |= zip(group, _together(job, group, motions, limbs), strict=True)
+    return [done[t] for t in job.takes]
+
+
+def _standing(robot: RobotSpec, motion: Motion) -> tuple[str, ...]:
+    """Joints of the limbs that are told to stand at home all the time."""
+    away = np.abs(motion.ctrl - robot.qpos_home).max(axis=0) > 1e-9
+    return idle_joints(robot, tuple(name for name, a in zip(robot.joint_names, away, strict=True) if a))
+
+
+def _together(job: Job, group: list[Take], motions: dict[str, Motion], locked: tuple[str, ...]) -> list[Sequence]:
+    """Record takes side by side, in order of falling length: those still running are always a prefix."""
+    dt = 1.0 / group[0].rate
+    ctrl = [motions[t.motion].sample(dt) for t in group]
+    lengths, longest = np.array([len(c) for c in ctrl]), len(ctrl[0])
+    targets = np.stack([np.concatenate([c, np.repeat(c[-1:], longest - len(c), axis=0)]) for c in ctrl], axis=1)
+    payloads = [(t.payload, job.recipe.payload_side) for t in group]
+    robots = VirtualRobot(job.robot, [job.fleet.unit(t.unit) for t in group], payloads, dt, locked=locked)
+    seeds = [t.seed(job.seed) for t in group]
+    warmth = np.array([_warmth(job.fleet.unit(t.unit), s) for t, s in zip(group, seeds, strict=True)])
+    robots.reset(targets[0], seeds, warmth)
+    seen = np.empty((4, *targets.shape), np.float32)
+    for t in range(longest):  # row t: the state at t·dt, then the command of [t·dt, (t+1)·dt)
+        reading = robots.read()
+        seen[:, t] = reading.qpos, reading.qvel, reading.tau, reading.temperature
+        robots.step(targets[t], np.arange(int((lengths > t).sum())))
+    models = {p: build_model(job.robot, *p, dt, bare=True) for p in dict.fromkeys(payloads)}
+    sequences = []
+    for i, (take, c) in enumerate(zip(group, ctrl, strict=True)):
+        qpos, qvel, tau, temperature = seen[:, : len(c), i]
+        torque, qacc = equivalent_torque(models[payloads[i]], qpos, dt)
+        notes = {
+            "rate_hz": take.rate,
+            "warmth_K": round(float(warmth[i]), 2),
+            "seed": job.seed,
+            "events": _events(robots.events[i], len(c) * dt),
+        }
+        meta = _meta(job, take, motions[take.motion].level, notes)
+        sequences.append(Sequence(meta, job.robot.joint_names, dt, c, qpos, qvel, qacc, tau, torque, temperature))
+    return sequences
+
+
+def _warmth(unit: Physics, seed: int) -> float:
+    """K above ambient at the start of a recording."""
+    drawn = np.random.default_rng([seed, 1]).standard_normal()
+    return max(0.0, float(unit.warmth[0] + unit.warmth_spread[0] * drawn))
+
+
+def _events(seen: list[UnitEvent], end: float) -> list[dict[str, Any]]:
+    """Start, what happened, end: each with its time in the recording, s."""
+    middle = [{k: v for k, v in asdict(e).items() if v != ""} for e in seen if e.time < end]
+    return [{"time": 0.0, "kind": "motion_start"}, *middle, {"time": round(end, 4), "kind": "motion_end"}]
+
+
+def _meta(job: Job, take: Take, level: str, notes: dict[str, Any]) -> SequenceMeta:
+    return SequenceMeta(
+        robot=job.robot.name,
+        unit_id=take.unit,
+        motion=take.motion,
+        payload_mass=take.payload,
+        payload_side=job.recipe.payload_side,
+        level=level,
+        repetition=take.repetition,
+        virtual=True,
+        source=f"virtual fleet '{job.fleet.name}'",
+        notes=notes,
+        kp=tuple(job.robot.kp.tolist()),
+        kd=tuple(job.robot.kd.tolist()),
+    )
+
+
+def equivalent_torque(model: mujoco.MjModel, qpos: Array, dt: float, cutoff: float = CUTOFF) -> tuple[Array, Array]:
+    """What the nominal, payload-carrying model would have needed to move as recorded.
+
+    Args:
+        model: Nominal simulator with the recording's payload (sim.model.build_model).
+        qpos: Recorded, (T, n) rad.
+        dt: s.
+        cutoff: Cut-off of the zero-phase filter before differentiating, Hz.
+
+    Returns:
+        Torque (T, n) N·m and the accelerations (T, n) rad/s² that it belongs to.
+    """
+    smooth = lowpass(qpos.astype(float), dt, cutoff)
+    qvel = differentiate(smooth, dt)
+    qacc = differentiate(qvel, dt)
+    return inverse_dynamics(model, smooth, qvel, qacc), qacc

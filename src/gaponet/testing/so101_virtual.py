@@ -1,0 +1,206 @@
+"""A VIRTUAL SO-101: servos that answer like STS3215, hidden physics behind them, on a pseudo-terminal in real time.
+
+Registers that act: torque enable, goal, P (stiffness), position limits, torque limit. The others are kept and read
+back. Its calibration is the one that LeRobot would have written into the servos of an arm with the MJCF's limits.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+import tty
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.hw.control.clock import uncollected
+from gaponet.hw.drivers import feetech as reg
+from gaponet.hw.drivers.so101 import FULL, STALL_CURRENT, STIFFNESS
+from gaponet.hw.drivers.so101_calibration import GRIPPER, SPEAK, STEP, STEPS, TURNS, ArmCalibration, ServoRow
+from gaponet.robot.spec import RobotSpec
+from gaponet.robot.toml_file import Table
+from gaponet.testing.physics import Physics
+from gaponet.testing.virtual_driver import LiveUnit
+
+PERIOD = 0.005  # s between two steps of the physics
+BEHIND = 0.5  # s of arrears that are dropped: an interrupted process does not hurry afterwards
+CATCH_UP = 4  # steps
+FREE_DAMPING = 0.3  # N·m·s/rad that the gears brake with when the torque is off (assumed)
+
+
+class VirtualSO101:
+    """The servos' side of the bus; `port` is what a driver opens."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str] = (0.0, "hand"),
+        link: Path | None = None,
+        frame: float | None = None,
+    ) -> None:
+        """
+        Args:
+            payload: kg, and mount.
+            link: Another name for the port, a symbolic link; replaced if it is one.
+            frame: s that pass with every goal position; default: real time passes.
+        """
+        robot = replace(robot, table=robot.table or Table(height=0.0))  # on which it rests while its torque is off
+        self.robot, self._frame = robot, None if frame is None else round(frame / PERIOD)
+        self.live = LiveUnit(robot, physics, payload, period=PERIOD)
+        self._order = robot.index(SPEAK)  # servo number − 1 → joint
+        self.calibration = ArmCalibration(_as_calibrated(robot), robot)
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        self.port, self._slave = os.ttyname(slave), slave
+        self._link = link
+        if link is not None:
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(self.port)
+        self.memory = [bytearray(128) for _ in SPEAK]
+        for joint, memory in zip(SPEAK, self.memory, strict=True):
+            row = self.calibration.rows[joint]
+            for register, value in (
+                (reg.MODEL, reg.STS3215), (reg.MIN_POSITION, row.range_min), (reg.MAX_POSITION, row.range_max),
+                (reg.HOMING_OFFSET, row.homing_offset), (reg.MAX_TORQUE, FULL), (reg.TORQUE_LIMIT, FULL),
+                (reg.P, 32), (reg.D, 32), (reg.PROTECTION_CURRENT, 500), (reg.PRESENT_VOLTAGE, 120),
+            ):  # fmt: skip
+                _put(memory, register, value)
+        self.deaf: set[int] = set()  # servos that do not answer
+        self.damaged = False  # replies have a wrong checksum
+        self.status = [0] * len(SPEAK)  # error bits in replies
+        self._buffer = self._said = b""
+        self._apply()
+
+    @uncollected()
+    def run(self, seconds: float = np.inf) -> None:
+        """Live and answer in real time."""
+        began = time.monotonic()
+        start = began - self.live.steps * PERIOD
+        while time.monotonic() - began < seconds:
+            due = start + self.live.steps * PERIOD
+            wait = min(max(0.0, due - time.monotonic()), PERIOD) if self._frame is None else BEHIND
+            readable, _, _ = select.select([self._master], [], [], wait)
+            if readable:
+                os.write(self._master, self.hear(os.read(self._master, 4096)))
+            if self._frame is not None:
+                continue
+            now = time.monotonic()
+            if now - due > BEHIND:
+                start += now - due
+            for _ in range(CATCH_UP):  # then look at the bus again, however far behind
+                if start + self.live.steps * PERIOD <= time.monotonic():
+                    self.live.step()
+
+    def close(self) -> None:
+        for descriptor in (self._master, self._slave):
+            os.close(descriptor)
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def hear(self, data: bytes) -> bytes:
+        """What the bus carries to the servos; returns what they answer."""
+        self._buffer, self._said = self._buffer + data, b""
+        while (start := self._buffer.find(b"\xff\xff")) >= 0:
+            packet = self._buffer[start:]
+            if len(packet) < 4 or len(packet) < 4 + packet[3]:
+                self._buffer = packet
+                return self._said
+            end = 4 + packet[3]
+            body, self._buffer = packet[2:end], packet[end:]
+            if reg.checksum(body[:-1]) == body[-1]:
+                self._do(body[0], body[2], body[3:-1])
+        self._buffer = self._buffer[-1:] if self._buffer.endswith(b"\xff") else b""
+        return self._said
+
+    def _do(self, servo: int, instruction: int, parameters: bytes) -> None:
+        if instruction == reg.PING:
+            self._answer(servo, b"")
+        elif instruction == reg.READ:
+            self._refresh()
+            self._answer(servo, self._bytes(servo, parameters[0], parameters[1]))
+        elif instruction == reg.WRITE:
+            for one in range(1, len(SPEAK) + 1) if servo == reg.BROADCAST else (servo,):
+                self._store(one, parameters[0], parameters[1:])
+            self._answer(servo, b"")
+        elif instruction == reg.SYNC_READ:
+            self._refresh()
+            for one in parameters[2:]:
+                self._answer(one, self._bytes(one, parameters[0], parameters[1]))
+        elif instruction == reg.SYNC_WRITE:
+            size = parameters[1] + 1
+            for i in range(2, len(parameters), size):
+                self._store(parameters[i], parameters[0], parameters[i + 1 : i + size])
+        self._apply()
+        if instruction == reg.SYNC_WRITE and parameters[0] == reg.GOAL_POSITION.address:
+            for _ in range(self._frame or 0):
+                self.live.step()
+
+    def _answer(self, servo: int, data: bytes) -> None:
+        if not 1 <= servo <= len(SPEAK) or servo in self.deaf:
+            return
+        reply = reg.packet(servo, self.status[servo - 1], data)
+        self._said += reply[:-1] + bytes([reply[-1] ^ self.damaged])
+
+    def _bytes(self, servo: int, address: int, size: int) -> bytes:
+        return bytes(self.memory[servo - 1][address : address + size]) if 1 <= servo <= len(SPEAK) else b""
+
+    def _store(self, servo: int, address: int, data: bytes) -> None:
+        if 1 <= servo <= len(SPEAK):
+            self.memory[servo - 1][address : address + len(data)] = data
+
+    def _refresh(self) -> None:
+        """Readings into the registers."""
+        order = self._order
+        qpos, qvel, tau, temperature = self.live.read()
+        steps = np.rint(qpos / (STEP * self.calibration.sign) + self.calibration.zero)[order]  # beyond the limits, too
+        share = (tau / self.robot.effort_limit)[order]
+        values = {
+            reg.PRESENT_POSITION: np.clip(steps, 0, STEPS - 1),
+            reg.PRESENT_VELOCITY: np.rint(qvel[order] / STEP),
+            reg.PRESENT_LOAD: np.clip(np.rint(1000 * share), -1000, 1000),
+            reg.PRESENT_CURRENT: np.rint(share * STALL_CURRENT),
+            reg.PRESENT_TEMPERATURE: np.rint(temperature[order]),
+        }
+        for register, numbers in values.items():
+            for memory, value in zip(self.memory, numbers, strict=True):
+                _put(memory, register, int(value))
+
+    def _apply(self) -> None:
+        """Registers into targets, gains and torque limits."""
+        kp, kd, effort = self.robot.kp.copy(), self.robot.kd.copy(), self.robot.effort_limit.copy()
+        goals = self.calibration.steps(self.live.ctrl)
+        for joint, memory in zip(self._order, self.memory, strict=True):
+            kp[joint] = STIFFNESS * _get(memory, reg.P)
+            effort[joint] *= min(_get(memory, reg.TORQUE_LIMIT), FULL) / FULL
+            if not _get(memory, reg.TORQUE_ENABLE):
+                kp[joint], kd[joint] = 0.0, FREE_DAMPING
+                continue
+            goals[joint] = np.clip(
+                _get(memory, reg.GOAL_POSITION), _get(memory, reg.MIN_POSITION), _get(memory, reg.MAX_POSITION)
+            )
+            self.live.ctrl[joint] = self.calibration.qpos(goals)[joint]
+        self.live.set_gains(kp, kd, effort)
+
+
+def _as_calibrated(robot: RobotSpec) -> dict[str, ServoRow]:
+    """What LeRobot's calibration finds on an arm whose joints stop where the MJCF's do."""
+    rows = {}
+    for number, joint in enumerate(SPEAK, 1):
+        low, high = robot.qpos_range[robot.index([joint])[0]]
+        half = (STEPS - 1) / 2 if joint == TURNS else (high - low) / 2 / STEP
+        middle = STEPS / 2 - (0.5 if joint == TURNS else 300 if joint == GRIPPER else 0)
+        ends = {"range_min": int(np.ceil(middle - half)), "range_max": int(np.floor(middle + half))}
+        rows[joint] = ServoRow(id=number, drive_mode=0, homing_offset=17 * number, **ends)
+    return rows
+
+
+def _put(memory: bytearray, register: reg.Register, value: int) -> None:
+    memory[register.address : register.address + register.size] = register.encode(value)
+
+
+def _get(memory: bytearray, register: reg.Register) -> int:
+    return register.decode(bytes(memory[register.address : register.address + register.size]))

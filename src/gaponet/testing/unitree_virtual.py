@@ -1,0 +1,199 @@
+"""A VIRTUAL H1-2 behind the real DDS topics: hidden physics in real time, LowState out, arm_sdk and lowcmd in.
+
+It holds its home posture until somebody speaks, hands its arms over by the weight of rt/arm_sdk, obeys the gains that
+it is sent, ignores messages with a wrong checksum, and keeps the last command when commands cease: the worst a robot
+can do. It can also be told to fail, for rehearsing what a controller does then.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.files import whole
+from gaponet.hw.control.clock import MonotonicClock, uncollected
+from gaponet.hw.drivers import hg
+from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
+from gaponet.robot.spec import RobotSpec
+from gaponet.testing.physics import Physics
+from gaponet.testing.virtual_driver import LiveUnit
+
+FaultKind = Literal[
+    "none", "stop", "freeze", "repeat", "nan", "jump", "hot", "late", "checksum", "clock",
+    "encoder", "motor", "remote", "fall", "machine",
+]  # fmt: skip
+
+LATE = 0.3  # s by which messages of the fault "late" are held back
+CLOCK_STEP = 10.0  # s by which the robot's clock is ahead while the fault "clock" holds
+ARMS = 12  # motors from here on belong to rt/arm_sdk
+
+
+@dataclass
+class Heard:
+    """What arrived: time (s), topic, targets, gains, weight, and where the joints were; (n) in motor order."""
+
+    time: list[float] = field(default_factory=list)
+    topic: list[str] = field(default_factory=list)
+    ctrl: list[Array] = field(default_factory=list)
+    kp: list[Array] = field(default_factory=list)
+    kd: list[Array] = field(default_factory=list)
+    mode: list[Array] = field(default_factory=list)
+    weight: list[float] = field(default_factory=list)
+    qpos: list[Array] = field(default_factory=list)
+    qvel: list[Array] = field(default_factory=list)
+
+    def save(self, path: Path) -> None:
+        """Write what was heard as npz."""
+        with whole(path) as temporary, temporary.open("wb") as file:
+            np.savez_compressed(file, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
+
+
+class VirtualH12:
+    """The robot's side of the bus."""
+
+    def __init__(
+        self,
+        robot: RobotSpec,
+        physics: Physics,
+        payload: tuple[float, str] = (0.0, "both"),
+        domain: int = 0,
+        interface: str = "lo",
+        rate: float = 500.0,
+        fault: FaultKind = "none",
+        fault_at: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        """
+        Args:
+            payload: kg per hand, and side.
+            rate: States per second.
+            fault_at: s after the first command.
+        """
+        from gaponet.hw.drivers import dds
+
+        robot = robot.nominal or robot
+        self._dds, bus = dds, dds.Bus(domain, interface)
+        self.robot, self.rate, self.fault, self.fault_at = robot, rate, fault, fault_at
+        self._order = robot.index(MOTOR_NAMES)  # motor → place in the robot's order
+        self._writer = bus.writer("rt/lowstate", dds.LowState)
+        self._readers = {name: bus.reader(f"rt/{name}", dds.LowCmd) for name in ("arm_sdk", "lowcmd")}
+        self.live = LiveUnit(robot, physics, payload, seed=seed, period=1.0 / rate)
+        self.clock, self.heard = MonotonicClock(), Heard()
+        self.first_command: float | None = None
+        self.refused = self.missed = 0
+        self._message = hg.LowState.new()
+        hg.LowState.view(self._message, "reserve")[0] = VIRTUAL_MARK
+        self.machine = 6  # what an H1-2 is said to be; no document of Unitree's names it
+        self._held: deque[tuple[float, Array]] = deque()
+        self._frozen: tuple[Array, ...] | None = None
+
+    @uncollected()
+    def run(self, seconds: float = np.inf) -> None:
+        """Live in real time, until interrupted."""
+        start, k = self.clock.now(), 0
+        while (passed := k / self.rate) < seconds:
+            now = self.clock.wait_until(start + passed)
+            self._obey(now)
+            self.live.step()
+            self._speak(k, now)
+            behind = int((self.clock.now() - start) * self.rate) - k
+            self.missed += max(behind - 1, 0)
+            k += max(1, behind)
+
+    def _obey(self, now: float) -> None:
+        for topic, reader in self._readers.items():
+            for data in self._dds.receive(reader):
+                if len(data) != hg.LowCmd.wire_size or not hg.LowCmd.intact(data):
+                    self.refused += 1
+                    continue
+                self.first_command = self.first_command or now
+                self._apply(topic, data, now)
+
+    def _apply(self, topic: str, data: Array, now: float) -> None:
+        names = ("q", "kp", "kd", "mode", "dq", "tau")
+        q, kp, kd, mode, dq, tau = (hg.LowCmd.motors(data, name).astype(float) for name in names)
+        if not all(np.isfinite(values).all() for values in (q, kp, kd, dq, tau)):
+            self.refused += 1
+            return
+        weight = 1.0 if topic == "lowcmd" else float(np.clip(q[WEIGHT_MOTOR], 0.0, 1.0))
+        self._note(topic, q, kp, kd, mode, weight, now)
+        robot, motors = self.robot, len(MOTOR_NAMES)
+        share = np.zeros(motors)
+        share[0 if topic == "lowcmd" else ARMS :] = weight
+        enabled = (mode[:motors] == 1) | (topic == "arm_sdk")
+        gains, dampers, torque = robot.kp.copy(), robot.kd.copy(), np.zeros_like(robot.kp)
+        forward = tau[:motors] + kd[:motors] * dq[:motors]
+        for out, mine, theirs in (
+            (self.live.ctrl, robot.qpos_home, q[:motors]),
+            (gains, robot.kp, np.where(enabled, kp[:motors], 0.0)),
+            (dampers, robot.kd, np.where(enabled, kd[:motors], 0.0)),
+            (torque, np.zeros_like(robot.kp), np.where(enabled, forward, 0.0)),
+        ):
+            out[self._order] = (1 - share) * mine[self._order] + share * theirs
+        self.live.set_gains(gains, dampers, torque=torque)
+
+    def _note(self, topic: str, q: Array, kp: Array, kd: Array, mode: Array, weight: float, now: float) -> None:
+        qpos, qvel, *_ = self.live.read()
+        heard, motors = self.heard, len(MOTOR_NAMES)
+        heard.time.append(now)
+        heard.topic.append(topic)
+        heard.weight.append(weight)
+        for log, values in ((heard.ctrl, q), (heard.kp, kp), (heard.kd, kd), (heard.mode, mode)):
+            log.append(values[:motors])
+        heard.qpos.append(qpos[self._order])
+        heard.qvel.append(qvel[self._order])
+
+    def _speak(self, k: int, now: float) -> None:
+        wrong = self.first_command is not None and now - self.first_command >= self.fault_at
+        fault = self.fault if wrong else "none"
+        if fault == "stop":
+            return
+        readings = self._readings(fault)
+        message, data = hg.LowState, self._message
+        if fault != "repeat":
+            ahead = CLOCK_STEP if fault == "clock" else 0.0
+            message.view(data, "tick")[0] = round(1000 * (k / self.rate + ahead)) % 2**32
+        self._tell(fault)
+        for name, values in zip(("q", "dq", "tau_est", "temperature"), readings, strict=True):
+            column = np.zeros((hg.MOTORS, 2) if name == "temperature" else hg.MOTORS)
+            column[: len(MOTOR_NAMES)] = values[self._order, None] if name == "temperature" else values[self._order]
+            message.set_motors(data, name, column)
+        message.seal(data)
+        if fault == "checksum":
+            message.view(data, "crc")[0] ^= 1
+        self._held.append((now + (LATE if fault == "late" else 0.0), data.copy()))
+        while self._held and self._held[0][0] <= now:
+            self._dds.send(self._writer, self._dds.LowState, self._held.popleft()[1])
+
+    def _tell(self, fault: str) -> None:
+        """What the robot says about itself, honest or not."""
+        message, data = hg.LowState, self._message
+        half = 0.5 if fault == "fall" else 0.0  # half the angle by which it leans forward
+        message.view(data, "imu_state.quaternion")[:] = (np.cos(half), 0.0, np.sin(half), 0.0)
+        message.view(data, "wireless_remote")[2:4] = (0x20, 0x02) if fault == "remote" else 0  # L2 + B
+        message.view(data, "mode_machine")[0] = 5 if fault == "machine" else self.machine
+        errors = np.zeros(hg.MOTORS)
+        errors[MOTOR_NAMES.index("left_elbow_joint")] = 4 * (fault == "motor")
+        message.set_motors(data, "motorstate", errors)
+
+    def _readings(self, fault: str) -> tuple[Array, ...]:
+        """qpos, qvel, tau, temperature (n), honest or not."""
+        if fault in ("freeze", "repeat") and self._frozen is not None:
+            return self._frozen
+        qpos, qvel, tau, temperature = (values.copy() for values in self.live.read())
+        joint = self.robot.index(["left_elbow_joint"])[0]
+        if fault == "encoder" and self._frozen is not None:
+            qpos[joint] = self._frozen[0][joint]
+        if fault == "nan":
+            qpos[joint] = np.nan
+        if fault == "jump":
+            qpos[joint] += 1.5
+        if fault == "hot":
+            temperature[joint] = 120.0
+        self._frozen = qpos, qvel, tau, temperature
+        return self._frozen

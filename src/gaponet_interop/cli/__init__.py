@@ -1,1 +1,0 @@
-"""Commands that hand over to others."""

@@ -1,1 +1,0 @@
-"""What other simulators take: the network in torch, the simulator's facts, an MJCF, an action term."""

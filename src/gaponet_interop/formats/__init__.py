@@ -1,1 +1,0 @@
-"""Readers of other people's logs, as gaponet.data.formats says."""

@@ -1,1 +1,0 @@
-"""Writers of other people's formats, as gaponet.data.writers says."""

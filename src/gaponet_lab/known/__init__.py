@@ -1,1 +1,0 @@
-"""What is known of a robot: how sure its values are, and whether later logs are still of it."""

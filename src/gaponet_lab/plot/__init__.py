@@ -1,1 +1,0 @@
-"""The ground floor of every figure: style, charts, legends, files."""

@@ -1,1 +1,0 @@
-"""Pages and figures about datasets, gaps and runs."""

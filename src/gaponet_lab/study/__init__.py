@@ -1,1 +1,0 @@
-"""Questions: each trains or plays, and becomes tables, figures and sentences in one folder, one report over all."""

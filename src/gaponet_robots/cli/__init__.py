@@ -1,1 +1,0 @@
-"""Commands that play motions on robots, real or virtual."""

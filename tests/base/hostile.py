@@ -1,0 +1,516 @@
+"""Files of some bytes that ask for gigabytes or for ever, and what becomes of whoever opens them.
+
+    PYTHONPATH=src:tests python -m base.hostile [--only WORDS] [--json FILE]
+
+Each must end in one line, within SECONDS of computing and MEMORY of the command and all that it starts; exit code 1
+where one does not. Some of them are tests (test_sandbox.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from arm import XML, write_arm
+from logs import arm_sequence, late, wave
+
+from gaponet.base import sandbox
+from gaponet.base.errors import LogError
+from gaponet.base.sandbox import inside
+
+SECONDS, MEMORY = 10.0, 1 << 30
+CUT = 60.0, 12 << 30  # where a command is ended
+IMPORT = ("import", "{}/logs", "--robot", "{}/arm", "--unit-id", "a", "--payload-mass", "0", "--out", "{}/set")
+IMPORT = (*IMPORT, "--position-unit", "rad", "--time-unit", "s")
+CHECK = ("robot", "check", "{}/arm")
+
+
+@dataclass(frozen=True)
+class Case:
+    """Files, made in a folder, and the command that opens them; {} stands for the folder."""
+
+    make: Callable[[Path], None]
+    words: tuple[str, ...]
+
+
+def mjcf(old: str, new: str) -> Callable[[Path], None]:
+    """The test arm with something put in."""
+    assert old in XML
+    return lambda folder: str(write_arm(folder / "arm", xml=XML.replace(old, new, 1)))  # type: ignore[return-value]
+
+
+def asset(text: str) -> Callable[[Path], None]:
+    return mjcf("<worldbody>", f"<asset>{text}</asset><worldbody>")
+
+
+def before(text: str) -> Callable[[Path], None]:
+    return mjcf("<worldbody>", f"{text}<worldbody>")
+
+
+def attach_bomb(folder: Path) -> None:
+    """Each file attaches the next one ten times."""
+    write_arm(folder / "arm")
+    for i in range(8):
+        inner = "".join(f'<frame><attach model="m" body="b" prefix="p{k}_"/></frame>' for k in range(10))
+        own = f'<asset><model name="m" file="m{i + 1}.xml"/></asset>' if i < 7 else ""
+        text = (
+            f'<mujoco>{own}<worldbody><body name="b"><geom size="1"/>{inner if own else ""}</body></worldbody></mujoco>'
+        )
+        (folder / "arm" / f"m{i}.xml").write_text(text)
+    text = XML.replace(
+        "<worldbody>",
+        '<asset><model name="m" file="m0.xml"/></asset><worldbody><attach model="m" body="b" prefix="q"/>',
+    )
+    (folder / "arm" / "robot.xml").write_text(text)
+
+
+def deep(folder: Path) -> None:
+    """Bodies in bodies."""
+    text = '<body><geom size="1"/>' * 9000 + "</body>" * 9000
+    write_arm(folder / "arm", xml=XML.replace("<worldbody>", f"<worldbody>{text}"))
+
+
+def picture(folder: Path) -> None:
+    """A PNG of 40,000 × 40,000 pixels in some kilobytes."""
+    side = 40_000
+    rows = zlib.compressobj(9)
+    line = bytes(1 + 3 * side)
+    packed = b"".join(rows.compress(line) for _ in range(side)) + rows.flush()
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    asset('<texture name="t" type="2d" file="t.png"/>')(folder)
+    head = struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
+    content = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", packed) + chunk(b"IEND", b"")
+    (folder / "arm" / "t.png").write_bytes(content)
+
+
+def hull(folder: Path) -> None:
+    """A mesh of points on a sphere, all of them corners of its hull: dear, but a valid one, 3 s for its 2.5 MB."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(150_000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    (folder / "arm").mkdir(parents=True)
+    triangles = np.zeros((50_000, 12), "<f4")
+    triangles[:, 3:] = points.reshape(-1, 9)
+    content = bytes(80) + struct.pack("<I", len(triangles)) + b"".join(t.tobytes() + b"\0\0" for t in triangles)
+    mjcf("<worldbody>", '<asset><mesh name="m" file="m.stl"/></asset><worldbody><geom type="mesh" mesh="m"/>')(folder)
+    (folder / "arm" / "m.stl").write_bytes(content)
+
+
+def network(nodes: Callable[[object], list[object]], folder: Path) -> None:
+    """A run with a network of these nodes between x and delta."""
+    import onnx
+    import torch
+    from onnx import TensorProto, helper
+    from runs import random_run
+
+    torch.manual_seed(0)
+    random_run(folder / "run", write_arm(folder / "arm"))
+    place = folder / "run" / "model"
+    old = onnx.load(place / "model.onnx")
+    width = old.graph.input[0].type.tensor_type.shape.dim[1].dim_value
+    x = helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", width])
+    delta = helper.make_tensor_value_info("delta", TensorProto.FLOAT, ["n", 2])
+    zero = helper.make_node("MatMul", ["x", "w"], ["nothing"])
+    weights = [helper.make_tensor("w", TensorProto.FLOAT, [width, 2], [0.0] * 2 * width)]
+    graph = helper.make_graph(
+        [zero, *nodes(weights), helper.make_node("Add", ["nothing", "odd"], ["delta"])], "g", [x], [delta], weights
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+    model.ir_version = 8
+    onnx.save(model, place / "model.onnx")
+    card = json.loads((place / "card.json").read_text())
+    card.pop("sha256")
+    (place / "card.json").write_text(json.dumps(card))
+
+
+def loop(weights: list[object]) -> list[object]:
+    """2^62 times nothing."""
+    from onnx import TensorProto, helper
+
+    weights.append(helper.make_tensor("often", TensorProto.INT64, [], [1 << 62]))
+    weights.append(helper.make_tensor("go", TensorProto.BOOL, [], [True]))
+    weights.append(helper.make_tensor("start", TensorProto.FLOAT, [], [0.0]))
+    value = helper.make_tensor_value_info
+    often, go, number = value("i", TensorProto.INT64, []), value("c", TensorProto.BOOL, []), TensorProto.FLOAT
+    nodes = [helper.make_node("Identity", ["c"], ["c2"]), helper.make_node("Add", ["v", "v"], ["v2"])]
+    after = [value("c2", TensorProto.BOOL, []), value("v2", number, [])]
+    inside = helper.make_graph(nodes, "body", [often, go, value("v", number, [])], after)
+    return [helper.make_node("Loop", ["often", "go", "start"], ["odd"], body=inside)]
+
+
+def large(count: int) -> Callable[[list[object]], list[object]]:
+    """So many numbers made of none, and their mean."""
+
+    def nodes(weights: list[object]) -> list[object]:
+        from onnx import TensorProto, helper
+
+        weights.append(helper.make_tensor("shape", TensorProto.INT64, [1], [count]))
+        return [helper.make_node("ConstantOfShape", ["shape"], ["many"]),
+                helper.make_node("ReduceMean", ["many"], ["odd"], keepdims=0)]  # fmt: skip
+
+    return nodes
+
+
+def outer(weights: list[object]) -> list[object]:
+    """A column times a row: 50,000 × 50,000 of 2 × 50,000 numbers, with operators that every network has."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    weights.append(numpy_helper.from_array(np.ones((50_000, 1), np.float32), "column"))
+    weights.append(numpy_helper.from_array(np.ones((1, 50_000), np.float32), "row"))
+    weights.append(helper.make_tensor("axes", TensorProto.INT64, [2], [0, 1]))
+    return [helper.make_node("MatMul", ["column", "row"], ["many"]),
+            helper.make_node("ReduceSum", ["many", "axes"], ["odd"], keepdims=0)]  # fmt: skip
+
+
+def logs(name: str, told: str = "") -> Callable[[Callable[[Path], None]], Callable[[Path], None]]:
+    """A log of that name beside the test arm."""
+
+    def wrapped(write: Callable[[Path], None]) -> Callable[[Path], None]:
+        def make(folder: Path) -> None:
+            write_arm(folder / "arm")
+            (folder / "logs").mkdir()
+            if told:
+                (folder / "logs" / "logs.toml").write_text(told)
+            write(folder / "logs" / name)
+
+        return make
+
+    return wrapped
+
+
+@inside(LogError, "numpy")
+def parsed(file: Path, how: str) -> object:
+    """What a parser may do."""
+    match how:
+        case "answers":
+            return {"zeros": np.zeros((1000, 3)), "name": (file.name, np.arange(3))}
+        case "refuses":
+            raise LogError(f"{file}: no log")
+        case "wants memory":
+            return np.ones(1 << 28)
+        case "never ends":
+            while True:
+                pass
+        case "ends":
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case "prints":
+            os.write(1, b"a library says something")
+        case "fails":
+            raise ZeroDivisionError("what nobody thought of")
+        case "writes":
+            with open(file, "wb") as out:
+                out.truncate(sandbox.MEMORY + 1)
+    return os.getpid()
+
+
+JOINTS = ("ctrl.shoulder", "ctrl.elbow", "qpos.shoulder", "qpos.elbow")
+
+
+@logs("a.parquet")
+def parquet_rows(file: Path) -> None:
+    """150 million equal rows."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = 1 << 20
+    table = pa.table({name: np.zeros(rows) for name in ("time", *JOINTS)})
+    with pq.ParquetWriter(file, table.schema, compression="zstd", use_dictionary=True) as writer:
+        for _ in range(143):
+            writer.write_table(table, row_group_size=rows)
+
+
+@logs("a.parquet")
+def parquet_text(file: Path) -> None:
+    """A column of one long text, a million times."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = 1_000_000
+    column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array(["x" * 100_000]))
+    columns = {name: column if name == "ctrl.elbow" else np.zeros(rows) for name in ("time", *JOINTS)}
+    pq.write_table(pa.table(columns), file, compression="zstd", store_schema=False)
+
+
+@logs("a.mat", 'rate = 50.0\nctrl = "q"\nqpos = "q"\njoints = ["shoulder", "elbow"]\n')
+def mat_zeros(file: Path) -> None:
+    """4 GB of zeros, packed."""
+
+    def element(kind: int, data: bytes) -> bytes:
+        return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+    rows = 120_000_000
+    size = rows * 2 * 8
+    head = element(6, struct.pack("<II", 6, 0)) + element(5, struct.pack("<ii", rows, 2)) + element(1, b"q")
+    packer = zlib.compressobj(9)
+    body = packer.compress(struct.pack("<II", 14, len(head) + 8 + size) + head + struct.pack("<II", 9, size))
+    block = bytes(1 << 20)
+    body += (
+        b"".join(packer.compress(block) for _ in range(size >> 20))
+        + packer.compress(bytes(size % (1 << 20)))
+        + packer.flush()
+    )
+    file.write_bytes(
+        b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + struct.pack("<II", 15, len(body)) + body
+    )
+
+
+@logs("a.h5", 'rate = 50.0\nctrl = "q"\nqpos = "q"\njoints = ["shoulder", "elbow"]\n')
+def hdf5_chunk(file: Path) -> None:
+    """Ten rows in a chunk of 3 GB, packed."""
+    import h5py
+
+    with h5py.File(file, "w") as root:
+        data = root.create_dataset("q", (10, 2), "f8", chunks=(10, 2), maxshape=(None, None), compression=9)
+        data[...] = 0
+    # h5py refuses to make a chunk larger than its data: made by hand, of the largest that the library takes
+    with h5py.File(file, "w") as root:
+        space = h5py.h5s.create_simple((10, 2), (h5py.h5s.UNLIMITED, 2))
+        how = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        how.set_chunk((190_000_000, 2))
+        how.set_deflate(9)
+        data = h5py.Dataset(h5py.h5d.create(root.id, b"q", h5py.h5t.IEEE_F64LE, space, how))
+        packer = zlib.compressobj(9)
+        body = b"".join(packer.compress(bytes(10_000_000)) for _ in range(304)) + packer.flush()
+        data.id.write_direct_chunk((0, 0), body)
+
+
+@logs("a.mcap")
+def mcap_zeros(file: Path) -> None:
+    """A bag whose one chunk unpacks to 4 GB."""
+    import shutil
+
+    import pyarrow as pa
+    from strange_logs import write_bag
+
+    made = file.parent / "bag"
+    write_bag(made, "mcap")
+    whole = next(made.glob("*.mcap")).read_bytes()
+    shutil.rmtree(made)
+    frame = pa.CompressedOutputStream
+    sink = pa.BufferOutputStream()
+    with frame(sink, "zstd") as out:
+        for _ in range(64):
+            out.write(bytes(64 << 20))
+    packed = sink.getvalue().to_pybytes()
+    record = (
+        struct.pack("<QQQI", 0, 10**12, 4 << 30, 0)
+        + struct.pack("<I", 4)
+        + b"zstd"
+        + struct.pack("<Q", len(packed))
+        + packed
+    )
+    at = 8 + 9 + struct.unpack("<Q", whole[9:17])[0]
+    file.write_bytes(whole[:at] + b"\x06" + struct.pack("<Q", len(record)) + record + whole[at:])
+
+
+@logs("a.db3")
+def db3_view(file: Path) -> None:
+    """Messages that are a query without end."""
+    from strange_logs import write_bag
+
+    made = file.parent / "bag"
+    write_bag(made, "sqlite3")
+    next(made.glob("*.db3")).replace(file)
+    for child in made.iterdir():
+        child.unlink()
+    made.rmdir()
+    with sqlite3.connect(file) as base:
+        base.execute("ALTER TABLE messages RENAME TO old")
+        base.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c) "
+            "SELECT n AS id, topic_id, timestamp + n AS timestamp, zeroblob(100000000) AS data FROM c, old"
+        )
+
+
+def pickled(code: bytes) -> Callable[[Path], None]:
+    return logs("a.pkl", 'joints = ["shoulder", "elbow"]\naction_scale = 0.25\n')(
+        lambda file: file.write_bytes(code) and None
+    )
+
+
+DOUBLED = b"\x80\x04]\x94" + b"".join(b"h" + bytes([i]) + b"h" + bytes([i]) + b"\x86\x94" for i in range(60))
+
+
+@logs("a.npz", 'rate = 50.0\nctrl = "q"\nqpos = "q"\njoints = ["shoulder", "elbow"]\n')
+def npz_zeros(file: Path) -> None:
+    """4 GB of zeros, packed."""
+    import zipfile
+
+    head = (
+        b"\x93NUMPY\x01\x00"
+        + struct.pack("<H", 118)
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (268435456, 2), }".ljust(117)
+        + b"\n"
+    )
+    with (
+        zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as packed,
+        packed.open("q.npy", "w", force_zip64=True) as part,
+    ):
+        part.write(head)
+        for _ in range(64):
+            part.write(bytes(64 << 20))
+
+
+def sparse(name: str) -> Callable[[Path], None]:
+    """A text of 40 GB that takes no room on the disk."""
+
+    def make(file: Path) -> None:
+        with file.open("wb") as out:
+            out.write(b"time,ctrl.shoulder,ctrl.elbow,qpos.shoulder,qpos.elbow\n0,0,0,0,0\n")
+            out.truncate(40 << 30)
+
+    return logs(name)(make)
+
+
+def pushed(change: Callable[[Path], None]) -> Callable[[Path], None]:
+    """A dataset that was pushed to a folder, its robot then another, with the right hash."""
+
+    def make(folder: Path) -> None:
+        from gaponet.data.store import Dataset
+        from gaponet.share.move import push
+        from gaponet.share.target import part_of
+
+        ctrl = wave(60, 2)
+        robot = write_arm(folder / "good")
+        data = Dataset.create(folder / "set", robot)
+        data.append(arm_sequence(robot, ctrl, late(ctrl, 2), "wave", 0.0))
+        push(data.path, f"file://{folder}/bucket")
+        change(folder)
+        index = json.loads((folder / "bucket" / "gaponet.json").read_text())
+        part = part_of(folder / "arm" / "robot.xml")
+        shutil.copyfile(folder / "arm" / "robot.xml", folder / "bucket" / "sha256" / part.sha256)
+        index["files"]["gaponet/robot/robot.xml"] = vars(part)
+        (folder / "bucket" / "gaponet.json").write_text(json.dumps(index))
+
+    return make
+
+
+PULL, BENCH = ("pull", "file://{}/bucket", "{}/back"), ("bench", "latency", "{}/run")
+PICKLE = (*IMPORT, "--allow-pickle")
+CONE = asset('<mesh name="m" builtin="cone" params="100000000 1"/>')
+NKEY = before('<size nkey="300000000"/>')
+LONG = b"\x80\x04cbuiltins\nbytearray\n\x8a\x08" + struct.pack("<q", 5_900_000_000) + b"\x85R."
+CASES = {
+    "mjcf cone": Case(CONE, CHECK),
+    "mjcf supersphere": Case(asset('<mesh name="m" builtin="supersphere" params="30000 1 1"/>'), CHECK),
+    "mjcf nuserdata": Case(before('<size nuserdata="500000000"/>'), CHECK),
+    "mjcf nuser_geom": Case(before('<size nuser_geom="300000000"/>'), CHECK),
+    "mjcf nuser_body": Case(before('<size nuser_body="300000000"/>'), CHECK),
+    "mjcf nkey": Case(NKEY, CHECK),
+    "mjcf njmax": Case(before('<size njmax="2000000000" nconmax="2000000000"/>'), CHECK),
+    "mjcf iterations": Case(mjcf("<option ", '<option iterations="2000000000" tolerance="0" '), CHECK),
+    "mjcf attach": Case(attach_bomb, CHECK),
+    "mjcf deep": Case(deep, CHECK),
+    "mjcf sensor": Case(before('<sensor><user name="u" dim="1000000000"/></sensor>'), CHECK),
+    "mjcf delay": Case(before('<actuator><motor joint="elbow" nsample="1000000000" delay="0.1"/></actuator>'), CHECK),
+    "mjcf picture": Case(picture, CHECK),
+    "mjcf hull": Case(hull, CHECK),
+    "pull cone": Case(pushed(CONE), PULL),
+    "pull nkey": Case(pushed(NKEY), PULL),
+    "onnx Loop": Case(lambda folder: network(loop, folder), BENCH),
+    "onnx ConstantOfShape": Case(lambda folder: network(large(2_000_000_000), folder), BENCH),
+    "onnx outer": Case(lambda folder: network(outer, folder), BENCH),
+    "parquet rows": Case(parquet_rows, IMPORT),
+    "parquet text": Case(parquet_text, IMPORT),
+    "mat zeros": Case(mat_zeros, IMPORT),
+    "hdf5 chunk": Case(hdf5_chunk, IMPORT),
+    "mcap zeros": Case(mcap_zeros, IMPORT),
+    "db3 view": Case(db3_view, IMPORT),
+    "npz zeros": Case(npz_zeros, IMPORT),
+    "pickle bytearray": Case(pickled(LONG), PICKLE),
+    "pickle repr": Case(pickled(DOUBLED + b"cnumpy\ndtype\nh\x3c\x85R."), PICKLE),
+    "csv sparse": Case(sparse("a.csv"), IMPORT),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a command: exit code (None: it was ended), what it said, s in all and of computing, peak bytes."""
+
+    code: int | None
+    said: str
+    seconds: float
+    computing: float
+    memory: int
+
+    @property
+    def good(self) -> bool:
+        """One line, or taken without a word; soon on a machine of one's own, and small."""
+        last = [line for line in self.said.splitlines() if not line.startswith(("reading", "checking", "downloading"))]
+        said = (self.code == 2 and len(last) == 1) or (self.code == 0 and not last)
+        return said and self.computing < SECONDS and self.memory < MEMORY
+
+
+def tried(name: str, folder: Path) -> Outcome:
+    """Make a case in a folder and run its command, of the gaponet that this Python imports."""
+    case = CASES[name]
+    case.make(folder)
+    return outcome([word.format(folder) for word in case.words])
+
+
+def outcome(words: list[str]) -> Outcome:
+    """Run a gaponet command, ended where it wants too much."""
+
+    def bounded() -> None:
+        os.setsid()
+        resource.setrlimit(resource.RLIMIT_AS, (CUT[1],) * 2)
+
+    command = [sys.executable, "-m", "gaponet", *words]
+    with tempfile.TemporaryFile() as said:
+        start = time.monotonic()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said, preexec_fn=bounded)
+        pid = code = None
+        while not pid and time.monotonic() - start < CUT[0]:
+            time.sleep(0.02)
+            pid, status, used = os.wait4(process.pid, os.WNOHANG)
+            code = os.waitstatus_to_exitcode(status) if pid else None
+        if not pid:
+            os.killpg(process.pid, signal.SIGKILL)
+            _, _, used = os.wait4(process.pid, 0)
+        process.returncode = -9 if code is None else code
+        seconds = time.monotonic() - start
+        said.seek(0)
+        text = said.read().decode("utf-8", "replace")
+        return Outcome(code, text, seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="how names begin, with commas between")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    found: dict[str, Outcome] = {}
+    for name in filter(lambda name: name.startswith(tuple(args.only.split(","))), CASES):
+        with tempfile.TemporaryDirectory(prefix="hostile-") as folder:
+            found[name] = one = tried(name, Path(folder))
+        last = one.said.replace(folder, "").strip().splitlines()[-1:] or [""]
+        times = f"{one.seconds:6.1f} s, computing {one.computing:5.1f} s, {one.memory / 1e6:6.0f} MB"
+        print(f"{'ok' if one.good else 'NOT':4}{name:22}{times}, code {one.code}: {last[0][:150]}", flush=True)
+    if args.json:
+        args.json.write_text(json.dumps({n: asdict(o) | {"good": o.good} for n, o in found.items()}, indent=1))
+    bad = [name for name, one in found.items() if not one.good]
+    said = ", ".join(bad) or "none"
+    print(f"{len(found)} hostile files; not in one line, {SECONDS:g} s and {MEMORY >> 20} MiB: {said}")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

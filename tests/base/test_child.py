@@ -1,0 +1,125 @@
+"""A folder full of modules that are called like Python's and everybody's: no command and no child of one runs any."""
+
+import importlib.metadata
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+from arm import write_arm
+
+from gaponet.cli.main import COMMANDS
+
+NAMES = sorted({*sys.stdlib_module_names, *importlib.metadata.packages_distributions()} - {"gaponet", "__main__"})
+MARK = "ran.txt"
+POISON = f"import os; open(os.path.join(os.path.dirname(__file__), {MARK!r}), 'a').write(__name__ + '\\n')\n"
+
+# What a console script is: sys.path begins with the folder of scripts.
+SCRIPT = "import sys\nfrom gaponet.__main__ import entry\nentry()\n"
+
+EVERY_COMMAND = """
+from contextlib import suppress
+from gaponet.base.child import leave_folder
+leave_folder()
+from gaponet.cli.main import COMMANDS, main
+for command in COMMANDS:
+    with suppress(SystemExit):
+        main([command, "--help"])
+"""
+
+CHILDREN = """
+import sys, os
+from gaponet.base import child
+child.leave_folder()
+from pathlib import Path
+from gaponet.data.importer import import_logs
+from gaponet.hw.control.driver import DriverError
+from gaponet.hw.control.watchdog import Watchdog
+from gaponet.base.executor import opened
+from gaponet.robot.spec import load_robot
+from gaponet.experiments.speed.latency import in_own_process
+from gaponet.base.errors import GAPONetError
+
+if __name__ == "__main__":
+    robot = load_robot(Path("arm"))
+    print(len(import_logs("logs", robot, "lab", 0.0, "set").entries), "imported")
+    lock = os.open("lock", os.O_CREAT | os.O_RDWR)
+    watchdog = Watchdog({"kind": "so101", "robot": "so101", "early": False, "port": "nowhere"}, lock, 1, 1)
+    watchdog.wait_ready()
+    watchdog.release()
+    print("watched")
+    with opened("local", 1, 1) as pool:
+        print(*pool.map(abs, [-3]), "computed")
+    try:
+        in_own_process(Path("set"), 1, 1)
+    except GAPONetError:
+        print("measured")
+"""
+
+
+@pytest.fixture
+def poisoned(tmp_path):
+    """Such a folder, with a robot and a log of it."""
+    for name in NAMES:
+        (tmp_path / f"{name}.py").write_text(POISON)
+    write_arm(tmp_path / "arm")
+    (tmp_path / "logs").mkdir()
+    time = 0.02 * np.arange(60)
+    angles = np.sin(time)[:, None] * [0.3, 0.2]
+    scipy.io.savemat(tmp_path / "logs" / "a.mat", {"time": time, "cmd": angles, "q": 0.9 * angles})
+    told = 'ctrl = "cmd"\nqpos = "q"\njoints = ["shoulder", "elbow"]\nposition_unit = "rad"\ntime_unit = "s"\n'
+    (tmp_path / "logs" / "logs.toml").write_text(told)
+    return tmp_path
+
+
+def python(folder: Path, code: str, *words: str, **env: str) -> str:
+    """A script that lies elsewhere, started in the folder."""
+    (folder / "elsewhere").mkdir(exist_ok=True)
+    script = folder / "elsewhere" / "script.py"
+    script.write_text(code)
+    done = subprocess.run(
+        [sys.executable, str(script), *words], cwd=folder, capture_output=True, text=True, env=os.environ | env
+    )
+    return done.stdout + done.stderr
+
+
+def ran(folder: Path) -> list[str]:
+    return (folder / MARK).read_text().split() if (folder / MARK).exists() else []
+
+
+def test_a_poisoned_folder_runs_where_python_looks_there(poisoned):
+    """The test's own proof: this is what must not happen."""
+    subprocess.run([sys.executable, "-c", "import numpy"], cwd=poisoned, capture_output=True)
+    assert "numpy" in ran(poisoned)
+
+
+def test_no_command_runs_what_lies_in_the_folder(poisoned):
+    said = python(poisoned, EVERY_COMMAND)
+    assert said.count("usage: gaponet") == len(COMMANDS), said
+    assert ran(poisoned) == []
+
+
+def test_no_child_runs_what_lies_in_the_folder(poisoned):
+    pytest.importorskip("serial")
+    assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "watched", "3 computed", "measured"]
+    assert ran(poisoned) == []
+
+
+@pytest.mark.parametrize("how", ["-m", "PYTHONPATH"])
+def test_a_command_runs_nothing_of_the_folder_however_it_is_started(poisoned, how):
+    """What Python itself loads before a module of ours can say anything is out of our hands."""
+    started = [sys.executable, "-c", "import sys; print(*sys.modules)"]
+    loaded = subprocess.run(started, cwd="/", capture_output=True, text=True).stdout.split()  # by .pth files as well
+    library = sys.stdlib_module_names - {"json", "tomllib", "hashlib", "subprocess", "multiprocessing", "csv"}
+    for name in library.union(loaded):
+        (poisoned / f"{name}.py").unlink(missing_ok=True)
+    if how == "-m":
+        words = [sys.executable, "-m", "gaponet", "formats"]
+        said = subprocess.run(words, cwd=poisoned, capture_output=True, text=True).stdout
+    else:
+        said = python(poisoned, SCRIPT, "formats", PYTHONPATH=f":{os.environ.get('PYTHONPATH', '')}")
+    assert "rosbag" in said
+    assert ran(poisoned) == []

@@ -1,0 +1,87 @@
+"""Executors: workers that are killed cost nothing but time, on each of them; nothing is loaded unasked."""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from importlib.util import find_spec
+
+import pytest
+from arm import write_arm
+from jobs import dies_at_first
+
+from gaponet.base.errors import UsageError, WorkerError
+from gaponet.base.executor import opened
+from gaponet.cli.main import main
+from gaponet.robot.spec import load_robot
+from gaponet.sim.model import model_hash
+
+
+def carried_out(pool, folder, numbers):
+    """Outcomes of the jobs, and how many attempts each took."""
+    outcomes = {o.job[1]: o for o in pool.run(dies_at_first, ((folder, n) for n in numbers))}
+    return outcomes, {n: len(list(folder.glob(f"{n}-*"))) for n in numbers}
+
+
+def test_a_killed_worker_costs_its_own_job_another_attempt_and_no_other_job_anything(tmp_path, monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    with opened("local", 2, 1) as pool:
+        outcomes, attempts = carried_out(pool, tmp_path, range(8))
+        assert list(pool.map(abs, (-3, 2, -1))) == [3, 2, 1]
+    assert attempts == {0: 2, 1: 1, 2: 2, 3: 1, 4: 2, 5: 3, 6: 2, 7: 1}
+    for n in (0, 1, 2, 3, 4, 6):
+        assert outcomes[n].result() == (n**2, "1")
+    with pytest.raises(WorkerError, match="3 workers died of it, out of memory"):
+        outcomes[5].result()
+    with pytest.raises(UsageError, match="seven is refused") as refused:
+        outcomes[7].result()
+    assert "dies_at_first" in refused.value.__notes__[0]
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+
+
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs gaponet[ray]")
+def test_the_same_on_a_ray_of_this_machine(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # jobs.py
+    with opened("ray", 2, 1) as pool:
+        outcomes, attempts = carried_out(pool, tmp_path, (0, 1, 7))
+    assert attempts == {0: 2, 1: 1, 7: 1}
+    assert [outcomes[n].result() for n in (0, 1)] == [(0, "1"), (1, "1")]
+    with pytest.raises(UsageError, match="seven is refused"):
+        outcomes[7].result()
+
+
+def test_any_executor_of_the_standard_library_will_do():
+    for executor in (ThreadPoolExecutor(2), ProcessPoolExecutor(2)):
+        with executor, opened(executor, 0, 1) as pool:
+            assert list(pool.map(abs, range(-9, 0))) == [*range(9, 0, -1)]
+
+
+@pytest.mark.parametrize("where", ["dask", "submitit:cluster=local", "slurm", "local:2", object()])
+def test_what_is_no_executor_is_refused_and_the_answer_names_ray_and_python(where):
+    answer = r"--executor .*: choose local, ray or ray:ADDRESS; from Python, give a concurrent\.futures\.Executor"
+    with pytest.raises(UsageError, match=answer), opened(where, 0, 1):
+        pass
+
+
+def test_ray_is_loaded_only_where_it_is_asked_for_and_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
+    code = "import sys, gaponet.base.executor, gaponet.experiments.found; print('ray' in sys.modules)"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "False\n"
+    monkeypatch.setitem(sys.modules, "ray", None)
+    command = ["collect", "--robot", "so101", "--recipe", "arm", "--executor", "ray", "--out", str(tmp_path / "ray")]
+    assert main(command) == 2
+    assert "pip install 'gaponet[ray]'" in capsys.readouterr().err
+
+
+def test_a_robot_goes_to_a_machine_that_has_not_its_folder(tmp_path):
+    robot = write_arm(tmp_path / "here")
+    sent = pickle.dumps(robot)
+    assert pickle.loads(sent).folder == robot.folder
+    shutil.rmtree(robot.folder)
+    there = pickle.loads(sent)
+    assert there.folder != robot.folder
+    assert pickle.loads(sent).folder == there.folder
+    assert model_hash(there) == model_hash(load_robot(there.folder))
+    assert there.name == robot.name

@@ -1,0 +1,33 @@
+import pytest
+
+from gaponet.base.errors import GAPONetError
+from gaponet.base.text import markdown, measured
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [(7.43e-5, 1.3, "0.0 ± 1.3"), (320.4, 168.0, "320 ± 170"), (19.63, 0.912, "19.63 ± 0.91"),
+     (-0.01234, 0.00071, "-0.01234 ± 0.00071"), (1234.0, 5678.0, "1200 ± 5700"), (2.0, float("nan"), "2.000 ± nan")],
+)  # fmt: skip
+def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, text):
+    assert measured(value, error) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("s3://KEY:se/cret@bucket/x: no", "s3://bucket/x: no"),
+        ("'ftp://u:secret@h/x' and gs://me@b/y", "'ftp://h/x' and gs://b/y"),
+        ("s3:/KEY:se/c@ret@bucket/x", "s3://bucket/x"),
+        (
+            "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x",
+            "file:///logs@home/a@b, s3://bucket/a@b, s3://bucket/x",
+        ),
+    ],
+)
+def test_no_error_shows_the_keys_of_an_address(text, shown):
+    assert str(GAPONetError(text)) == shown
+
+
+def test_a_name_in_markdown_fetches_no_picture():
+    assert markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"

@@ -1,0 +1,116 @@
+"""gaponet attach, and the LeRobot plug-in on stand-ins for what LeRobot 0.6 publishes; its own run is make lerobot."""
+
+import importlib.util
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from arm import write_arm
+
+from gaponet.cli.main import main
+from gaponet.robot.folder import save_robot
+
+PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
+POLICY = {
+    "name": "policy_postprocessor",
+    "steps": [
+        {"registry_name": "unnormalizer_processor", "config": {}, "state_file": "x"},
+        {"registry_name": "device_processor", "config": {"device": "cpu"}},
+    ],
+}
+
+
+@pytest.fixture
+def known(tmp_path):
+    robot = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 14.0, "delay": 0.03, "frictionloss": 0.2}})
+    save_robot(robot, tmp_path / "known")
+    return tmp_path / "known"
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    """The plug-in on stand-ins for what it takes from LeRobot."""
+
+    class Config:
+        register_subclass = staticmethod(lambda name: lambda cls: cls)
+
+    @dataclass
+    class RobotConfig(Config):
+        id: str | None = None
+        calibration_dir: Path | None = None
+
+    class Robot:
+        def __init__(self, config):
+            self.calibration_fpath = config.calibration_dir / self.name / f"{config.id}.json"
+
+    keys = SimpleNamespace(ACTION="action", OBSERVATION="observation")
+    registry = SimpleNamespace(register=lambda name: lambda cls: cls)
+    modules = {
+        "lerobot": {}, "lerobot.utils": {},
+        "lerobot.cameras": {"CameraConfig": object, "make_cameras_from_configs": lambda configs: {}},
+        "lerobot.lerobot_types": {"EnvTransition": dict, "TransitionKey": keys},
+        "lerobot.processor": {"ProcessorStep": object, "ProcessorStepRegistry": registry},
+        "lerobot.robots": {"Robot": Robot, "RobotConfig": RobotConfig},
+        "lerobot.teleoperators": {"Teleoperator": object, "TeleoperatorConfig": Config},
+        "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
+    }  # fmt: skip
+    for name, content in modules.items():
+        module = ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    spec = importlib.util.spec_from_file_location("lerobot_robot_gaponet", PLUGIN)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "lerobot_robot_gaponet", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_policy_is_corrected_by_what_was_attached_last_and_by_nothing_after_off(tmp_path, known, plugin, capsys):
+    policy = tmp_path / "policy"
+    policy.mkdir()
+    file = policy / "policy_postprocessor.json"
+    file.write_text(json.dumps(POLICY))
+    for mass in ("0.1", "0.2"):
+        assert main(["attach", str(policy), str(known), "--payload-mass", mass]) == 0
+    *before, step = json.loads(file.read_text())["steps"]
+    assert before == POLICY["steps"]
+    assert (step["registry_name"], step["config"]["payload_mass"]) == ("gaponet_correct", 0.2)
+    assert plugin.GaponetCorrect(**step["config"]).get_config() == {"model": ""} | step["config"]
+    assert main(["attach", str(policy), "--off"]) == 0
+    assert json.loads(file.read_text()) == POLICY
+    for words, said in (([str(policy)], "or --off"), ([str(tmp_path), str(known)], "has no policy_postprocessor.json"),
+                        ([str(policy), str(policy)], "is neither a robot folder")):  # fmt: skip
+        assert main(["attach", *words]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_a_chunk_is_corrected_as_its_rows_would_be_and_the_next_goes_on_where_it_overlaps(known, plugin):
+    time = 0.02 * np.arange(90)[:, None]
+    rows = torch.from_numpy(np.degrees(0.3 * np.sin(2 * np.pi * np.array([0.4, 0.6]) * time))).float()
+    one, many = plugin.GaponetCorrect(known=str(known)), plugin.GaponetCorrect(known=str(known))
+    single = torch.stack([one({"action": row[None]})["action"][0] for row in rows])
+    first = many({"action": rows[None, :50]})["action"]
+    assert first.shape == (1, 50, 2)
+    torch.testing.assert_close(first[0], single[:50])
+    assert (first[0] - rows[:50]).abs().max() > 0.5  # degrees
+    second = many({"action": rows[None, 40:]})["action"]  # ten rows of the first were not sent
+    jump = ((second[0, 0] - rows[40]) - (first[0, 39] - rows[39])).abs().max()
+    assert jump < 0.2
+    with pytest.raises(ValueError, match="one robot's chunk"):
+        many({"action": torch.zeros(2, 5, 2)})
+
+
+def test_the_arms_calibration_is_found_by_the_id_it_was_calibrated_under(tmp_path, plugin):
+    robot = plugin.GaponetSO101(plugin.GaponetSO101Config(id="mine", calibration_dir=tmp_path))
+    assert "--calibration" not in robot._command("ipc://x")
+    (tmp_path / "so_follower").mkdir()
+    (tmp_path / "so_follower" / "mine.json").write_text("{}")
+    words = robot._command("ipc://x")
+    assert words[words.index("--calibration") + 1] == str(tmp_path / "so_follower" / "mine.json")
+    with pytest.raises(NotImplementedError, match=r"--robot.type=so101_follower, with --robot.id=mine"):
+        robot.calibrate()

@@ -1,0 +1,76 @@
+"""gaponet export and what gaponet bench latency measures, on a small artifact."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from arm import write_arm
+
+from gaponet.cli.main import main
+from gaponet.deploy.aligned_sim import AlignedSim
+from gaponet.experiments.speed import latency
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+
+CONFIG = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run folder with artifact and checkpoint."""
+    robot = write_arm(tmp_path / "arm")
+    torch.manual_seed(0)
+    net = build_network(CONFIG, 2)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    export(net, tmp_path / "run" / "model", make_card(CONFIG, robot, dt=[0.02]), drawn_states(net))
+    torch.save({"best_state": net.state_dict()}, tmp_path / "run" / "checkpoint.pt")
+    return tmp_path / "run"
+
+
+def test_an_artifact_without_numpy_weights_gets_them(run, capsys):
+    before = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    (run / "model" / "weights.npz").unlink()
+    assert main(["export", str(run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["parity_rad"] < 1e-5
+    again = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    np.testing.assert_allclose(again, before, atol=1e-7)
+
+
+def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
+    robot = load_robot(tmp_path / "arm")
+    save_robot(robot, run / "robot")
+    assert main(["export", str(run), "--out", str(tmp_path / "shipped")]) == 0
+    stiff = replace(robot, kp=2.0 * robot.kp)
+    there = AlignedSim(stiff, GapModel.load(run), 0.1)
+    shutil.rmtree(run)
+    sim = AlignedSim(stiff, GapModel.load(tmp_path / "shipped"), 0.1)
+    for each in (there, sim):
+        each.step(np.full(2, 0.3))
+    assert sim.transfer is not None
+    np.testing.assert_allclose(sim.target, there.target, atol=1e-7)
+
+
+def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
+    (run / "checkpoint.pt").unlink()
+    assert main(["export", str(run)]) == 2
+    assert "no checkpoint.pt" in capsys.readouterr().err
+
+
+def test_every_runtime_is_measured(run, monkeypatch):
+    monkeypatch.setattr(latency, "BATCH", 16)
+    threads = torch.get_num_threads()
+    result = latency.measure(run, calls=100, threads=0)
+    torch.set_num_threads(threads)
+    assert set(result["microseconds"]) == {
+        "network, onnxruntime", "network, numpy", "network, torch",
+        "delta(), onnxruntime", "delta(), numpy",
+    }  # fmt: skip
+    assert all(0 < t["p50"] <= t["p99"] <= t["max"] for t in result["microseconds"].values())
+    assert set(result["deltas_per_s"]) == {"onnxruntime", "numpy"}

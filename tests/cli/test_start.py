@@ -1,0 +1,158 @@
+"""gaponet start: a model file and a folder of logs, as a lab has them, to a report by commands that it prints."""
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import XML, commands, record, write_arm
+
+from gaponet.cli import start
+from gaponet.cli.main import main
+
+SERVOS = "".join(f'<position joint="{joint}" kp="20" forcerange="-5 5"/>' for joint in ("shoulder", "elbow"))
+ORDER = ["robot", "import", "doctor", "gap", "identify", "gap", "export", "report"]
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A model file and csv logs of an arm with weaker, later servos; columns and names as no format has them."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.xml").write_text(XML.replace("</mujoco>", f"<actuator>{SERVOS}</actuator></mujoco>"))
+    robot = write_arm(tmp_path / "nominal")
+    Path("logs").mkdir()
+    for seed in range(5):
+        s = record(robot, commands(300, seed), f"swing_{seed}", kp=0.7, delay=2)
+        table = np.concatenate([1e3 * s.dt * np.arange(300)[:, None], s.ctrl, s.qpos], axis=1)
+        head = "time_ms,shoulder_des,elbow_des,shoulder_meas,elbow_meas"
+        np.savetxt(f"logs/swing_{seed}.csv", table, delimiter=",", header=head, comments="", fmt="%.6f")
+    return tmp_path
+
+
+def test_a_dry_run_says_what_was_understood_and_writes_nothing(place, capsys):
+    before = sorted(place.rglob("*"))
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert (said["joints"], said["recordings"], said["rate_hz"]) == (["shoulder", "elbow"], 5, 50.0)
+    assert 'time_unit = "ms"' in said["logs_toml"]
+    assert 'motion = "{motion}"' in said["logs_toml"]  # other commands: a number at a name's end counts no repetitions
+    assert [shlex.split(line)[1] for line in said["commands"]] == ORDER
+    assert sorted(place.rglob("*")) == before
+
+
+def test_a_single_recording_is_cut_so_that_parts_of_it_can_judge(place, capsys):
+    for seed in range(1, 5):
+        Path(f"logs/swing_{seed}.csv").unlink()
+    one = Path("logs/swing_0.csv")
+    head, *rows = one.read_text().splitlines()
+    later = [f"{float(row.split(',')[0]) + 6000},{row.partition(',')[2]}" for row in rows]
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    assert "--cut" not in json.loads(capsys.readouterr().out)["commands"][1]  # 6 s are too short
+    last = [f"{float(row.split(',')[0]) + 6000},{row.partition(',')[2]}" for row in later]
+    one.write_text("\n".join([head, *rows, *later, *last]))
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json"]) == 0
+    assert "--cut 5.99" in json.loads(capsys.readouterr().out)["commands"][1]
+
+
+def test_an_interrupted_start_goes_on_and_keeps_the_commands_that_ran(place, monkeypatch, capsys):
+    ran = []
+
+    def stopping(words):
+        ran.append(words[0])
+        if words[0] != "identify":
+            return main(words)
+        if ran.count("identify") == 1:
+            return 2
+        shutil.copytree("started/robot", "started/identified")
+        return 0
+
+    monkeypatch.setattr(start, "main", stopping)
+    monkeypatch.setattr(start, "COMMANDS", dict.fromkeys(ORDER[:5]))
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "stopped at: gaponet identify started/data" in capsys.readouterr().err
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran == ["robot", "import", "gap", "identify", "identify", "gap"]  # the doctor is asked directly
+    lines = Path("started/commands.sh").read_text().splitlines()
+    assert [shlex.split(line)[1] for line in lines] == ["robot", "import", "doctor", "gap", "identify", "gap"]
+
+
+def test_other_logs_need_another_folder_and_more_logs_run_again_what_followed_from_them(place, monkeypatch, capsys):
+    ran, look = [], start.api.doctor
+    monkeypatch.setattr(start, "main", lambda words: ran.append(words[0]) or main(words))
+    monkeypatch.setattr(start, "COMMANDS", dict.fromkeys(ORDER[:3]))  # robot, import and doctor
+    monkeypatch.setattr(start.api, "doctor", lambda data: ran.append("doctor") or look(data))
+    last = Path("logs/swing_4.csv").rename("swing_4.csv")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    shutil.copytree("logs", "other")
+    assert main(["start", "arm.xml", "other"]) == 0  # the same logs elsewhere are the same data
+    assert ran == ["robot", "import", "doctor", "import"]
+    Path("logs/swing_4.csv").write_text("no log\n")
+    assert main(["start", "arm.xml", "logs"]) == 2  # a new log that cannot be read may be mended
+    assert ran.pop() == "import"
+    last.rename("logs/swing_4.csv")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran[4:] == ["import", "doctor"]
+    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 5
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert ran[6:] == []
+    capsys.readouterr()
+    before = {file: file.read_bytes() for file in Path("started").rglob("*") if file.is_file()}
+    assert main(["start", "arm.xml", "logs", "--cut", "3"]) == 2
+    assert "started/data was imported with --robot started/robot" in capsys.readouterr().err
+    Path("other/swing_3.csv").write_text(Path("logs/swing_4.csv").read_text())
+    Path("logs/swing_3.csv").unlink()
+    for logs, more in (("other", []), ("other", ["--dry-run"]), ("logs", [])):
+        assert main(["start", "arm.xml", logs, *more]) == 2
+        gone = "swing_3.csv, swing_4.csv are missing or changed in other" if logs == "other" else "swing_3.csv is"
+        assert gone in (said := capsys.readouterr().err)
+        assert "Give another --out for these logs, or the same logs again; or delete started/data" in said
+    assert {file: file.read_bytes() for file in before} == before
+    shutil.rmtree("started/data")
+    assert main(["start", "arm.xml", "logs"]) == 0
+    assert len(Path("started/data/sequences.jsonl").read_text().splitlines()) == 4
+
+
+def test_what_is_said_of_the_logs_reaches_their_import(place, capsys):
+    """Options that messages of import recommend; by some of them the first recording is read here already."""
+    for file in Path("logs").iterdir():
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+        head = file.read_text().split("\n", 1)[0].replace("shoulder", "a1")
+        np.savetxt(file, np.c_[table[:, :1], np.rad2deg(table[:, 1:])], delimiter=",", header=head, comments="")
+    said = ["--map", "a1=shoulder", "--position-unit", "deg", "--time-unit", "ms", "--cut", "3", "--skip-bad"]
+    assert main(["start", "arm.xml", "logs", "--dry-run", "--json", *said]) == 0
+    found = json.loads(capsys.readouterr().out)
+    words = shlex.split(found["commands"][1])
+    assert (found["joints"], found["rate_hz"]) == (["shoulder", "elbow"], 50.0)
+    assert {"--map=a1=shoulder", "--position-unit=deg", "--time-unit=ms", "--cut=3.0", "--skip-bad"} < set(words)
+
+
+@pytest.mark.parametrize("name", ["a1", "x"])
+def test_logs_that_do_not_explain_themselves_stop_with_a_file_to_correct(place, capsys, name):
+    for file in Path("logs").iterdir():
+        text = file.read_text()
+        file.write_text(text.replace("shoulder", name) if name == "a1" else text.replace("meas", name))
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == (0 if name == "a1" else 2)
+    said = capsys.readouterr()
+    assert "\\n" not in said.err
+    assert re.search('^ *"a1" = "shoulder"' if name == "a1" else '^ *# qpos = "…"', said.out, re.MULTILINE)
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "started/logs.toml says what these logs show of themselves" in capsys.readouterr().err
+    told = Path("started/logs.toml")
+    text = told.read_text()
+    assert ('"a1" = "shoulder"' if name == "a1" else '# qpos = "…"') in text
+    told.write_text(text if name == "a1" else re.sub("# qpos.*", 'qpos = "{joint}_x"', text))
+    assert main(["start", "arm.xml", "logs", "--dry-run"]) == 0, text
+
+
+def test_logs_with_an_error_are_not_fitted(place, monkeypatch, capsys):
+    for file in Path("logs").iterdir():  # the shoulder's command with the other sign
+        head, *rows = file.read_text().splitlines()
+        values = np.array([[float(x) for x in row.split(",")] for row in rows])
+        values[:, 1] *= -1
+        file.write_text("\n".join([head, *(",".join(f"{x:.6f}" for x in row) for row in values)]) + "\n")
+    assert main(["start", "arm.xml", "logs"]) == 2
+    assert "no fit mends it" in capsys.readouterr().err
+    assert not Path("started/identified").exists()

@@ -1,0 +1,78 @@
+"""BAM's logs: one servo, its load and its gain said in the file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from logs import late, wave, write_bam
+
+from gaponet.base.errors import JointMismatchError, LogError, UsageError
+from gaponet.data.formats import detect, read_logs
+from gaponet.data.importer import import_logs
+from gaponet.robot.spec import load_robot
+from gaponet.sim.batch import Condition
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return load_robot("xl330_bench")
+
+
+def test_a_recording_says_its_gain_and_its_load(tmp_path, bench):
+    write_bam(tmp_path / "a.json")
+    write_bam(tmp_path / "b.json", kp=100, vin=5.0, trajectory="up", length=0.15, arm_mass=0.02)
+    (tmp_path / "notes.json").write_text('{"entries": "of a diary"}')
+    assert detect(tmp_path) == detect(tmp_path / "a.json") == "bam"
+    report = import_logs(tmp_path, bench, "mine", None, tmp_path / "data")
+    first, second = report.dataset.sequences(report.entries)
+    assert first.meta.motion == "sin_sin"
+    assert (first.meta.payload_mass, first.meta.payload_side) == (0.49, "100mm")
+    np.testing.assert_allclose(first.meta.kp, bench.kp, rtol=1e-3)  # robot.toml is at the factory's gain and 7.4 V
+    assert Condition.of(first, bench).kp is None
+    assert (second.meta.payload_mass, second.meta.payload_side) == (0.5, "150mm")
+    np.testing.assert_allclose(second.meta.kp, bench.kp / 4 * 5.0 / 7.4, rtol=1e-3)
+    np.testing.assert_allclose(Condition.of(second, bench).kp, second.meta.kp)
+    np.testing.assert_allclose(first.qpos[:, 0], late(wave(60, 1, 0.0053), 3)[:, 0], atol=1e-6)
+    assert sorted(report.entries[0].channels) == ["ctrl", "qpos", "qvel", "temperature"]
+
+
+def test_a_recording_ends_where_torque_is_switched_off(tmp_path, bench):
+    report = import_logs(write_bam(tmp_path / "a.json", off=40), bench, "mine", None, tmp_path / "data")
+    assert (report.entries[0].rows, report.entries[0].meta.notes["cut"]) == (40, "torque is off from 0.22 s on")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"off": 1}, "off from the start"),
+        ({"kp": 0}, "kp"),
+        ({"mass": -1}, "mass"),
+        ({"entries": []}, "entries"),
+        ({"entries": [{"position": "high"}] * 3}, r"entries\[0\]"),
+    ],
+)
+def test_what_cannot_be_a_recording_is_refused(tmp_path, bench, changes, message):
+    with pytest.raises(LogError, match=message):
+        list(read_logs(write_bam(tmp_path / "a.json", **changes), bench, "bam"))
+
+
+def test_any_servo_comes_in_whose_gain_law_robot_toml_states(tmp_path, bench):
+    servo = replace(bench.servos[0], gain=0.02, gain_volts=None)  # one whose current follows the error
+    mine = replace(bench, servos=(servo,), aliases={"mx64": "motor"})
+    ((_, log),) = read_logs(write_bam(tmp_path / "a.json", motor="mx64", kp=50, vin=12.0), mine)
+    assert log.meta["kp"] == [pytest.approx(1.0)]
+    with pytest.raises(JointMismatchError, match=r"names joint 'mx64', which .* does not have; nearest: motor\."):
+        list(read_logs(tmp_path, bench))
+    with pytest.raises(LogError, match=r"what its kp 50 means .* write gain \(and gain_volts\) into the \[\[servo\]\]"):
+        list(read_logs(tmp_path, replace(mine, servos=(replace(servo, gain=None),))))
+
+
+def test_an_arm_of_another_length_is_named(tmp_path, bench):
+    with pytest.raises(UsageError, match="'123mm' is unknown to xl330_bench; use one of both, 100mm"):
+        import_logs(write_bam(tmp_path / "a.json", length=0.123), bench, "mine", None, tmp_path / "data")
+
+
+def test_a_folder_that_is_called_like_a_recording_is_none(tmp_path):
+    (tmp_path / "x.json").mkdir()
+    with pytest.raises(LogError, match="not a log this version reads"):
+        detect(tmp_path)

@@ -1,0 +1,103 @@
+"""ROS bags: two topics joined in time, whatever says the command, and clocks that do not agree."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+from strange_logs import motion, write_bag
+
+from gaponet.base.errors import LogError
+from gaponet.data.formats import detect, read_logs
+from gaponet.data.importer import import_logs
+
+JOINTS = 'joints = ["shoulder", "elbow"]\n'
+
+
+def only(path, arm):
+    ((_, log),) = read_logs(path, arm)
+    return log
+
+
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_command_and_state_are_two_topics_with_clocks_of_their_own(tmp_path, arm, storage):
+    bag = write_bag(tmp_path / "wave", storage)
+    assert detect(tmp_path) == "rosbag"
+    file = next(bag.glob(f"*.{storage}"))
+    assert detect(file) == "rosbag"
+    for path in (tmp_path, bag, file):
+        log = only(path, arm)
+        ctrl, qpos = motion()
+        assert np.array_equal(log.channels["qpos"].values, qpos)
+        assert np.array_equal(log.channels["ctrl"].values, ctrl[::2])
+        assert log.channels["qpos"].time == pytest.approx(0.02 * np.arange(40), abs=1e-6)
+        assert log.channels["ctrl"].time == pytest.approx(0.004 + 0.04 * np.arange(20), abs=1e-6)
+
+
+@pytest.mark.parametrize("command", ["trajectory", "array", "controller", "custom"])
+def test_what_says_the_command_may_be_of_several_kinds(tmp_path, arm, command):
+    bag = write_bag(tmp_path / "wave", command=command)
+    (tmp_path / "logs.toml").write_text(JOINTS)
+    log = only(tmp_path, arm)
+    assert np.array_equal(log.channels["ctrl"].values, motion()[0][::2])
+    assert bag.is_dir()
+
+
+def test_all_arrays_of_a_message_of_ones_own_are_offered(tmp_path, arm):
+    write_bag(tmp_path / "wave", command="custom")
+    (tmp_path / "logs.toml").write_text('ctrl = "/arm/commands.gain"\n')
+    with pytest.raises(LogError, match=r"/arm/commands\.position\[2\].*/arm/commands\.gains\[3\]"):
+        only(tmp_path, arm)
+
+
+def test_unitrees_low_level_messages_bring_their_gains(tmp_path, arm):
+    write_bag(tmp_path / "wave", command="unitree")
+    (tmp_path / "logs.toml").write_text('joints = ["shoulder", "elbow"' + 33 * ', ""' + "]\n")
+    log = only(tmp_path, arm)
+    assert np.allclose(log.channels["qpos"].values, motion()[1], atol=1e-6)
+    assert np.allclose(log.channels["ctrl"].values, motion()[0][::2], atol=1e-6)
+    assert (log.meta["kp"], log.meta["kd"]) == ([20.0, 20.0], [1.0, 1.0])
+    assert "the recorder's" in log.meta["notes"]["clock"]["/arm/commands"]
+
+
+def test_commands_are_held_and_states_interpolated_and_it_is_written_down(tmp_path, arm):
+    write_bag(tmp_path / "logs" / "wave")
+    (entry,) = import_logs(tmp_path / "logs", arm, "lab", 0.0, tmp_path / "data").entries
+    assert entry.dt == pytest.approx(0.02)
+    assert entry.meta.notes["rows"] == "resampled to 50.00 Hz: commands held, states interpolated"
+
+
+@pytest.mark.parametrize(("drift", "away"), [(0.02, 0.0), (0.0, 3.0), (-0.01, -1e6)])
+def test_a_command_clock_that_runs_away_is_brought_back_and_noted(tmp_path, arm, drift, away):
+    write_bag(tmp_path / "wave", drift=drift, away=away)
+    log = only(tmp_path, arm)
+    state, command = log.channels["qpos"].time, log.channels["ctrl"].time
+    assert command - state[::2] == pytest.approx(0.004 * np.ones(20), abs=2e-4)
+    assert "ppm" in log.meta["notes"]["clock"]["/arm/commands"]
+
+
+def test_clocks_that_agree_are_left_alone(tmp_path, arm):
+    write_bag(tmp_path / "wave")
+    assert "clock" not in only(tmp_path, arm).meta["notes"]
+
+
+def test_messages_recorded_twice_count_once(tmp_path, arm):
+    write_bag(tmp_path / "wave", twice=True)
+    log = only(tmp_path, arm)
+    assert len(log.channels["qpos"].time) == 40
+    assert log.meta["notes"]["repeated"] == 40
+
+
+def test_a_bag_without_commands_says_so_and_what_can_still_be_done(tmp_path, arm):
+    write_bag(tmp_path / "wave", with_command=False)
+    with pytest.raises(LogError, match=r"no column holds ctrl.*/joint_states.position\[2\].* What can still be done"):
+        only(tmp_path, arm)
+
+
+def test_a_bag_cut_short_is_one_clear_error(tmp_path, arm):
+    bag = write_bag(tmp_path / "wave")
+    file = next(bag.glob("*.mcap"))
+    whole = file.read_bytes()
+    for size in (0, 7, len(whole) // 2, len(whole) - 5):
+        file.write_bytes(whole[:size])
+        with pytest.raises(LogError, match=r"not a readable bag \(.*\); it is cut short"):
+            only(file, arm)

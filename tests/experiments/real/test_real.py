@@ -1,0 +1,151 @@
+"""The benchmark of real robots: what it asks, what it counts, and how somebody adds a method."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from logs import arm_sequence, late, wave
+
+from gaponet.base.errors import UsageError
+from gaponet.data.store import Dataset
+from gaponet.experiments.real import networks as brief
+from gaponet.experiments.real.adversaries import ADVERSARIES
+from gaponet.experiments.real.bench import Bench, load_method
+from gaponet.experiments.real.cards import CARDS, ROBOTS, read_cards
+from gaponet.experiments.real.page import by_joint
+from gaponet.experiments.real.questions import floor, questions
+from gaponet.experiments.real.rivals import LEFT_OUT, METHODS
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import available, load_robot
+
+PAGE = Path(__file__).parents[3] / "docs" / "benchmark.md"
+
+
+@pytest.fixture
+def played(arm, tmp_path):
+    """Four motions by two units, each three times."""
+    data = Dataset.create(tmp_path / "data", arm)
+    for motion in range(4):
+        for unit in ("a", "b"):
+            for k in range(3):
+                ctrl = wave(120, 2, hertz=0.4 + 0.2 * motion)
+                qpos = late(ctrl, 2 + (unit == "b")) + 0.002 * k
+                one = arm_sequence(arm, ctrl, qpos, f"m{motion}", unit=unit, payload=0.5 * (unit == "b"))
+                data.append(replace(one, meta=replace(one.meta, repetition=k)))
+    return data
+
+
+def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
+    cards, page = read_cards(CARDS), PAGE.read_text(encoding="utf-8")
+    for card in cards.set:
+        robot = load_robot(ROBOTS / card.robot if card.robot not in available() else card.robot)
+        assert set(card.joints) <= set(robot.joint_names)
+        assert f"| {card.name} | {card.title} |" in page
+        assert card.elsewhere in {"", *(c.name for c in cards.set)}
+
+
+def test_a_unit_left_out_is_learned_from_by_calibration_alone_and_never_asked_what_it_saw(arm, played):
+    for question in questions("a unit left out", played, arm, None):
+        (unit,) = {s.meta.unit_id for s in question.test}
+        assert unit not in {s.meta.unit_id for s in question.train}
+        assert {s.meta.unit_id for s in question.few} == {unit}
+        assert not {s.meta.motion for s in question.few} & {s.meta.motion for s in question.test}
+    with pytest.raises(UsageError, match="question 'of life' is not known"):
+        list(questions("of life", played, arm, None))
+
+
+def test_repetitions_are_no_motions_set_the_floor_and_are_measured_once(arm, played, tmp_path):
+    (question,) = questions("new motions", played, arm, None)
+    assert floor(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
+    methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
+    card = next(c for c in read_cards().set if c.name == "so101")
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=lambda text: None)
+    told = [row.as_dict() for row in bench.ask(card, "new motions", [question])]
+    assert [(r["motions"], r["recordings"]) for r in told] == [(1, 6), (1, 6)]
+    assert told[0]["standard_error"] is None
+    assert told[1]["of_nominal"] < 1.0
+    stopped = Bench(
+        read_cards(), tmp_path, tmp_path / "work", dict.fromkeys(methods, ("", None)), say=lambda text: None
+    )
+    assert [row.as_dict()["mrad"] for row in stopped.ask(card, "new motions", [question])] == [r["mrad"] for r in told]
+
+
+def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, played):
+    (question,) = questions("new motions", played, arm, None)
+    changed = {name: change(question) for name, change in ADVERSARIES.items()}
+    mixed = changed["labels"]
+    assert sorted(s.meta.unit_id for s in mixed.known) == sorted(s.meta.unit_id for s in question.known)
+    assert [s.meta.unit_id for s in mixed.known] != [s.meta.unit_id for s in question.known]
+    was, later = question.test[0], changed["all_late"].test[0]
+    rows = len(was) - len(later)
+    assert rows * was.dt == pytest.approx(0.04)
+    assert (later.ctrl == was.ctrl[rows:]).all()
+    assert (later.qpos == was.qpos[:-rows]).all()
+    assert sum(len(s) < len(was) for s in changed["late"].known) == -(-len(question.known) // 10)
+    assert (changed["joints"].train[0].qpos == question.train[0].qpos[:, ::-1]).all()
+    asked = changed["asked_labels"]
+    assert asked.train is question.train
+    assert [s.meta.payload_mass for s in asked.test] != [s.meta.payload_mass for s in question.test]
+    assert sorted(s.meta.payload_mass for s in asked.test) == sorted(s.meta.payload_mass for s in question.test)
+    assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "asked_labels"))
+
+
+def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_identified_robot(
+    arm, played, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(brief, "BRIEF", replace(brief.BRIEF, num_envs=12, gradient_steps=0, sensor_states=16))
+    (question,) = questions("new motions", played, arm, None)
+    methods = {title: method for title, method in brief.networks(240).values() if "MLP" not in title}
+    with pytest.raises(UsageError, match="networks need a folder"):
+        methods["GAPONet"](question)
+    question = replace(question, work=tmp_path)
+    save_robot(arm, tmp_path / "identified")
+    beside, above = (method(question) for method in methods.values())
+    assert beside.corrector is not None
+    assert not beside.note.startswith(LEFT_OUT)
+    assert (above.corrector, above.note.partition(":")[0]) == (None, LEFT_OUT)
+    cards = [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
+    assert len(cards) == 2
+    again = methods["GAPONet"](question)
+    assert again.note == beside.note
+    assert cards == [file.stat().st_mtime_ns for file in tmp_path.rglob("card.json")]
+
+
+def test_only_what_is_there_is_asked(tmp_path):
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", METHODS, say=lambda text: None)
+    for only, asked, told in ((("a robot",), (), "no set 'a robot'"), ((), ("why",), "no question 'why'")):
+        with pytest.raises(UsageError, match=told):
+            bench.run(only, asked)
+    assert bench.run()["rows"] == []
+
+
+def test_the_method_on_the_page_is_one(arm, played, tmp_path):
+    code = re.search(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[1]
+    (tmp_path / "mine.py").write_text(code)
+    name, method = load_method(f"{tmp_path / 'mine.py'}:half_gravity")
+    (question,) = questions("new motions", played, arm, None)
+    moved = method(question).positions(question.test)
+    assert name == "half_gravity"
+    assert [q.shape for q in moved] == [s.qpos.shape for s in question.test]
+    with pytest.raises(UsageError, match=r"no such file; give FILE\.py:FUNCTION"):
+        load_method("nothing.py:f")
+
+
+def test_a_method_that_fails_loses_its_own_row_and_joints_that_were_recorded_alone_are_told_by_payload(
+    arm, played, tmp_path
+):
+    alone = Dataset.create(tmp_path / "alone", arm)
+    for e in played.entries:
+        one = played.read(e)
+        alone.append(replace(one, meta=replace(one.meta, notes={"held_at_home": [arm.operated[1]]})))
+    (question,) = questions("0.5 kg left out", alone, arm, None)
+    said, methods = [], {"nominal": METHODS["nominal"], "mine": ("mine", lambda question: 1 / 0)}
+    bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=said.append)
+    card = next(c for c in read_cards().set if c.name == "so101")
+    (row,) = (row.as_dict() for row in bench.ask(card, question.name, [question]))
+    assert any("mine: ZeroDivisionError" in text for text in said)
+    ((mrad, count),) = row["by_joint_mrad"][arm.operated[0]].values()
+    assert (mrad, count) == (pytest.approx(row["mrad"]), 12)
+    told = by_joint([row])
+    assert told[-1] == f"| 0.5 kg left out | {arm.operated[0]} | 0.5 | 12 | {mrad:.1f} |"

@@ -1,0 +1,69 @@
+"""The checks that travel, in other people's engines in environments of their own: make engines."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import torch
+from environments import environment
+
+from gaponet.export import folder as exporting
+from gaponet.export.forms import own_motions
+from gaponet.robot.spec import load_robot
+
+pytestmark = pytest.mark.peers
+
+ENGINES = {  # name → what is exported, what is run, Python, what is installed
+    "mujoco": ("mjcf", "check.py", "3.11", ("mujoco>=3.5",)),
+    "mjlab-1.6": ("mjlab", "check.py", "3.11", (f"torch=={torch.__version__}", "mjlab==1.6.*")),
+    "mjx": ("mjcf", "check_mjx.py", "3.11", ("mujoco-mjx",)),
+    "isaaclab-3": ("isaaclab", "check.py", "3.12", ("isaaclab==3.*", "mujoco-usd-converter")),
+    "drake": ("drake", "check.py", "3.12", ("drake",)),
+    "newton": ("newton", "check.py", "3.11", ("newton[sim,onnx]",)),
+}
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A VIRTUAL SO-101 with late servos and a law for every engine; motions of 2 to 4 s, so that worlds end apart."""
+    folder, robot = tmp_path_factory.mktemp("engines"), load_robot("so101")
+    law = {"stribeck": 0.03, "stribeck_speed": 0.05, "friction_motor": 0.08, "friction_external": 0.15}
+    found = {j: {"delay": 0.006 * i, "offset": 0.01 * i} | law for i, j in enumerate(robot.operated, 1)}
+    robot = robot.with_servos(found)
+    motions = [s.rows(slice(0, 100 + 27 * i)) for i, s in enumerate(own_motions(robot, count=5))]
+    with pytest.MonkeyPatch.context() as patch:  # the nearest numbers are searched for in test_export_robot.py
+        patch.setattr(
+            exporting, "plain_form", lambda r, *_, **__: r.with_servos({j: dict.fromkeys(law, 0.0) for j in found})
+        )
+        for to in {to for to, *_ in ENGINES.values()}:
+            exporting.export_robot(robot, to, folder / to, (motions, motions))
+    return folder
+
+
+@pytest.mark.parametrize("name", ENGINES)
+def test_late_servos_with_a_law_move_there_as_here_in_worlds_that_begin_anew_by_themselves(
+    exported: Path, name: str
+) -> None:
+    to, check, version, packages = ENGINES[name]
+    python = environment(name, version, *((package,) for package in packages))
+    said = subprocess.run([python, check], cwd=exported / to, capture_output=True, text=True, check=True).stdout
+    print(said)
+    pairs = re.findall(r": ([\d.]+) mrad; in gaponet ([\d.]+)", said)
+    assert pairs
+    for there, here in pairs:
+        assert abs(float(there) - float(here)) <= 0.05 * float(here) + 0.05
+
+
+@pytest.mark.parametrize("name", ["mjlab-1.6", "isaaclab-3"])
+def test_their_own_train_command_takes_the_exported_robot(exported: Path, tmp_path: Path, name: str) -> None:
+    to, _, version, packages = ENGINES[name]
+    python = environment(name, version, *((package,) for package in packages))
+    peer = Path(__file__).parent / f"{to}_train.py"
+    there = {**os.environ, "PYTHONPATH": f"{exported / to}{os.pathsep}{peer.parent}"}
+    subprocess.run([python, peer, tmp_path], cwd=exported / to, env=there, check=True)
+    trained = sorted(f.name for folder in (tmp_path, exported / to / "logs") for f in folder.rglob("model_*.pt"))
+    assert "model_1.pt" in trained

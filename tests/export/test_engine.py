@@ -1,0 +1,374 @@
+"""What other simulators are given: the network in torch, the simulator's numbers, an MJCF, an action term."""
+
+import re
+import sys
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from arm import write_arm
+from runs import random_run
+
+from gaponet.base.errors import ModelError
+from gaponet.cli.main import main
+from gaponet.export import action_term
+from gaponet.export.action_term import (
+    AlignedAction,
+    Aligner,
+    DelayedAction,
+    LateServos,
+    ServoLaw,
+    hold_friction,
+    isaaclab_actuators,
+    read_facts,
+)
+from gaponet.export.facts import mjcf_text, simulator_facts
+from gaponet.export.folder import export_model
+from gaponet.export.program import program
+from gaponet.export.scene_facts import require_scene
+from gaponet.export.step import delta_step
+from gaponet.nn.config import ModelConfig
+from gaponet.robot.identity import lines
+from gaponet.robot.spec import LAW, load_robot
+from gaponet.sim.batch import BatchSim, Condition
+from gaponet.sim.model import build_model, model_hash
+from gaponet.sim.servo import friction_limit, servo_torque
+
+LATE = {"shoulder": {"delay": 0.007, "offset": 0.02, "zero": 0.01}, "elbow": {"delay": 0.013, "stop_low": -1.2}}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A run in a simulator with late servos, and its export."""
+    folder = tmp_path_factory.mktemp("engine")
+    robot = write_arm(folder / "arm").with_servos(LATE)
+    model = random_run(folder / "run", robot)
+    assert export_model(model, folder / "run", folder / "torch", payload_mass=0.1) <= 1e-5
+    return folder
+
+
+@pytest.fixture(scope="module")
+def model(place):
+    return random_run(place / "run", write_arm(place / "arm").with_servos(LATE))
+
+
+def drawn(num_envs, columns=2, seed=0):
+    rng = np.random.default_rng(seed)
+    return [torch.from_numpy(rng.uniform(-0.5, 0.5, (num_envs, columns))).float() for _ in range(3)]
+
+
+def test_an_aligner_follows_the_loop_over_any_number_of_worlds_with_some_beginning_anew(place, model):
+    for num_envs in (1, 5):
+        aligner = Aligner(place / "torch", ["shoulder", "elbow"], num_envs, "cpu")
+        loop = model.loop(num_envs)
+        for t in range(8):
+            if t == 4:
+                ids = np.arange(0, num_envs, 2)
+                loop.reset(ids)
+                aligner.past.reset(torch.from_numpy(ids))
+            q, v, a = drawn(num_envs, seed=t)
+            loop.delta(*(x.numpy() for x in (q, v, a)), np.full(num_envs, 0.1, np.float32))
+            np.testing.assert_allclose(aligner(q, v, a).numpy(), loop.applied, atol=1e-6)
+        assert np.abs(loop.applied - a.numpy()).max() > 0.01
+
+
+def test_joints_are_taken_by_name_others_are_left_alone_and_all_stay_within_their_limits(place):
+    mine = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu")
+    scene = Aligner(place / "torch", ["elbow", "head", "shoulder"], 3, "cpu")
+    q, v, a = (torch.cat([x, torch.full((3, 1), 9.0)], 1) for x in drawn(3))
+    out = scene(*(x[:, [1, 2, 0]] for x in (q, v, a)))
+    torch.testing.assert_close(out[:, [2, 0]], mine(*(x[:, :2] for x in (q, v, a))))
+    assert (out[:, 1] == 9.0).all()
+    assert scene(q, v, torch.full((3, 3), -3.0))[:, [0, 2]].min() >= -1.5
+    with pytest.raises(ValueError, match="corrects 'shoulder', which is not among elbow"):
+        Aligner(place / "torch", ["elbow"], 3, "cpu")
+
+
+def test_nothing_of_the_program_stays_on_the_device_that_it_was_written_on(place):
+    aligner = Aligner(place / "torch", ["shoulder", "elbow"], 4, "meta")
+    assert aligner(*(x.to("meta") for x in drawn(4))).device.type == "meta"
+
+
+def test_a_past_made_in_inference_mode_is_begun_anew_outside_it(place):
+    aligner, state = Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu"), drawn(3)
+    with torch.inference_mode():
+        first = aligner(*state).clone()
+        aligner(*drawn(3, seed=1))
+    aligner.past.reset(torch.tensor([0, 2]))
+    now = aligner(*state)
+    torch.testing.assert_close(now[[0, 2]], first[[0, 2]])
+    assert not torch.equal(now[1], first[1])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+@pytest.mark.parametrize("when", [0, 2])
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(place, model, bad, when):
+    aligners = [Aligner(place / "torch", ["shoulder", "elbow"], 3, "cpu") for _ in range(2)]
+    step = program(delta_step(model, place / "run")).module()
+    frames, fresh = [torch.zeros(3, 3, 6)] * 2, torch.ones(3, dtype=torch.bool)
+    for t in range(6):
+        q, v, a = drawn(3, seed=t)
+        targets, held = [a.clone(), a.clone()], a.clone()
+        if t == when:
+            targets[0][1, 0] = bad
+            targets[1][1, 0] = aligners[1].sent[1, 0] if t else q[1, 0]
+            held[1, 0] = frames[1][1, 0, 4] if t else q[1, 0]
+        sent = [aligner(q, v, target) for aligner, target in zip(aligners, targets, strict=True)]
+        assert torch.equal(*sent)
+        assert sent[0].isfinite().all()
+        made = [step(q, v, b, torch.zeros(3), f, fresh) for b, f in zip((targets[0], held), frames, strict=True)]
+        frames, fresh = [f for _, f in made], torch.zeros_like(fresh)
+        assert torch.equal(made[0][0], made[1][0])
+        assert torch.equal(*frames)
+        assert frames[0].isfinite().all()
+
+
+def test_gradients_reach_the_present_command_and_no_earlier_one(model, place):
+    step = program(delta_step(model, place / "run")).module()
+    frames, fresh, payload = torch.zeros(2, 3, 6), torch.ones(2, dtype=torch.bool), torch.zeros(2)
+    commands = [x.requires_grad_() for t in range(3) for x in drawn(2, seed=t)[2:]]
+    for a in commands:
+        q, v, _ = drawn(2)
+        delta, frames = step(q, v, a, payload, frames, fresh)
+        fresh = torch.zeros_like(fresh)
+    gradients = torch.autograd.grad(delta.sum(), commands, allow_unused=True)
+    assert gradients[2] is not None
+    assert gradients[:2] == (None, None)
+    assert not frames.requires_grad
+
+
+def test_facts_are_the_compiled_simulators(place, model):
+    robot, facts = model.simulator(), read_facts(place / "torch")
+    compiled = build_model(robot, 0.1)
+    assert facts["simulator"] == model_hash(robot) == model.card["simulator"]
+    assert facts["corrected"] == ["shoulder", "elbow"]
+    assert (facts["dt"], facts["decimation"], facts["payload_mass"]) == (0.02, 4, 0.1)
+    joint = facts["joints"]["shoulder"]
+    assert (joint["kp"], joint["effort_limit"], joint["delay"], joint["offset"]) == (20.0, 5.0, 0.007, 0.02)
+    assert joint["mujoco"]["actuator_forcerange"] == [-5.0, 5.0]
+    assert joint["mujoco"]["dof_solimp"] == compiled.dof_solimp[0].tolist()
+    assert facts["options"]["integrator"] == "implicitfast"
+    assert facts["options"]["timestep"] == 0.005
+    built = compiled.dof_invweight0[0] / mujoco.MjModel.from_xml_path(str(place / "torch/robot.xml")).dof_invweight0[0]
+    assert facts["dof_invweight0_factor"] == pytest.approx(built)
+
+
+@pytest.mark.parametrize("name", ["so101", "h1_2"])
+def test_an_mjcf_with_servos_is_the_simulator(name):
+    robot = load_robot(name)
+    found = {"delay": 0.011, "offset": -0.01, "zero": 0.02, "friction_external": 0.1, "damping": 0.7}
+    robot = robot.with_servos({robot.operated[1]: found})
+    dt = 1 / 60  # no round number of physics steps: all digits count
+    again = mujoco.MjModel.from_xml_string(mjcf_text(robot, dt, 0.5))
+    own = build_model(robot, 0.5, dt=dt)
+    assert list(lines(again)) == list(lines(own))
+    assert again.opt.timestep == own.opt.timestep
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: setattr(m.opt, "timestep", 0.001), r"timestep 0\.001 instead of 0\.005"),
+        (lambda m: setattr(m.opt, "integrator", 0), "integrator euler instead of implicitfast"),
+        (lambda m: m.actuator_forcerange.fill(0), "actuator_forcerange of shoulder"),
+        (lambda m: m.dof_armature.fill(0.1), r"dof_armature of shoulder 0\.1 instead of 0\.02"),
+        (lambda m: m.dof_solimp.fill(0.9), "dof_solimp of shoulder"),
+        (lambda m: m.actuator_delay.fill(0.0), "actuator_delay of shoulder"),
+        (lambda m: m.actuator_biasprm.fill(0.0), "actuator_biasprm of shoulder"),
+    ],
+)
+def test_a_scene_that_is_not_the_simulator_of_training_is_refused_with_the_field(place, change, said):
+    scene = mujoco.MjModel.from_xml_path(str(place / "torch" / "robot.xml"))
+    require_scene(scene, "", place / "torch")
+    change(scene)
+    with pytest.raises(ValueError, match=said):
+        require_scene(scene, "", place / "torch")
+
+
+def test_late_servos_of_a_world_that_begins_stay_where_it_begins(place, model):
+    robot = model.simulator()
+    own = BatchSim(robot, [Condition(0.1, "both", 0.02)] * 3)
+    late = torch.full((3, own.batch.bind("history").shape[1]), 7.0)
+    named = re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
+    scene = mujoco.MjModel.from_xml_string(named)
+    sim = SimpleNamespace(mj_model=scene, device="cpu", data=SimpleNamespace(history=late, time=torch.zeros(3)))
+    q = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+    own.reset(slice(None), q, 0 * q, past=q[:, None])
+    fresh = torch.tensor([True, False, True])
+    LateServos(sim, "robot", ["elbow", "shoulder"]).begin(fresh, torch.tensor(q[:, ::-1].copy()))
+    np.testing.assert_allclose(late[[0, 2]], own.batch.bind("history")[[0, 2]], atol=1e-7)
+    assert (late[1] == 7.0).all()
+
+
+class Wrapped:
+    """As Isaac Lab 3 hands out its tensors."""
+
+    def __init__(self, x):
+        self.torch = x
+
+
+class JointPositionAction:
+    """The interface that both engines publish for it; their own runs in make engines (mjlab) or nowhere (Isaac Lab)."""
+
+    def __init__(self, dt=0.02):
+        self._env, self.num_envs, self.device = SimpleNamespace(step_dt=dt), 2, "cpu"
+        self._raw_actions = torch.zeros(2, 2)
+
+    def process_actions(self, actions):
+        self._raw_actions[:] = actions
+        self._processed_actions = 0.5 * self._raw_actions
+
+    def reset(self, env_ids=None):
+        self._raw_actions[env_ids] = 0.0
+
+
+class Term(AlignedAction, JointPositionAction):
+    payload_mass = None
+
+
+def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
+    term, (q, v, a) = Term(), drawn(2)
+    term.folder = place / "torch"
+    robot = SimpleNamespace(data=SimpleNamespace(joint_pos=Wrapped(q), joint_vel=Wrapped(v)))
+    term.align(robot, slice(None), ["shoulder", "elbow"])
+    own = Aligner(place / "torch", ["shoulder", "elbow"], 2, "cpu")
+    for _ in range(3):
+        term.process_actions(a)
+        torch.testing.assert_close(term._processed_actions, own(q, v, 0.5 * a))
+    term.reset(env_ids=slice(None))
+    own.past.reset()
+    term.process_actions(a)
+    torch.testing.assert_close(term._processed_actions, own(q, v, 0.5 * a))
+    other = Term(dt=0.01)
+    other.folder = place / "torch"
+    with pytest.raises(ValueError, match=r"a control period is 0\.02 s, here it is 0\.01 s"):
+        other.align(None, slice(None), ["shoulder", "elbow"])
+
+
+def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
+    rng, law = np.random.default_rng(0), dict(zip(LAW, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02), strict=True))
+    robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
+    scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
+    q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
+    seen = {"qpos": q, "qvel": v, "actuator_force": torque, "qfrc_bias": load}
+    model = SimpleNamespace(dof_frictionloss=torch.zeros(20, 2), actuator_biasprm=torch.zeros(20, 2, 10))
+    data = SimpleNamespace(**{name: torch.tensor(x).float() for name, x in seen.items()})
+    sim = SimpleNamespace(mj_model=scene, model=model, data=data, device="cpu", num_envs=20)
+    sim.expand_model_fields, entity = lambda fields: None, SimpleNamespace(update=lambda dt: None)
+    found = ServoLaw(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
+    entity.update(0.005)
+    found.before(torch.tensor(ctrl).float())
+    terms, kp = {name: getattr(robot, name) for name in LAW}, robot.kp
+    friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
+    np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
+    asked = servo_torque(terms, kp, ctrl + robot.offset, q)
+    np.testing.assert_allclose(model.actuator_biasprm[:, :, 0], asked - kp * (ctrl - q), atol=1e-5)
+    found.begin(torch.ones(20, dtype=torch.bool), torch.full((20, 2), 0.01))
+    np.testing.assert_allclose(found.torque, np.tile(kp * (robot.offset + 0.01), (20, 1)), atol=1e-6)
+
+
+def isaac_lab(monkeypatch):
+    """What Isaac Lab 3 publishes of itself; its own physics is tried in make engines."""
+
+    @dataclass
+    class Servos:
+        joint_names_expr: list
+        stiffness: dict
+        damping: dict
+        armature: dict
+        friction: dict
+        viscous_friction: dict
+        actuator_effort_limit: dict
+
+    @dataclass
+    class Config:
+        class_type: object = None
+        use_default_offset: bool = True
+
+    modules = {
+        "isaaclab": {}, "isaaclab.envs": {}, "isaaclab.envs.mdp.actions": {},
+        "isaaclab.utils": {"configclass": dataclass}, "isaaclab.actuators": {"IdealPDActuatorCfg": Servos},
+        "isaaclab.envs.mdp": {"JointPositionActionCfg": Config},
+        "isaaclab.envs.mdp.actions.joint_actions": {"JointPositionAction": JointPositionAction},
+    }  # fmt: skip
+    for name, content in modules.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**content))
+
+
+def test_isaac_labs_classes_are_found_by_name_as_hydra_looks_for_them(place, monkeypatch):
+    isaac_lab(monkeypatch)
+    config = action_term.isaaclab_action(place / "torch")
+    there = f"{config.class_type.__module__}:{config.class_type.__qualname__}"
+    assert there == "gaponet.export.action_term:IsaacLabTerm"
+    assert config.class_type is action_term.IsaacLabTerm is action_term.__dict__["IsaacLabTerm"]
+    assert config.class_type.__doc__
+    assert config.folder == str(place / "torch")
+    (servos,) = isaaclab_actuators(place / "torch").values()
+    assert servos.stiffness == {"shoulder": 20.0, "elbow": 20.0}
+    assert servos.actuator_effort_limit == {"shoulder": 5.0, "elbow": 5.0}
+
+
+def test_targets_under_way_in_the_term_are_late_by_parts_of_a_step_and_begin_at_rest():
+    class Engine:
+        num_envs, device, servo_offset = 2, "cpu", torch.tensor([0.1, 0.0])
+        aligner = SimpleNamespace(past=SimpleNamespace(fresh=torch.tensor([True, True])))
+
+        def apply_actions(self):
+            self.told = self._processed_actions
+
+    class Late(DelayedAction, Engine):
+        pass
+
+    term = Late()
+    term.late([0.007, 0.0], 0.005)
+    term.begin(torch.ones(2, 2), torch.zeros(2, 2))
+    term.aligner.past.fresh = torch.tensor([False, False])
+    term._processed_actions = torch.ones(2, 2)
+    told = []
+    for _ in range(3):
+        term.apply_actions()
+        told.append(term.told[0].tolist())
+    assert np.allclose(told, [[0.1, 1.0], [0.6 + 0.4 * 0.1, 1.0], [1.0, 1.0]])
+    assert (term._processed_actions == 1.0).all()
+
+
+def test_friction_is_made_to_hold_in_every_world_of_a_model_that_they_share(place):
+    scene = mujoco.MjModel.from_xml_string(
+        re.sub('="(shoulder|elbow)"', r'="robot/\1"', (place / "torch/robot.xml").read_text())
+    )
+    shared = torch.tensor(scene.dof_invweight0)[None].expand(3, -1)  # as mjlab has it: one row for all
+
+    def expand(fields):
+        sim.model.dof_invweight0 = shared.clone()
+
+    sim = SimpleNamespace(mj_model=scene, model=SimpleNamespace(dof_invweight0=shared), expand_model_fields=expand)
+    hold_friction(sim, "robot", place / "torch")
+    np.testing.assert_allclose(sim.model.dof_invweight0, 0.1 * shared)
+
+
+def test_the_command_writes_a_folder_that_needs_no_gaponet(place, capsys):
+    files = {f.name for f in (place / "torch").iterdir()}
+    shared = {"facts.json", "robot.xml", "gaponet_action.py", "servo_law.py", "mujoco_servos.py", "scene_facts.py"}
+    assert files == shared | {".gaponet", "delta.pt2", "robot_without_servos.xml"}
+    assert not [f for f in (place / "torch").glob("*.py") if re.search(r"^(from|import) gaponet", f.read_text(), re.M)]
+    assert mujoco.MjModel.from_xml_path(str(place / "torch/robot_without_servos.xml")).nu == 0
+    assert main(["export", str(place / "run"), "--to", "torch", "--payload-mass", "9"]) == 2
+    assert "asked for 9 kg" in capsys.readouterr().err
+    assert not (place / "run" / "torch").exists()
+
+
+def test_a_network_without_a_fused_form_ships_too(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    model = random_run(tmp_path / "run", robot, kind="transformer")
+    assert not (tmp_path / "run/model/weights.npz").exists()
+    assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
+
+
+@pytest.mark.parametrize("how", [{"delta_hold": 2}, {"real_state": True}])
+def test_a_model_with_inputs_or_memory_that_a_program_lacks_is_refused(tmp_path, how):
+    model = SimpleNamespace(config=ModelConfig(kind="paper", **how), path=tmp_path)
+    with pytest.raises(ModelError, match="train without"):
+        delta_step(model, tmp_path)

@@ -1,0 +1,288 @@
+"""A robot leaves: a user's own MJCF with identified servos, the law beside it, and a check that needs no gaponet."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from arm import XML, write_arm
+
+from gaponet.base.errors import RobotError
+from gaponet.cli.main import main
+from gaponet.export import folder as exporting
+from gaponet.export.facts import simulator_facts
+from gaponet.export.folder import export_robot
+from gaponet.export.forms import left, own_motions, plain_form
+from gaponet.export.mujoco_servos import delay_weights, play
+from gaponet.robot.spec import LAW
+from gaponet.sim.model import build_model
+from gaponet.sim.replay import replay
+
+FOUND = {
+    "shoulder": {"kp": 16.0, "damping": 0.8, "frictionloss": 0.1, "delay": 0.013, "offset": 0.02, "zero": 0.01},
+    "elbow": {"kp": 24.0, "armature": 0.03, "delay": 0.006, "stop_low": -1.2},
+}
+LAWS = {joint: {"stribeck": 0.3, "stribeck_speed": 0.1, "friction_motor": 0.1} for joint in FOUND}
+MAIN = """<mujoco model="my scene">
+  <!-- degrees, as MuJoCo has it where nothing is said -->
+  <compiler autolimits="true" meshdir="meshes"/>
+  <option integrator="implicitfast" timestep="{step}"><flag contact="disable"/></option>
+  <include file="parts/defaults.xml"/>
+  <asset><mesh name="wedge" file="wedge.obj"/></asset>
+  <worldbody>
+    <body name="ball" pos="1 0 0"><freejoint/><geom size="0.1" mass="1"/></body>
+    <include file="parts/arm.xml"/>
+  </worldbody>
+  <tendon><fixed name="both"><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed></tendon>
+  <actuator>
+    <!-- mine -->
+    <position class="servo" name='first' joint="shoulder" ctrlrange="-80 80"/>
+    <motor name="thumb" joint="thumb" gear="2"/>
+    <general name="second" joint="elbow"/>
+  </actuator>
+  <sensor><jointpos joint="elbow"/><tendonpos tendon="both"/></sensor>
+  <keyframe><key name="home" qpos="1 0 0 1 0 0 0 0.1 0.2 0" ctrl="0.1 0 0.2"/></keyframe>
+</mujoco>
+"""
+DEFAULTS = """<mujocoinclude><default>
+  <joint damping="0.5" armature="0.02" frictionloss="0.05"/><general gear="3" dyntype="integrator" biastype="none"/>
+  <default class="servo"><position kp="99" forcerange="-1 1" gear="1"/></default>
+</default></mujocoinclude>
+"""
+ARM = """<mujocoinclude>
+  <body name="upper">
+    <joint name="shoulder" axis="0 1 0"
+           range="-85.94366926962348 85.94366926962348"/> <!-- turned by hand -->
+    <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.3" contype="0" conaffinity="0"/>
+    <body name="fore" pos="0.2 0 0">
+      <joint armature='7' name="elbow" axis="0 1 0" range="-85.94366926962348 85.94366926962348"/>
+      <geom type="capsule" fromto="0 0 0 0.2 0 0" size="0.02" mass="0.2" contype="0" conaffinity="0"/>
+      <geom type="mesh" mesh="wedge" mass="0" contype="0" conaffinity="0"/>
+      <site name="tip" pos="0.2 0 0"/>
+      <body name="thumb" pos="0.2 0 0"><joint name="thumb" axis="0 0 1"/><geom size="0.01" mass="1e-6"/></body>
+    </body>
+  </body>
+</mujocoinclude>
+"""
+WEDGE = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_servos(FOUND)
+
+
+@pytest.fixture(scope="module")
+def lawful(robot):
+    return robot.with_servos(LAWS)
+
+
+@pytest.fixture
+def mine(tmp_path):
+    """A user's scene: includes, degrees, defaults, a mesh, a tendon, sensors, a keyframe, a servo and a body before."""
+    folder = tmp_path / "mine"
+    for name, text in {"scene.xml": MAIN.format(step=0.005), "parts/defaults.xml": DEFAULTS, "parts/arm.xml": ARM,
+                       "meshes/wedge.obj": WEDGE}.items():  # fmt: skip
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder / "scene.xml"
+
+
+@pytest.fixture
+def quick(monkeypatch, robot):
+    """The form without the law is not searched for: that is identification's, and tried below."""
+    monkeypatch.setattr(
+        exporting, "plain_form", lambda r, *a, **k: r.with_servos({j: dict.fromkeys(LAW, 0.0) for j in FOUND})
+    )
+
+
+def test_a_users_file_moves_as_gaponet_does_and_keeps_all_that_is_the_users(lawful, mine, tmp_path, quick):
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
+    assert made.virtual
+    assert made.left["in gaponet"] == pytest.approx(0.0, abs=1e-9)
+    assert made.left["scene.xml with servo_law.py"] < 2e-5
+    assert made.left["scene.xml alone"] == pytest.approx(made.left["in gaponet, fitted without the law"], rel=0.02)
+    assert made.left["scene.xml alone"] > 0.003
+    assert any("elbow met something at -1.20 rad" in note for note in made.notes)
+    before, now = (mujoco.MjModel.from_xml_path(str(f)) for f in (mine, made.file))
+    assert np.array_equal(before.key_qpos, now.key_qpos)
+    assert [now.actuator(i).name for i in range(3)] == ["first", "thumb", "second"]
+    assert np.degrees(now.actuator_ctrlrange[0]) == pytest.approx([-80 * 180 / np.pi, 80 * 180 / np.pi])
+    assert now.actuator_gear[1, 0] == 2
+    assert now.sensor_type.tolist() == before.sensor_type.tolist()
+    assert now.site("tip").pos.tolist() == before.site("tip").pos.tolist()
+    assert (now.nsite, now.ntendon, now.nmesh) == (before.nsite, before.ntendon, before.nmesh) == (1, 1, 1)
+    assert now.qpos0[now.joint("shoulder").qposadr[0]] == pytest.approx(-0.01)
+    text = made.file.read_text() + (tmp_path / "out/parts/arm.xml").read_text()
+    assert "<!-- mine -->" in text
+    assert "<!-- turned by hand -->" in text
+    assert (tmp_path / "out/parts/defaults.xml").read_text() == DEFAULTS
+    changed = [
+        x
+        for x in (tmp_path / "out/changes.diff").read_text().splitlines()
+        if x[:1] in "+-" and x[:3] not in ("+++", "---")
+    ]
+    assert len(changed) == 9  # two joints, of which one is of two lines, two servos, and the solver's tolerance
+    assert mine.read_text() == MAIN.format(step=0.005)
+
+
+def test_the_check_travels(robot, mine, tmp_path):
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+    assert not [f for f in (tmp_path / "out").glob("*.py") if "from gaponet" in f.read_text()]
+    said = subprocess.run(
+        [sys.executable, "check.py"], cwd=tmp_path / "out", check=True, capture_output=True, text=True
+    )
+    assert "the MJCF alone: 0.0" in said.stdout
+    assert made.left["scene.xml alone"] < 2e-5
+
+
+def test_an_engine_that_steps_twice_as_long_keeps_delays_and_tells_its_price(robot, mine, tmp_path):
+    mine.write_text(MAIN.format(step=0.01))
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert model.opt.timestep == 0.01
+    assert model.actuator_delay.tolist() == [0.013, 0.0, 0.006]
+    assert 2e-5 < made.left["scene.xml alone"] < 0.002
+
+
+def test_a_servo_whose_gains_and_commands_are_in_degrees_takes_radians_from_now_on(
+    robot, lawful, mine, tmp_path, quick
+):
+    degrees = 'gainprm="0.42" biasprm="0 -24 -0.5" biastype="affine" gear="1" ctrlrange="-90 90"'
+    plain = '<general name="second" joint="elbow"/>'
+    mine.write_text(mine.read_text().replace(plain, f"{plain[:-2]} {degrees}/>"))
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=mine)
+    servo = mujoco.MjModel.from_xml_path(str(made.file)).actuator("second")
+    assert servo.gainprm[0] == 24.0
+    assert servo.biasprm[:2].tolist() == [0.0, -24.0]
+    assert servo.ctrlrange.tolist() == pytest.approx([-90 * 0.42 / 24, 90 * 0.42 / 24])
+    assert "targets of elbow were not in rad before (degrees?)" in made.notes[-1]
+    assert made.left["scene.xml with servo_law.py"] < 2e-5
+    assert f'-    <general name="second" joint="elbow" {degrees}/>' in (tmp_path / "out/changes.diff").read_text()
+
+
+def test_a_joint_that_turns_without_end_leaves_beside_one_that_does_not(tmp_path, quick):
+    xml = XML.replace(' range="-1.5 1.5"/>', "/>", 1).replace("<option ", '<option timestep="0.005" ')
+    endless = write_arm(tmp_path / "arm", xml=xml).with_servos(LAWS)
+    made = export_robot(endless, "mjcf", tmp_path / "out")
+    assert made.left["robot.xml with servo_law.py"] < 2e-5
+
+
+def test_two_robots_in_one_scene_are_told_apart_by_what_stands_before_their_names(robot, lawful, tmp_path, quick):
+    body = """<body name="{0}upper"><joint name="{0}shoulder" axis="0 1 0"/><geom size=".1" mass=".3"/>
+        <body pos=".2 0 0"><joint name="{0}elbow" axis="0 1 0"/><geom size=".1" mass=".2"/></body></body>"""
+    scene = tmp_path / "scene.xml"
+    scene.write_text(f"<mujoco><worldbody>{body.format('left_')}{body.format('right_')}</worldbody></mujoco>")
+    first = export_robot(robot, "mjcf", tmp_path / "one", source=scene, prefix="left_")
+    both = export_robot(lawful, "mjcf", tmp_path / "two", source=first.file, prefix="right_")
+    model = mujoco.MjModel.from_xml_path(str(both.file))
+    assert [model.actuator(i).name for i in range(4)] == [
+        "left_shoulder",
+        "left_elbow",
+        "right_shoulder",
+        "right_elbow",
+    ]
+    assert model.actuator_gainprm[:, 0].tolist() == [16.0, 24.0, 16.0, 24.0]
+    with pytest.raises(RobotError, match=r"no joint 'shoulder' in its text \(--prefix"):
+        export_robot(robot, "mjcf", tmp_path / "none", source=scene)
+
+
+def test_a_file_in_one_line_takes_a_payload_right_before_a_joint(robot, tmp_path):
+    text = re.sub(r">\s+<", "><", robot.mjcf.read_text().strip())
+    scene = tmp_path / "scene.xml"
+    scene.write_text(text.replace("<option ", '<option timestep="0.005" '))
+    made = export_robot(robot, "mjcf", tmp_path / "out", source=scene, payload_mass=0.2)
+    assert '"/></body><joint' in made.file.read_text().replace("\n", "")
+    model, own = mujoco.MjModel.from_xml_path(str(made.file)), build_model(robot, 0.2)
+    assert model.body_mass.sum() == pytest.approx(own.body_mass.sum())
+    assert model.dof_armature.tolist() == own.dof_armature.tolist()
+    assert made.left["scene.xml alone"] < 2e-5
+
+
+def test_an_engine_with_another_order_of_joints_is_told_by_name(lawful, tmp_path, quick):
+    free = 'type="capsule" size=".1 .1" mass=".3" contype="0" conaffinity="0"'
+    other = f'<body name="other"><joint name="elbow_of_another" axis="0 1 0"/><geom {free}/></body>'
+    servos = [("a", "elbow", 3), ("z", "elbow_of_another", 7), ("b", "shoulder", 5)]
+    drives = "".join(f'<position name="{name}" joint="{joint}" kp="{kp}"/>' for name, joint, kp in servos)
+    text = lawful.mjcf.read_text().replace("<option ", '<option timestep="0.005" ')
+    text = text.replace("<worldbody>", f"<worldbody>{other}").replace(
+        "</mujoco>", f"<actuator>{drives}</actuator></mujoco>"
+    )
+    scene = tmp_path / "scene.xml"
+    scene.write_text(text)
+    made = export_robot(lawful, "mjcf", tmp_path / "out", source=scene)
+    model = mujoco.MjModel.from_xml_path(str(made.file))
+    assert [model.actuator(i).name for i in range(3)] == ["a", "z", "b"]
+    assert model.actuator_gainprm[:, 0].tolist() == [24.0, 7.0, 16.0]
+    assert made.left["scene.xml with servo_law.py"] < 2e-5
+
+
+def test_a_joint_with_two_servos_is_refused(robot, mine, tmp_path):
+    text = mine.read_text().replace('<motor name="thumb" joint="thumb"', '<velocity name="thumb" joint="elbow"')
+    mine.write_text(text)
+    with pytest.raises(RobotError, match="has 2 servos of 'elbow'; one is needed"):
+        export_robot(robot, "mjcf", tmp_path / "out", source=mine)
+
+
+def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
+    made = export_robot(robot, "mjcf", tmp_path / "out")
+    facts = json.loads((tmp_path / "out/facts.json").read_text())
+    spec = mujoco.MjSpec.from_file(str(made.file))
+    late = spec.compile()
+    for servo in spec.actuators:
+        servo.delay = servo.nsample = 0
+    model = spec.compile()
+    late.opt.timestep = model.opt.timestep = 0.005
+    (motion,) = own_motions(robot, count=1)
+    native = play(
+        late, facts, {"ctrl": motion.ctrl, "qpos": motion.qpos, "qvel": motion.qvel, "dt": 0.02}, form="plain"
+    )
+    weights, data = delay_weights([0.013, 0.006], 0.005), mujoco.MjData(model)
+    data.qpos[:], past, found = motion.qpos[0], np.tile(motion.ctrl[0], (len(weights), 1)), [motion.qpos[0]]
+    for ctrl in motion.ctrl[:-1]:
+        for _ in range(4):
+            past = np.concatenate([ctrl[None], past[:-1]])
+            data.ctrl[:] = (weights * past).sum(0)
+            mujoco.mj_step(model, data)
+        found.append(data.qpos.copy())
+    np.testing.assert_allclose(found, native, atol=1e-6)
+
+
+def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_struck_out(lawful):
+    motions = own_motions(lawful, count=4)
+    struck = lawful.with_servos({j: dict.fromkeys(LAW, 0.0) for j in FOUND})
+    plain = plain_form(lawful, motions[:2])
+    assert not plain.has_law
+    assert left(motions[2:], plain) < 0.8 * left(motions[2:], struck)
+    assert plain_form(struck, motions) is struck
+
+
+def test_a_robot_folder_leaves_by_the_command_and_without_torch(robot, tmp_path, capsys):
+    alone = (
+        "import sys; from gaponet.cli.main import main; sys.exit(main(sys.argv[1:]) or 9 * ('torch' in sys.modules))"
+    )
+    words = ["export", str(robot.folder), "--to", "mjcf", "--out", str(tmp_path / "alone")]
+    subprocess.run([sys.executable, "-c", alone, *words], check=True)
+    for to in ("mjcf", "newton", "drake", "json", "mjlab", "isaaclab"):
+        assert main(["export", str(robot.folder), "--to", to, "--out", str(tmp_path / to), "--json"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["robot"] == "arm"
+        facts = json.loads((tmp_path / to / "facts.json").read_text())
+        assert facts["plain"]["elbow"]["kp"] == 20.0
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "newton/robot.xml")).nu == 0
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "mjlab/robot.xml")).nu == 2
+    for to in ("mjlab", "isaaclab", "newton", "drake"):
+        compile((tmp_path / to / "robot_cfg.py").read_text(), to, "exec")
+    assert main(["export", str(robot.folder), "--to", "torch"]) == 2
+    assert "is a robot, which has no network" in capsys.readouterr().err
+
+
+def test_facts_hold_both_forms(robot, lawful):
+    facts = simulator_facts(lawful, 0.02, plain=replace(robot, kp=robot.kp + 1))
+    assert facts["law"] == ["stribeck", "stribeck_speed", "friction_motor"]
+    assert (facts["joints"]["elbow"]["kp"], facts["plain"]["elbow"]["kp"]) == (24.0, 25.0)
+    assert replay(own_motions(robot, count=1), robot)[0].qpos.shape[1] == 2

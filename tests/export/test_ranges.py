@@ -1,0 +1,122 @@
+"""Units to train on: drawn from what is known of a robot, whole, and refused where something is missing."""
+
+import json
+import subprocess
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+from arm import XML, write_arm
+
+from gaponet.cli.main import main
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.knowledge import JointKnown, Knowledge, seen
+
+FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
+SERVO = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+ERRORS = np.array([0.05, 0.001, 1e-4, 1e-4, 2e-3, 1e-3])
+
+
+def source(values, unit="a", days=()):
+    covariance = {j: [[0.0] * len(FIELDS)] * len(FIELDS) for j in values}
+    return {"made_by": "identify", "days": days, "unit": unit, "logs": {}, "seconds": 60.0,
+            "values": {j: tuple(v) for j, v in values.items()}, "covariance": covariance}  # fmt: skip
+
+
+def written(arm, folder, servo=SERVO, errors=ERRORS, sources=1):
+    """A robot folder that knows its values; friction and damping err together."""
+    save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), folder)
+    robot = load_robot(folder)
+    values = seen(robot, FIELDS)
+    like = np.eye(6)
+    like[1, 2] = like[2, 1] = -0.9
+    covariance = like * np.outer(errors, errors)
+    none = tuple(np.zeros(7))
+    joints = {
+        j: JointKnown(tuple(v), tuple(map(tuple, covariance)), none, (none,) * 7, none, 1e-3, 2e-3, 3e-3)
+        for j, v in values.items()
+    }
+    days = [{j: v + k * np.array([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0]) for j, v in values.items()} for k in range(sources)]
+    said = tuple(source(v, days=(f"2026-11-{20 + k}",)) for k, v in enumerate(days[::-1]))
+    Knowledge(FIELDS, joints, said, 24, True).save(folder)
+    return folder
+
+
+def exported(capsys, *words):
+    code = main(["export", *map(str, words), "--to", "randomization", "--json"])
+    said = capsys.readouterr()
+    return code, json.loads(said.out) if said.out else said.err
+
+
+@pytest.fixture
+def arm(tmp_path):
+    return write_arm(tmp_path / "arm")
+
+
+def test_units_scatter_as_the_values_err_and_together(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known")
+    code, said = exported(capsys, folder)
+    assert code == 0
+    made = json.loads((folder / "randomization" / "randomization.json").read_text())
+    kp, damping, friction = (np.array(made["units"][f])[:, 1] for f in ("kp", "damping", "frictionloss"))
+    assert np.log(kp).std() == pytest.approx(0.05, rel=0.2)
+    assert np.corrcoef(damping / kp, friction / kp)[0, 1] < -0.8
+    low, high = (said["ranges"]["elbow"]["kp"][k] for k in (0, 2))
+    np.testing.assert_allclose([np.log(low / 16), np.log(high / 16)], [-0.0822, 0.0822], atol=0.006)
+    assert min(np.min(made["units"][f]) for f in FIELDS if f != "offset") >= 0
+    np.testing.assert_allclose(np.array(made["units"]["effort_limit"])[:, 1] / arm.effort_limit[1], kp / 16, rtol=1e-5)
+
+
+def test_what_no_log_determines_is_said(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known", errors=np.where(np.arange(6) == 3, 0.02 / 16, ERRORS))
+    code, said = exported(capsys, folder)
+    assert (code, said["unknown"]) == (0, ["shoulder: armature", "elbow: armature"])
+    low, value, high = said["ranges"]["elbow"]["armature"]
+    assert low == 0
+    assert value < high < 4 * value
+
+
+def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
+    one, two = written(arm, tmp_path / "one"), written(arm, tmp_path / "two", sources=2)
+    code, said = exported(capsys, one, "--scope", "any-day")
+    assert code == 2
+    assert "known from one day; calibrate it with logs of another one" in said
+    assert exported(capsys, one, "--scope", "any-robot", "--units", two)[0] == 2
+    wide = exported(capsys, two, "--scope", "any-day")[1]["ranges"]["elbow"]["frictionloss"]
+    close = exported(capsys, two)[1]["ranges"]["elbow"]["frictionloss"]
+    assert wide[2] - wide[0] > 1.5 * (close[2] - close[0])
+    other = written(arm, tmp_path / "other", SERVO | {"kp": 24.0})
+    low, _, high = exported(capsys, one, "--scope", "any-robot", "--units", two, other)[1]["ranges"]["elbow"]["kp"]
+    assert low < 16
+    assert high > 24
+
+
+def test_a_model_takes_a_unit_without_gaponet(arm, tmp_path, capsys):
+    folder = written(arm, tmp_path / "known")
+    assert exported(capsys, folder, "--engine", "mujoco", "--out", tmp_path / "out")[0] == 0
+    (tmp_path / "robot.xml").write_text(
+        XML.replace("</mujoco>", '<actuator><position joint="elbow" kp="20" forcerange="-3 3"/></actuator></mujoco>')
+    )
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\nimport mujoco, mujoco_randomization as r\n"
+        "m = mujoco.MjModel.from_xml_path(sys.argv[2]); u = r.units(); left = r.apply(m, u, 7)\n"
+        "assert abs(m.actuator_gainprm[0, 0] - u['units']['kp'][7][1]) < 1e-6\n"
+        "assert abs(m.actuator_forcerange[0, 1] - u['units']['effort_limit'][7][1]) < 1e-6\n"
+        "assert abs(m.dof_frictionloss[1] - u['units']['frictionloss'][7][1]) < 1e-6\n"
+        "assert set(left['elbow']) == {'offset', 'delay'} and 'gaponet' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code, tmp_path / "out", tmp_path / "robot.xml"], check=True)
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml")).nu == 1
+
+
+@pytest.mark.parametrize("engine", ["mjlab", "isaaclab"])
+def test_events_in_an_engine_s_words_compile(arm, tmp_path, capsys, engine):
+    folder = written(arm, tmp_path / "known")
+    code, said = exported(capsys, folder, "--engine", engine)
+    assert code == 0
+    text = (folder / "randomization" / f"{engine}_randomization.py").read_text()
+    compile(text, engine, "exec")
+    low, _, high = said["ranges"]["elbow"]["frictionloss"]
+    assert f"({low:.6g}, {high:.6g})" in text

@@ -1,0 +1,108 @@
+"""A user's URDF or SDF takes along what its tags hold, and is told what they do not."""
+
+import json
+import subprocess
+import xml.etree.ElementTree as ET
+
+import mujoco
+import pytest
+from arm import write_arm
+from environments import environment
+
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.cli.main import main
+from gaponet.export.folder import export_robot
+
+FOUND = {
+    "shoulder": {"kp": 16.0, "damping": 0.8, "frictionloss": 0.1, "delay": 0.013, "armature": 0.05},
+    "elbow": {"kp": 24.0, "damping": 0.6, "frictionloss": 0.07},
+}
+LINK = (
+    '<link name="{0}"><inertial><mass value="0.3"/>'
+    '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+)
+URDF = f"""<robot name="arm"><!-- by hand -->
+  {LINK.format("base")}{LINK.format("upper")}{LINK.format("fore")}
+  <joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/>
+    <limit effort="9" velocity="3" lower="-1.5" upper="1.5"/>
+    <dynamics friction="0.5"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><axis xyz="0 1 0"/>
+    <limit effort="9" velocity="3" lower="-1.5" upper="1.5"/></joint>
+  <transmission name="t"><type>t</type><joint name="elbow"><hardwareInterface>e</hardwareInterface></joint>
+  </transmission>
+</robot>
+"""
+SDF = """<sdf version="1.9"><model name="arm"><link name="a"/><link name="b"/><link name="c"/>
+  <joint name="shoulder" type="revolute"><parent>a</parent><child>b</child><axis><xyz>0 1 0</xyz>
+    <limit><effort>9</effort></limit><dynamics><damping>0.1</damping></dynamics></axis></joint>
+  <joint name="elbow" type="revolute"><parent>b</parent><child>c</child><axis><xyz>0 1 0</xyz></axis></joint>
+</model></sdf>
+"""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm") / "arm").with_servos(FOUND)
+
+
+def test_a_urdf_keeps_all_but_its_dynamics_and_efforts_and_the_loss_has_its_price(robot, tmp_path):
+    file = tmp_path / "mine.urdf"
+    file.write_text(URDF)
+    made = export_robot(robot, "urdf", tmp_path / "out", source=file)
+    root = ET.parse(made.file).getroot()
+    told = {j.attrib["name"]: j.find("dynamics").attrib for j in root.findall("joint")}
+    assert {j: (float(d["damping"]), float(d["friction"])) for j, d in told.items()} == {
+        "shoulder": (0.8, 0.1),
+        "elbow": (0.6, 0.07),
+    }
+    assert [j.find("limit").attrib["effort"] for j in root.findall("joint")] == ["5", "5"]
+    assert "<!-- by hand -->" in made.file.read_text()
+    assert mujoco.MjModel.from_xml_path(str(made.file)).dof_damping.ravel().tolist() == [0.8, 0.6]
+    lost = next(note for note in made.notes if "no place" in note)
+    assert "kp, armature, delay" in lost
+    alone = made.left["mine.urdf alone, all else as before"]
+    assert alone > 100 * made.left["in gaponet"] + 0.002
+    changed = (tmp_path / "out/changes.diff").read_text().splitlines()
+    assert sum(line[:1] in "+-" and line[:3] not in ("+++", "---") for line in changed) == 9
+
+
+def test_an_sdf_likewise(robot, tmp_path):
+    file = tmp_path / "mine.sdf"
+    file.write_text(SDF)
+    root = ET.parse(export_robot(robot, "urdf", tmp_path / "out", source=file).file).getroot()
+    told = [[float(j.find(f"axis/dynamics/{f}").text) for f in ("damping", "friction")] for j in root.iter("joint")]
+    assert told == [[0.8, 0.1], [0.6, 0.07]]
+    assert next(root.iter("effort")).text == "5"
+
+
+def test_a_file_that_is_none_or_has_other_joints_is_refused(robot, tmp_path, capsys):
+    with pytest.raises(UsageError, match="--into FILE"):
+        export_robot(robot, "urdf", tmp_path / "a")
+    with pytest.raises(RobotError, match="begins with <mujoco>"):
+        export_robot(robot, "urdf", tmp_path / "b", source=robot.mjcf)
+    file = tmp_path / "other.urdf"
+    file.write_text(URDF.replace('"shoulder"', '"left_shoulder"'))
+    with pytest.raises(RobotError, match=r"no joint 'shoulder' \(--prefix\); it has left_shoulder, elbow"):
+        export_robot(robot, "urdf", tmp_path / "c", source=file)
+    assert main(["export", str(robot.folder), "--to", "urdf", "--into", str(file)]) == 2
+    assert "no joint 'shoulder'" in capsys.readouterr().err
+
+
+DRAKE = """
+import json, sys
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+plant = MultibodyPlant(0.001)
+Parser(plant).AddModels(sys.argv[1])
+print(json.dumps({name: plant.GetJointByName(name).default_damping() for name in ("shoulder", "elbow")}))
+"""
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize(("name", "text"), [("mine.urdf", URDF), ("mine.sdf", SDF)])
+def test_drakes_parser_reads_the_damping(robot, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    made = export_robot(robot, "urdf", tmp_path / "out", source=tmp_path / name)
+    python = environment("drake", "3.12", ("drake",))
+    done = subprocess.run([python, "-c", DRAKE, made.file], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"shoulder": 0.8, "elbow": 0.6}

@@ -1,0 +1,119 @@
+"""The Unitree driver and the virtual H1-2 on a bus that is a list, in simulated time: nothing of DDS is needed."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from types import SimpleNamespace
+
+import numpy as np
+
+from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.drivers import hg
+from gaponet.hw.drivers.unitree import MOTOR_NAMES
+from gaponet.robot.spec import RobotSpec
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.unitree_virtual import VirtualH12
+
+RATE = 100.0  # states per second
+
+
+class Loopback:
+    """What drivers.dds offers: messages that are sent are there at once."""
+
+    LowState, LowCmd = "LowState", "LowCmd"
+
+    def __init__(self) -> None:
+        self.queues: dict[str, list[deque]] = defaultdict(list)
+
+    def Bus(self, domain: int, interface: str) -> Loopback:  # noqa: N802
+        return self
+
+    def reader(self, topic: str, kind: str) -> deque:
+        self.queues[topic].append(deque(maxlen=64))
+        return self.queues[topic][-1]
+
+    def writer(self, topic: str, kind: str) -> str:
+        return topic
+
+    def publishers(self) -> dict[str, list[str]]:
+        return defaultdict(list)
+
+    def send(self, writer: str, kind: str, data: np.ndarray) -> None:
+        for queue in self.queues[writer]:
+            queue.append(np.array(data))
+
+    def receive(self, reader: deque) -> list[np.ndarray]:
+        found = list(reader)
+        reader.clear()
+        return found
+
+
+class Disobedient(VirtualH12):
+    """From some time after the first command on it does not do as told, in one way."""
+
+    way, at = "", 0.0
+
+    def _apply(self, topic: str, data: np.ndarray, now: float) -> None:
+        wrong = now - (self.first_command or now) >= self.at
+        left, right = (MOTOR_NAMES.index(f"{side}_elbow_joint") for side in ("left", "right"))
+        if (self.way == "ignores" and wrong) or (self.way == "listens midway" and not wrong):
+            return
+        if wrong and self.way in ("limp", "all limp", "crossed", "mirrored"):
+            q, kp = (hg.LowCmd.motors(data, name) for name in ("q", "kp"))
+            if self.way == "crossed":
+                q[[left, right]] = q[[right, left]]
+            elif self.way == "mirrored":
+                q[left] = -q[left]
+            else:
+                kp[slice(left, left + 1) if self.way == "limp" else slice(12, 27)] = 0.0
+            data = data.copy()
+            hg.LowCmd.set_motors(data, "q", q)
+            hg.LowCmd.set_motors(data, "kp", kp)
+        super()._apply(topic, data, now)
+        if wrong and self.way == "blocked":  # something holds the forearm: it creeps
+            for damping in (self.live.unit._damping, self.live.unit._cold_damping):
+                damping[:, self.live.unit.batch.model.joint("left_elbow_joint").dofadr[0]] = 1000.0
+        if wrong and self.way == "weak":
+            kp, kd, effort, torque = self.live._law
+            self.live.set_gains(kp, kd, np.where(np.arange(len(kp)) == self._order[left], 0.5, effort), torque)
+
+    def _readings(self, fault: str) -> tuple[np.ndarray, ...]:
+        qpos, *more = super()._readings(fault)
+        if self.way == "zero" and self.first_command and self.clock.now() - self.first_command >= self.at:
+            qpos = qpos + 0.31 * (np.arange(len(qpos)) == self._order[16])
+        return qpos, *more
+
+
+class RobotClock(SimulatedClock):
+    """While it waits, the robot lives."""
+
+    def __init__(self, robot: RobotSpec, bus: Loopback, unit: str, payload: float, fleet: str) -> None:
+        super().__init__(100.0)
+        physics = load_fleet(fleet, robot).unit(unit)
+        self.robot = Disobedient(robot, physics, (payload, "both"), rate=RATE)
+        self.robot.clock = self  # type: ignore[assignment]
+        self.steps = 0
+
+    def wait_until(self, deadline: float) -> float:
+        while 100.0 + self.steps / RATE <= deadline:
+            self._now = max(self._now, 100.0 + self.steps / RATE)
+            self.robot._obey(self._now)
+            self.robot.live.step()
+            self.robot._speak(self.steps, self._now)
+            self.steps += 1
+        return super().wait_until(deadline)
+
+
+def living(
+    monkeypatch, robot: RobotSpec, unit: str = "virtual-4", payload: float = 0.0, fleet: str = "easy"
+) -> RobotClock:
+    """A clock by which such a robot lives, and to which the driver's time belongs."""
+    import gaponet.hw.drivers as drivers
+    from gaponet.hw.drivers import unitree
+
+    bus = Loopback()
+    monkeypatch.setattr(drivers, "dds", bus, raising=False)
+    clock = RobotClock(robot, bus, unit, payload, fleet)
+    sleep = lambda seconds: clock.wait_until(clock.now() + max(seconds, 0.005))  # noqa: E731
+    monkeypatch.setattr(unitree, "time", SimpleNamespace(monotonic=clock.now, sleep=sleep))
+    return clock

@@ -1,0 +1,70 @@
+"""A virtual H1-2 on the bus in a process of its own, told what to do by lines on stdin, one JSON answer each.
+
+fault KIND: go wrong from now on. machine N: be another robot. clear: be well, forget what was heard. heard: the
+commands since.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+RATE = 100.0  # states per second: machines that run tests are busy
+
+
+class RobotProcess:
+    """The tests' end."""
+
+    def __init__(self, domain: int) -> None:
+        command = [sys.executable, __file__, str(domain)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self.ask("clear") == "ok"
+
+    def ask(self, line: str) -> Any:
+        """Answer to a line."""
+        assert self.process.stdin
+        assert self.process.stdout
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+        return json.loads(self.process.stdout.readline())
+
+    def kill(self) -> None:
+        """As a power cut would."""
+        self.process.kill()
+        self.process.wait()
+
+
+def main(domain: int) -> None:
+    from gaponet.robot.spec import load_robot
+    from gaponet.testing.fleet import load_fleet
+    from gaponet.testing.unitree_virtual import Heard, VirtualH12
+
+    robot = load_robot("h1_2")
+    served = VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), (1.0, "both"), domain, rate=RATE)
+    threading.Thread(target=served.run, daemon=True).start()
+    for line in sys.stdin:
+        word, _, rest = line.strip().partition(" ")
+        answer: Any = "ok"
+        if word == "fault":
+            served.fault_at, served.fault = 0.0, rest  # type: ignore[assignment]
+        if word == "machine":
+            served.machine = int(rest)
+        if word == "clear":
+            time.sleep(0.2)  # what the last controller sent is still on its way
+            served.fault, served.machine, served.heard, served.refused = "none", 6, Heard(), 0
+        if word == "heard":
+            heard = served.heard
+            k = len(heard.time)
+            answer = {n: [v.tolist() for v in getattr(heard, n)[:k]] for n in ("ctrl", "kp", "kd", "qvel")}
+            answer |= {"weight": heard.weight[:k], "time": heard.time[:k], "refused": served.refused}
+        print(json.dumps(answer), flush=True)
+
+
+if __name__ == "__main__":
+    sys.path.remove(str(Path(__file__).parent))
+    main(int(sys.argv[1]))

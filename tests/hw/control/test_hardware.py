@@ -1,0 +1,165 @@
+"""What a folder that somebody sent can change on a real robot: identified values within bounds, and nothing else."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from runs import untrained
+
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.hw.control.driver import DriverError
+from gaponet.hw.control.hardware import for_hardware, known_robot, robot_hash
+from gaponet.hw.control.plan import Planner
+from gaponet.hw.control.safety import Limits, SafetyConfig
+from gaponet.hw.drivers.unitree import UnitreeDriver
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.motion.motion import Motion
+
+JOINT = "left_shoulder_pitch_joint"
+
+
+@pytest.fixture(scope="module")
+def h1_2() -> RobotSpec:
+    return load_robot("h1_2")
+
+
+def tampered(robot: RobotSpec, folder: Path, file: str, pattern: str, new: str) -> Path:
+    """A copy of a robot folder in which one text was replaced, everywhere."""
+    save_robot(robot, folder)
+    text, count = re.subn(pattern, new, (folder / file).read_text())
+    assert count
+    (folder / file).write_text(text)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("file", "pattern", "new", "said"),
+    [
+        ("robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0", r"kp of left_hip_yaw_joint is 2000 N·m/rad, .*has 200 "),
+        ("robot.toml", r"effort_limit = (\d+)\.0", r"effort_limit = \g<1>0.0", r"effort_limit of left_hip_yaw_joint"),
+        ("robot.xml", r'range="[^"]*"', 'range="-9 9"', r"qpos_range of left_hip_yaw_joint is -9 to 9 rad, the known"),
+        ("robot.xml", r'mass="(\d)', r'mass="9\1', r"inertias or geometry of robot\.xml differ"),
+        ("collision.toml", r"radius = [\d.]+", "radius = 0.001", r"collision\.toml differs from that of"),
+    ],
+)
+def test_a_folder_that_differs_from_the_known_robot_is_refused_with_the_value(
+    h1_2, tmp_path, capsys, file, pattern, new, said
+):
+    folder = tampered(h1_2, tmp_path / "sent", file, pattern, new)
+    words = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes", "--robot", str(folder)]
+    assert main(words) == 2
+    assert re.search(said, " ".join(capsys.readouterr().err.split()))
+    sent = load_robot(folder)
+    assert robot_hash(sent) != robot_hash(h1_2)
+    with pytest.raises(RobotError, match=said):
+        for_hardware(sent, known_robot("unitree", None))
+
+
+def test_a_run_that_differs_from_the_known_robot_is_refused(h1_2, tmp_path, capsys):
+    stiff = load_robot(tampered(h1_2, tmp_path / "sent", "robot.toml", r"kp = (\d+)\.0", r"kp = \g<1>0.0"))
+    run = untrained(tmp_path / "run", stiff, Dataset.create(tmp_path / "set", stiff))
+    words = ["run", "--driver", "unitree", "--motion", "sweep-left_elbow", "--yes", "--model", str(run)]
+    assert main(words) == 2
+    assert "the known robot has 200 " in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_folder_supplies_identified_values_and_the_known_robot_its_limits(h1_2, tmp_path):
+    save_robot(h1_2.with_servos({JOINT: {"kp": 90.0, "stop_low": -0.5, "stop_high": 0.5}}), tmp_path / "identified")
+    robot = for_hardware(load_robot(tmp_path / "identified"), known_robot("unitree", None))
+    assert robot.folder == h1_2.folder
+    assert robot.kp[robot.index([JOINT])] == 90.0
+    limits = Limits.of(robot, (JOINT,), SafetyConfig(margin=0.0))
+    assert (limits.kp, limits.low, limits.high) == (100.0, -0.5, 0.5)
+
+
+def test_all_but_identified_values_is_the_known_robots(h1_2, tmp_path):
+    save_robot(h1_2.with_servos({JOINT: {"kp": 90.0}}), tmp_path / "identified")
+    file = tmp_path / "identified" / "robot.toml"
+    file.write_text(re.sub(r"home = [-\d.]+", "home = 0.3", file.read_text()))
+    sent = load_robot(tmp_path / "identified")
+    known = known_robot("unitree", None)
+    robot = for_hardware(sent, known)
+    assert not np.array_equal(sent.qpos_home, h1_2.qpos_home)
+    np.testing.assert_array_equal(robot.qpos_home, h1_2.qpos_home)
+    assert robot.nominal is known
+
+
+def test_an_identified_stop_does_not_widen_a_range(h1_2):
+    wide = h1_2.with_servos({JOINT: {"stop_low": -50.0, "stop_high": 50.0}})
+    np.testing.assert_array_equal(wide.qpos_range, h1_2.qpos_range)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [({"offset": 0.11}, "offset of .* is 0.11 rad"), ({"offset": -0.6}, "offset"), ({"kp": 0.0}, "kp of .* is 0 N"),
+     ({"kp": 24.0}, "0.25 to 4 times the nominal 100"), ({"kp": 401.0}, "kp")],
+)  # fmt: skip
+def test_identified_values_beyond_what_servos_have_are_refused_on_hardware(h1_2, values, said):
+    with pytest.raises(RobotError, match=said):
+        for_hardware(h1_2.with_servos({JOINT: values}), h1_2)
+
+
+def test_limits_may_come_from_a_folder_that_the_user_names_but_not_beyond_the_motors(h1_2, tmp_path):
+    folder = tampered(h1_2, tmp_path / "soft", "robot.toml", r"kp = (\d+)\.0", r"kp = 40.0")
+    soft = for_hardware(load_robot(folder), known_robot("unitree", str(folder)))
+    assert UnitreeDriver(soft).kp.tolist() == [40.0] * 27
+    with pytest.raises(RobotError, match=r"kp of .* is 1000; the driver of h1_2 takes at most 300"):
+        UnitreeDriver(replace(h1_2, kp=np.full(27, 1000.0)))
+    with pytest.raises(RobotError, match=r"effort_limit of .* the driver of h1_2 takes at most"):
+        UnitreeDriver(replace(h1_2, effort_limit=10 * h1_2.effort_limit))
+
+
+def test_a_driver_writes_no_command_outside_its_robots_range(h1_2):
+    driver = UnitreeDriver(h1_2)
+    for value in (np.nan, h1_2.qpos_range[13, 1] + 0.06):
+        ctrl = h1_2.qpos_home.copy()
+        ctrl[driver.joint_names.index(JOINT)] = value
+        with pytest.raises(DriverError, match=f"to {JOINT} is outside its range.*; it was not sent"):
+            driver.write(ctrl)
+
+
+class Shifted:
+    """A compensator that commands a joint away from its target."""
+
+    def __init__(self, robot: RobotSpec, joint: str, by: float) -> None:
+        self.shift = np.zeros(len(robot.joint_names))
+        self.shift[robot.joint_names.index(joint)] = by
+
+    def reset(self, target, payload_mass=None):
+        pass
+
+    def step(self, target, qpos, qvel=None):
+        return target + self.shift
+
+
+def test_the_plan_judges_the_commands_that_a_compensator_makes(so101):
+    planner = Planner(so101, so101.joint_names)
+    low = np.array([0.0, 0.35, 0.2, 0.0, 0.0, 0.0])
+    ctrl = np.repeat(low[None], 60, axis=0)
+    ctrl[:, 0] += 0.1 * np.sin(np.linspace(0, 2 * np.pi, 60))
+    plan = planner.plan(Motion("pan", "joint", 0.02, ctrl), low)
+    judged = planner.judge_commands(plan, Shifted(so101, "wrist_flex", 0.01), (0.0,))
+    assert judged.correction == pytest.approx(0.01)
+    assert judged.corrected_joint == "wrist_flex"
+    with pytest.raises(UsageError, match=r"compensation with 0 kg brings .* and the plane at 0 m"):
+        planner.judge_commands(plan, Shifted(so101, "shoulder_lift", 0.5), (0.0,))
+    with pytest.raises(UsageError, match="compensation commands no number to elbow_flex"):
+        planner.judge_commands(plan, Shifted(so101, "elbow_flex", np.nan), (0.0,))
+
+
+def test_a_run_with_compensation_says_how_far_commands_lead_and_whose_limits_hold(so101, tmp_path, capsys):
+    save_robot(so101.with_servos({"elbow_flex": {"kp": 12.0}}), tmp_path / "identified")
+    words = ["run", "--robot", str(tmp_path / "identified"), "--motion", "tour-all-0", "--fast", "--compensate"]
+    assert main([*words, "--payload-mass", "0", "--blend-speed", "4", "--blend", "0.2"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    lead = re.search(r"commands lead their targets by at most (\d\.\d\d) rad \((\w+)\)", said)
+    assert lead
+    assert 0.01 < float(lead[1]) < 0.5
+    assert re.search(r"limits and collision shapes: .*identified", said)

@@ -1,0 +1,370 @@
+"""Robots that do not do what they are told: never "handed over", never data. Virtual robots in simulated time."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hw.control.loopback import living
+
+from gaponet.base.errors import LogError
+from gaponet.data.importer import import_logs
+from gaponet.data.sequence import SequenceMeta, to_sequence
+from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.control.controller import Controller
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.drivers import feetech as reg
+from gaponet.hw.drivers.unitree import UnitreeDriver
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.so101_virtual import PERIOD, VirtualSO101
+
+serial = pytest.importorskip("serial", reason="pip install 'gaponet[so101]'")
+
+QUICK = ControlConfig(blend=0.5, blend_speed=2.0, settle=0.1, damp=2.0)
+ELBOW, ROLL = 3, 5  # servos
+WHOLE = reg.Register(0, 128)
+
+RNG = random.Random(1)
+SPOILT = {  # what reaches the driver of what servos say
+    "mute": lambda said: b"", "corrupt": lambda said: said[:-1] + bytes(b ^ 255 for b in said[-1:]),
+    "babble": lambda said: RNG.randbytes(600), "lossy": lambda said: said if RNG.random() > 0.03 else b"",
+    "noisy": lambda said: said if RNG.random() > 0.03 else RNG.randbytes(len(said)),
+}  # fmt: skip
+
+
+class Bus:
+    """A virtual arm on a wire that ages with the controller's clock; some time after its first goal it goes wrong."""
+
+    def __init__(self, arm: VirtualSO101, clock: SimulatedClock, way: str = "", at: float = np.inf) -> None:
+        self.arm, self.clock, self.way, self.at = arm, clock, way, at
+        self.buffer, self.first, self.done, self.lost, self.echo = b"", np.inf, False, False, False
+        self.written: list[tuple[float, int, bytes]] = []  # time, register, the rest of a packet that writes
+
+    def put(self, register: reg.Register, value: int, servos: range | tuple[int, ...] = range(1, 7)) -> None:
+        for servo in servos:
+            at = register.address
+            self.arm.memory[servo - 1][at : at + register.size] = register.encode(value)
+
+    def get(self, register: reg.Register) -> list[int]:
+        return [
+            register.decode(bytes(memory[register.address : register.address + register.size]))
+            for memory in self.arm.memory
+        ]
+
+    def write(self, data: bytes) -> int:
+        if self.lost:
+            raise OSError(5, "Input/output error")
+        now = self.clock.now()
+        while self.arm.live.steps * PERIOD <= now:
+            self.arm.live.step()
+        if data[4] in (reg.WRITE, reg.SYNC_WRITE):
+            self.written.append((now, data[5], data[6:-1]))
+            if data[5] == reg.GOAL_POSITION.address:
+                self.first = min(self.first, now)
+        wrong = now - self.first >= self.at
+        if wrong and not self.done:
+            self.done = True
+            self._go_wrong()
+        out = self.arm.hear(data if not wrong or self.way != "ignores" or data[4] == reg.SYNC_READ else b"")
+        if wrong and self.way == "crossed" and data[4] == reg.SYNC_WRITE and data[5] == reg.GOAL_POSITION.address:
+            elbow, roll = (bytes(self.arm.memory[servo - 1][42:44]) for servo in (ELBOW, ROLL))
+            self.arm.memory[ELBOW - 1][42:44], self.arm.memory[ROLL - 1][42:44] = roll, elbow
+            self.arm._apply()
+        self.buffer += (data if self.echo else b"") + (SPOILT[self.way](out) if wrong and self.way in SPOILT else out)
+        return len(data)
+
+    def _go_wrong(self) -> None:
+        if self.way in ("resets", "brown-out"):
+            servos = (ROLL,) if self.way == "resets" else range(1, 7)
+            self.put(reg.TORQUE_ENABLE, 0, servos)
+            self.put(reg.GOAL_POSITION, 0, servos)
+        elif self.way == "gain":
+            self.put(reg.P, 128, (ELBOW,))
+        elif self.way == "zero":
+            self.put(reg.HOMING_OFFSET, self.arm.calibration.rows["elbow_flex"].homing_offset + 33, (ELBOW,))
+            self.arm.calibration.zero[2] -= 33  # 0.05 rad
+        elif self.way == "mode":
+            self.put(reg.MODE, 1, (ELBOW,))
+        elif self.way == "limit":
+            self.put(reg.TORQUE_LIMIT, 200, (ELBOW,))
+        elif self.way == "lost":
+            self.lost = True
+        elif self.way == "hot":
+            self.arm.status[2] = 1 << 2
+        elif self.way == "silent":
+            self.arm.deaf = {4}
+        self.arm._apply()
+
+    def read(self, size: int = 1) -> bytes:
+        out, self.buffer = self.buffer[:size], self.buffer[size:]
+        return out
+
+    def reset_input_buffer(self) -> None:
+        self.buffer = b""
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def clock() -> SimulatedClock:
+    return SimulatedClock(100.0)
+
+
+@pytest.fixture
+def bus(so101: RobotSpec, clock: SimulatedClock, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bus]:
+    from gaponet.hw.drivers import so101 as driver
+
+    arm = VirtualSO101(so101, load_fleet("easy", so101).unit("virtual-1"))
+    arm.live.steps = round(clock.now() / PERIOD)
+    bus = Bus(arm, clock)
+    monkeypatch.setattr(serial, "Serial", lambda *_, **__: bus)
+    monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=clock.now))
+    yield bus
+    arm.close()
+
+
+def play(so101: RobotSpec, clock: SimulatedClock, stop: float = np.inf, watchdog: bool = False) -> Recording:
+    """One and a half second in which all joints swing."""
+    from gaponet.hw.drivers.so101 import SO101Driver
+
+    def policy(k: int, state: object) -> np.ndarray | None:
+        if k * 0.02 >= stop:
+            controller.stop("the operator")
+        return so101.qpos_home + 0.3 * np.sin(0.08 * k) * np.array([1, 0.5, -1, 0.8, 1, 0.5]) if k < 75 else None
+
+    driver = SO101Driver(so101, timeout=0.001)
+    controller = Controller(driver, so101, config=QUICK, clock=clock, watchdog=watchdog)
+    return controller.run(policy)
+
+
+WAYS = {
+    "ignores": "it holds the goal", "resets": r"servo 5 \(wrist_roll\): its torque is off",
+    "brown-out": "shoulder_pan.*its torque is off.*gripper",
+    "gain": r"servo 3 \(elbow_flex\): its p went from 32 to 128", "zero": "elbow_flex.*: its homing offset went from",
+    "limit": "elbow_flex.*: its torque limit went from 1000 to 200", "mode": "elbow_flex.*: its mode went from 0 to 1",
+    "crossed": "elbow_flex.*: it holds the goal",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("way", "at"), [*((way, 1.0) for way in WAYS), ("ignores", 0.05), ("gain", 2.35), ("zero", 2.35)]
+)
+def test_servos_that_do_not_as_told_are_named_and_their_run_is_no_data(so101, clock, bus, way, at, tmp_path):
+    bus.way, bus.at = way, at
+    recording = play(so101, clock)
+    assert recording.fault is not None
+    assert recording.fault.kind == "obedience", recording.fault
+    assert re.search(WAYS[way], recording.fault.text)
+    if at == 1.0 and way in ("ignores", "resets", "brown-out", "crossed"):  # each state tells; three in a row count
+        assert recording.fault.time - bus.first - at <= 5 * 0.02
+    if recording.fault.phase == "damp":  # else it was noticed at the very end, where the arm is held
+        off = bus.get(reg.TORQUE_ENABLE) == [0] * 6
+        assert off != recording.events[-1].text.startswith("could NOT be damped: switch the supply off")
+    with pytest.raises(LogError, match="the robot did not do what it was told: servo"):
+        recording.log()
+    path = recording.save(tmp_path / "logs", "sway")
+    assert path.exists() == (at > 0.5)
+    if path.exists():
+        with pytest.raises(LogError, match=r"sway\.parquet: no data, the robot did not do what it was told \(servo"):
+            import_logs(path, so101, "a", 0.0, tmp_path / "set", position_unit="rad", time_unit="s")
+    assert not json.loads((tmp_path / "logs" / "sway.json").read_text())["obeyed"]
+
+
+def test_a_setting_that_changes_is_noticed_within_a_second(so101, clock, bus):
+    bus.way, bus.at = "gain", 0.3
+    assert play(so101, clock).fault.time - bus.first - bus.at <= 1.0 + 2 * 0.02
+
+
+def test_an_honest_arm_is_believed(so101, clock, bus):
+    recording = play(so101, clock)
+    assert recording.fault is None
+    assert [e.phase for e in recording.events] == ["idle", "blend_in", "run", "blend_out", "stopped"]
+    assert bus.get(reg.TORQUE_ENABLE) == [1] * 6
+
+
+def test_what_is_remarked_about_the_servos_hinders_no_recording(so101, clock, bus):
+    bus.put(reg.P, 16)  # as LeRobot leaves them
+    recording = play(so101, clock)
+    assert any("16" in remark for remark in recording.meta["remarks"])
+    meta = SequenceMeta("so101", "lab", "sway", 0.0, "hand", "joint", 0, True, "sway.parquet")
+    assert len(to_sequence(recording.log(), so101, meta)) == 75
+
+
+# ---- ends
+
+
+def told(bus: Bus, register: reg.Register) -> list[tuple[float, bytes]]:
+    return [(time, words) for time, address, words in bus.written if address == register.address]
+
+
+def test_a_stop_lowers_the_arm_and_only_then_takes_its_torque(so101, clock, bus):
+    recording = play(so101, clock, stop=1.0)
+    assert [e.kind for e in recording.events if e.phase == "damp"] == ["stop"]
+    assert recording.events[-1].text == "let go: all servos say that their torque is off"
+    off = next(time for time, words in told(bus, reg.TORQUE_ENABLE) if words == b"\0")
+    began = recording.events[-2].time
+    assert off == pytest.approx(began + QUICK.damp, abs=0.05)
+    limits = [int.from_bytes(words[2:4], "little") for time, words in told(bus, reg.TORQUE_LIMIT) if time < off]
+    assert limits == sorted(limits, reverse=True)
+    assert limits[0] > 900
+    assert limits[-1] <= 10
+    assert bus.get(reg.TORQUE_ENABLE) == [0] * 6
+    assert bus.get(reg.TORQUE_LIMIT) == [1000] * 6, "the next user finds the limits that there were"
+    held = [row.state.qpos for row in recording.rows if row.phase == "damp"][:50]
+    assert np.ptp(held, axis=0).max() < 0.1, "for a second somebody may catch it"
+
+
+def test_a_servo_in_error_is_let_go_at_once(so101, clock, bus):
+    bus.way, bus.at = "hot", 1.5
+    recording = play(so101, clock)
+    assert recording.fault.kind == "robot"
+    off = next(time for time, words in told(bus, reg.TORQUE_ENABLE) if words == b"\0")
+    assert off <= recording.fault.time + 0.02
+    assert told(bus, reg.TORQUE_LIMIT)[0][0] > off
+
+
+def test_a_cable_that_is_out_is_never_said_to_be_damped_and_the_watchdog_goes_on(so101, clock, bus, monkeypatch):
+    ends: list[bool] = []
+    monkeypatch.setattr(
+        "gaponet.hw.control.controller.Watchdog",
+        lambda *_: SimpleNamespace(
+            trouble=str, fired=bool, beat=lambda weight: True, release=ends.append, wait_ready=lambda: None
+        ),
+    )
+    bus.way, bus.at = "lost", 1.0
+    recording = play(so101, clock, watchdog=True)
+    assert recording.fault.kind == "driver"
+    last = recording.events[-1]
+    assert (last.phase, last.kind) == ("stopped", "driver")
+    assert last.text.startswith("could NOT be damped: switch the supply off")
+    assert ends == [True]
+    assert bus.get(reg.TORQUE_ENABLE) == [1] * 6
+
+
+def test_one_servo_that_says_nothing_more_is_named_and_the_others_are_lowered(so101, clock, bus):
+    bus.way, bus.at = "silent", 1.0
+    recording = play(so101, clock)
+    assert recording.fault.kind == "stale"
+    assert told(bus, reg.TORQUE_LIMIT)
+    assert "could NOT be damped: switch the supply off" in recording.events[-1].text
+    assert "servo 4 (wrist_flex)" in recording.events[-1].text
+
+
+@pytest.mark.parametrize("way", ["mute", "corrupt", "babble"])
+def test_a_bus_that_says_nothing_true_any_more_carries_at_most_two_more_goals(so101, clock, bus, way):
+    bus.way, bus.at = way, 1.0
+    assert play(so101, clock).fault.kind in ("stale", "checksum")
+    assert sum(time >= bus.first + bus.at for time, _ in told(bus, reg.GOAL_POSITION)) <= 1 + 2
+    assert bus.get(reg.TORQUE_ENABLE) == [0] * 6
+
+
+@pytest.mark.parametrize("way", ["lossy", "noisy"])
+def test_a_bus_that_loses_or_damages_a_reply_now_and_then_goes_on(so101, clock, bus, way):
+    bus.way, bus.at = way, 0.0
+    assert play(so101, clock).fault is None
+
+
+def test_an_adapter_that_echoes_is_understood(so101, clock, bus):
+    bus.echo = True
+    assert play(so101, clock).fault is None
+
+
+def test_a_lost_packet_is_no_disobedience(so101, clock, bus):
+    """Every seventh packet that writes gets lost, the first among them."""
+    heard, hear = [0], bus.arm.hear
+
+    def lossy(data: bytes) -> bytes:
+        if data and data[4] == reg.SYNC_WRITE:
+            heard[0] += 1
+            data = b"" if heard[0] % 7 in (1, 2) else data
+        return hear(data)
+
+    bus.arm.hear = lossy
+    assert play(so101, clock).fault is None
+
+
+# ---- an H1-2, which cannot be asked what it was told
+
+
+def swing(
+    monkeypatch: pytest.MonkeyPatch, way: str = "", at: float = 0.0, told: float | None = None, **unit: object
+) -> tuple[Recording, list]:
+    """Both elbows go half a radian and then swing by as much, the right one the other way; told a payload."""
+    robot = load_robot("h1_2")
+    clock = living(monkeypatch, robot, **unit)  # type: ignore[arg-type]
+    clock.robot.way, clock.robot.at = way, at
+    left, right = robot.index(["left_elbow_joint", "right_elbow_joint"])
+
+    def policy(k: int, state: object) -> np.ndarray | None:
+        target = robot.qpos_home.copy()
+        target[left], target[right] = 0.5 + 0.5 * np.sin(0.06 * k), 0.5 - 0.5 * np.sin(0.06 * k)
+        return target if k < 150 else None
+
+    config = ControlConfig(blend=1.5, settle=0.1, damp=1.0)
+    driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
+    recording = Controller(driver, robot, config=config, clock=clock, watchdog=False, payload_mass=told).run(policy)
+    return recording, clock.robot.heard.weight
+
+
+@pytest.mark.parametrize(
+    ("way", "at"),
+    [
+        ("ignores", 0.0), ("ignores", 2.0), ("listens midway", 2.5), ("limp", 2.0), ("all limp", 2.0), ("weak", 2.0),
+        ("crossed", 0.0), ("mirrored", 0.0), ("blocked", 0.5), ("blocked", 2.6), ("blocked", 3.4),
+        ("zero", 2.5),
+    ],
+)  # fmt: skip
+def test_a_robot_whose_joints_do_not_follow_is_held_and_left_and_its_run_is_no_data(monkeypatch, way, at):
+    recording, _ = swing(monkeypatch, way, at)
+    assert recording.fault is not None
+    assert "elbow" in recording.fault.text
+    if recording.fault.kind == "obedience":
+        assert [e.phase for e in recording.events][-2:] == ["release", "stopped"]
+        assert recording.events[-1].text == "let go; the robot did not obey"
+    else:
+        assert (recording.fault.kind, recording.fault.phase) == ("jump" if way == "zero" else "frozen", "damp")
+    with pytest.raises(LogError, match="did not do what it was told"):
+        recording.log()
+    steps = np.abs(np.diff([row.state.qpos for row in recording.rows], axis=0))
+    assert steps.max() < 0.06 or "limp" in way or way == "zero", (
+        "nothing jumps when a robot listens again, and what is limp falls"
+    )
+    if at == 0.0 and way == "ignores":
+        assert max(row.time for row in recording.rows if row.phase == "blend_in") < recording.rows[0].time + 3.0
+
+
+def test_the_weight_waits_until_a_joint_has_followed(monkeypatch):
+    recording, weight = swing(monkeypatch, "listens midway", 2.5)
+    assert 0.0 < max(weight) <= 0.3 + 1e-6
+    recording, weight = swing(monkeypatch)
+    assert recording.fault is None
+    assert max(weight) == 1.0
+    assert recording.events[-1].text == "handed over"
+    assert recording.summary()["obeyed"]
+
+
+def test_an_arm_that_is_too_weak_for_its_load_but_pushes_obeys(monkeypatch):
+    recording, _ = swing(monkeypatch, told=3.0, unit="virtual-4", payload=3.0, fleet="hard")
+    assert recording.fault is None
+
+
+def test_a_run_in_which_nothing_moves_shows_nothing_and_is_no_data(monkeypatch):
+    robot = load_robot("h1_2")
+    clock = living(monkeypatch, robot)
+    driver = UnitreeDriver(robot, domain=200 + os.getpid() % 30)
+    rest = lambda k, state: robot.qpos_home if k < 10 else None  # noqa: E731
+    recording = Controller(
+        driver, robot, config=ControlConfig(blend=0.3, settle=0.0, damp=0.3), clock=clock, watchdog=False
+    ).run(rest)
+    assert recording.fault is None
+    assert recording.events[-1].text == "no data: no joint was told to go far enough to show whether the robot obeys"
+    with pytest.raises(LogError, match="no joint was told to go far enough"):
+        recording.log()

@@ -1,0 +1,62 @@
+"""The controller's state machine: every event in every phase, and the same table in docs/deploy-safety.md."""
+
+from __future__ import annotations
+
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from gaponet.hw.control.phases import COMMANDING, ENDED, TABLE, TRANSITIONS, Action, Phase, Trigger
+
+PAGE = Path(__file__).parents[3] / "docs" / "deploy-safety.md"
+WAITING = (Phase.CONNECT, Phase.IDLE)
+SENDING = {Action.BLEND_IN, Action.PLAY, Action.GO_BACK, Action.RELEASE, Action.RELEASE_HERE}
+
+
+def test_every_event_is_defined_once_in_every_phase_and_leads_forward():
+    named = [pair for row in TRANSITIONS if row[1] != tuple(Trigger) for pair in product(*row[:2])]
+    assert len(named) == len(set(named))
+    assert TABLE.keys() == set(product(Phase, Trigger))
+    order = list(Phase)
+    for (phase, _), (following, action) in TABLE.items():
+        if action in (Action.IGNORE, Action.RAISE):
+            assert following is phase
+        else:
+            assert order.index(following) > order.index(phase), "no way leads back, and each one ends"
+            assert (action in SENDING, action is Action.DAMP) == (following in COMMANDING, following is Phase.DAMP)
+
+
+@pytest.mark.parametrize("missing", [Trigger.CONSENT, Trigger.READY])
+def test_nothing_moves_without_consent_and_a_robot_that_is_ready(missing):
+    reached = {Phase.CONNECT}
+    for phase, trigger in product(Phase, Trigger):  # phases are in the order in which they can be reached
+        if phase in reached and trigger is not missing:
+            reached.add(TABLE[phase, trigger][0])
+    assert reached <= {*WAITING, Phase.STOPPED}
+
+
+@pytest.mark.parametrize("phase", Phase)
+@pytest.mark.parametrize("fault", [t for t in Trigger if "FAULT" in t.name or t is Trigger.NOT_FOLLOWING])
+def test_a_stop_in_any_phase_ends_held_or_damped(phase, fault):
+    following, action = TABLE[phase, fault]
+    if phase in ENDED:
+        assert action is Action.IGNORE, "it goes on damping, or has ended"
+    elif phase in WAITING or fault in (Trigger.FAULT_BEFORE_COMMAND, Trigger.FAULT_AFTER_WATCHDOG):
+        assert (following, action) == (Phase.STOPPED, Action.SEND_NOTHING), "never commanded, or damped already"
+    elif following is not Phase.DAMP:
+        assert (fault, action) == (Trigger.NOT_FOLLOWING, Action.RELEASE_HERE)
+
+
+def test_the_page_has_the_same_table():
+    def row(*cells: str) -> str:
+        return f"| {' | '.join(cells)} |"
+
+    page = PAGE.read_text(encoding="utf-8").splitlines()
+    for phases, triggers, following, action in TRANSITIONS:
+        events = "any other" if triggers == tuple(Trigger) else ", ".join(t.name.lower() for t in triggers)
+        assert row(", ".join(phases), events, following or "the same", action.value) in page
+    for trigger in Trigger:
+        assert row(trigger.name.lower(), trigger.value) in page
+    states = page[page.index("## States") : page.index("## One plan before motion")]
+    assert sum(line.startswith("| ") for line in states) == len(TRANSITIONS) + len(Trigger) + 2

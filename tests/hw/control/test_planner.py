@@ -1,0 +1,237 @@
+"""One plan before motion: from the found pose through the motion and back, judged by MuJoCo's own collision."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from contacts import Contacts
+
+from gaponet.base.errors import UsageError
+from gaponet.cli.main import main
+from gaponet.hw.control.clock import SimulatedClock
+from gaponet.hw.control.controller import Controller
+from gaponet.hw.control.driver import Fault, State
+from gaponet.hw.control.phases import ControlConfig
+from gaponet.hw.control.plan import Fence, Planner
+from gaponet.hw.control.safety import SafetyConfig
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sysid.motion.files import read_motion
+from gaponet.sysid.motion.motion import Motion
+from gaponet.sysid.motion.way import Way, ended, find_points
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.virtual_driver import VirtualDriver
+
+FOLDED = np.array([0.2, -1.70, 1.65, 0.9, 0.4, 1.2])  # pan, lift, elbow, wrist flex and roll, gripper
+OVER = np.array([0.0, -1.2, 0.0, 1.4, 0.0, 0.0])
+QUICK = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
+
+
+@pytest.fixture(scope="module")
+def planner(so101: RobotSpec) -> Planner:
+    return Planner(so101, so101.joint_names)
+
+
+@pytest.fixture(scope="module")
+def judge(so101: RobotSpec) -> Contacts:
+    return Contacts(so101)
+
+
+def motion(robot: RobotSpec, to: np.ndarray, joints: tuple[str, ...] | None = None, rows: int = 60) -> Motion:
+    """A small swing of the first named joint around a posture."""
+    ctrl = np.repeat(to[None], rows, axis=0)
+    ctrl[:, robot.index(list(joints or robot.joint_names))[0]] += 0.1 * np.sin(np.linspace(0, 2 * np.pi, rows))
+    return Motion("swing", "joint", 0.02, ctrl, joints)
+
+
+def test_a_file_for_one_joint_moves_that_joint_alone(so101, planner, judge, tmp_path):
+    rows = "\n".join(f"{0.1 * np.sin(0.1 * k):.5f}" for k in range(63))
+    (tmp_path / "pan.txt").write_text(f"shoulder_pan\n{rows}\n")
+    plan = planner.plan(read_motion(tmp_path / "pan.txt", so101), FOLDED)
+    assert np.flatnonzero(np.ptp(plan.rows, axis=0)).tolist() == [0]
+    np.testing.assert_allclose(plan.rows[[0, -1]], [FOLDED] * 2)
+    assert judge.along(plan.rows)[0] == 0
+
+
+def test_a_way_around_is_found_where_there_is_one():
+    wall = lambda rows: bool(((np.abs(rows[:, 0]) > 0.2) | (rows[:, 1] > 0.6)).all())  # noqa: E731
+    ends = np.array([[-1.0, -0.5, 0.3], [1.0, -0.5, 0.3]])
+    low, high = np.array([-1.5, -1.0, 0.3]), np.array([1.5, 1.0, 0.3])
+    points = ended(find_points(wall, *ends, low, high, home=np.zeros(3)))
+    np.testing.assert_array_equal(points[[0, -1]], ends)
+    assert wall(np.concatenate([np.linspace(a, b, 200) for a, b in itertools.pairwise(points)]))
+    assert (points[:, 2] == 0.3).all(), "a joint that may not move does not"
+    shut = lambda rows: bool((np.abs(rows[:, 0]) > 0.2).all())  # noqa: E731
+    assert ended(find_points(shut, *ends, low, high, home=np.zeros(3))) is None
+
+
+def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
+    under = np.array([0.0, 1.2, 0.6, 0.0, 0.0, 0.0])
+    with pytest.raises(UsageError, match=r"found with .* and the plane at 0 m .* in each other"):
+        planner.plan(motion(so101, OVER), under)
+    with pytest.raises(UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"):
+        planner.plan(motion(so101, under), FOLDED)
+    with pytest.raises(UsageError, match=r"the first target brings .* and the plane at 0 m"):
+        ended(planner.begin(under, FOLDED))
+
+
+def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():
+    way = Way.along(np.array([[0.0, 0.0], [1.0, 0.2], [0.4, 0.2]]), 0.5, 50.0, 2.0)
+    rows = way.rows(0.01)
+    speed = np.diff(rows, axis=0) / (way.duration / (len(rows) - 1))
+    assert np.abs(speed).max() <= 0.5 + 1e-6
+    np.testing.assert_allclose([rows[0], rows[-1], way.at(way.times[1])], way.points[[0, 2, 1]], atol=1e-12)
+    assert np.abs(speed[[0, -1]]).max() < 0.01
+
+
+def virtual(robot: RobotSpec, found: np.ndarray) -> tuple[Controller, list[np.ndarray]]:
+    """A controller of a virtual arm that stands in a posture, and its commands."""
+    clock, sent = SimulatedClock(), []
+
+    class Driver(VirtualDriver):
+        def write(self, ctrl: np.ndarray, weight: float = 1.0) -> None:
+            sent.append(ctrl.copy())
+            super().write(ctrl, weight)
+
+    stands = dataclasses.replace(robot, qpos_home=found)
+    driver = Driver(stands, load_fleet("easy", robot).unit("virtual-1"), clock)
+    return Controller(driver, robot, config=QUICK, clock=clock), sent
+
+
+def test_live_targets_that_go_for_the_table_are_cut(so101, planner, judge):
+    down = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0])
+    assert judge.deepest(down)[0] > 0.1
+    fence, at = Fence(planner, so101.qpos_home), []
+    for k in range(200):
+        asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
+        at.append(fence.step(asked, fence.at, 0.02))
+    assert max(judge.deepest(q)[0] for q in at) == 0
+    assert "the plane at 0 m" in fence.near
+    assert abs(at[-1][0] - down[0]) < 0.05, "what does not lead into it goes on"
+    for _ in range(300):
+        at.append(fence.step(so101.qpos_home, fence.at, 0.02))
+    np.testing.assert_allclose(at[-1], so101.qpos_home, atol=1e-6)
+    assert not fence.near
+
+
+def test_of_an_arm_that_sags_the_arm_itself_is_kept_clear(so101, planner):
+    down, sag = np.array([0.5, 1.7, 0.3, 0.5, 0.3, 0.0]), np.array([0.0, 0.08, 0.0, 0.0, 0.0, 0.0])
+    fence, least = Fence(planner, so101.qpos_home), np.inf
+    for k in range(200):
+        asked = so101.qpos_home + min(1.0, k / 60) * (down - so101.qpos_home)
+        at = fence.step(asked, fence.at + sag, 0.02)
+        least = min(least, planner.collision.along((at + sag)[None]).min())
+    told = planner.collision.along(at[None]).min()
+    assert "the plane at 0 m" in fence.near
+    assert least > planner.collision.clearance - 0.002
+    assert told > planner.collision.clearance + 0.005, "the sag matters here"
+
+
+def test_a_controller_cuts_them_and_says_what_for(so101, judge):
+    controller, sent = virtual(so101, so101.qpos_home)
+    down = np.array([0.0, 1.7, 0.3, 0.5, 0.0, 0.0])
+    way = down - so101.qpos_home
+    recording = controller.run(lambda k, state: so101.qpos_home + min(1, k / 50) * way if k < 90 else None)
+    assert recording.fault is None
+    assert max(judge.deepest(q)[0] for q in sent) == 0
+    assert any("targets are cut: " in e.text and "the plane at 0 m" in e.text for e in recording.events)
+
+
+ACROSS = np.array([-1.34, 0.86, 2.96, 2.27, -0.21, -1.15, -0.1, -2.5, 1.97, 1.78])  # straight from there to HERE …
+HERE = np.array([0.36, 2.83, -1.86, 1.95, 1.71, 1.47, -0.22, -0.6, 3.08, 2.84])  # … its arms go 14 cm into each other
+
+
+def straight(free, start, goal, *_):
+    """A search that looks at nothing."""
+    yield
+    return np.stack([start, goal])
+
+
+def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkeypatch):
+    monkeypatch.setattr("gaponet.hw.control.plan.find_points", straight)
+    robot = load_robot("h1_2")
+    found, far = robot.qpos_home.copy(), robot.qpos_home.copy()
+    found[robot.index(robot.operated)], far[robot.index(robot.operated)] = HERE, ACROSS
+    with pytest.raises(UsageError, match=r"the plan brings .* cm into each other; 3 cm are kept"):
+        ended(Planner(robot, robot.operated).begin(far, found))
+    hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
+    with pytest.raises(UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"):
+        Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
+
+
+@pytest.mark.parametrize("way", ["by way of home", "none", "none for a robot that does not obey"])
+def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_there(way, monkeypatch):
+    robot = load_robot("h1_2")
+    judge, found, far = Contacts(robot), robot.qpos_home.copy(), robot.qpos_home.copy()
+    at = robot.index(robot.operated)
+    found[at], far[at] = HERE, ACROSS
+    controller, sent = virtual(robot, found)
+    driver, hears = controller.driver, way in ("by way of home", "none")
+    driver.at_end = "hold" if hears else "hand_over"
+
+    def read():
+        fault = None if hears or controller.phase != "blend_out" else Fault("obedience", "it ignores goals")
+        return State(driver.clock.now(), sent[-1] if sent else found, *np.zeros((3, len(found))), fault=fault)
+
+    driver.read, controller.watch.noisy = read, False
+    assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
+    legs = [found, robot.qpos_home, far]
+    rows = np.concatenate([Way.along(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)])
+
+    def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
+        for _ in find_points(*given) if way == "by way of home" else range(50):
+            controller.clock._now += 0.001
+            yield
+        return ended(find_points(*given)) if way == "by way of home" else None
+
+    def policy(k, state):
+        if k:
+            monkeypatch.setattr("gaponet.hw.control.plan.find_points", search)
+        return rows[k] if k < len(rows) else None
+
+    recording = controller.run(policy)
+    last = recording.events[-1].text
+    assert (recording.fault is None) == hears, recording.fault
+    if not hears:
+        assert [e.phase for e in recording.events][-3:] == ["blend_out", "release", "stopped"]
+        assert last == "let go; the robot did not obey"
+        return
+    assert judge.along(np.array([row.ctrl for row in recording.rows if row.ctrl is not None]), 0.02)[0] == 0
+    back = np.array([row.target for row in recording.rows if row.phase == "blend_out" and row.target is not None])
+    if way == "none":
+        assert last.startswith("where it is: no clear way was found back to where it was found: the straight one ")
+        assert last.endswith("; hold")
+        np.testing.assert_allclose(sent[-1][at], ACROSS, atol=0.02)
+        return
+    assert last == "back where it was found; hold"
+    np.testing.assert_allclose(sent[-1][at], HERE, atol=0.02)
+    still = int(np.argmax(np.abs(back - back[0]).max(axis=1) > 0))
+    assert 2 < still < 100, "it looks for a share of each period"
+
+
+@pytest.mark.parametrize(("beyond", "kind"), [(0.03, None), (0.2, "plan")])
+def test_the_first_command_is_where_it_was_found_or_none_leaves(so101, beyond, kind):
+    found = so101.qpos_home.copy()
+    found[0] = so101.qpos_range[0, 1] + beyond
+    controller, sent = virtual(so101, found)
+    honest = controller.driver.read
+    controller.driver.read = lambda: honest() if sent else dataclasses.replace(honest(), qpos=found.copy())
+    recording = controller.run(lambda k, state: so101.qpos_home if k < 5 else None)
+    assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
+    assert [c[0] for c in sent[:1]] == ([] if kind else [pytest.approx(found[0], abs=2e-3)])
+
+
+def test_an_arm_without_shapes_and_a_robot_that_may_fall_are_asked_for(so101, tmp_path, capsys):
+    (tmp_path / "pan.txt").write_text("shoulder_pan\n0.0\n0.1\n")
+    save_robot(so101, tmp_path / "mine")
+    (tmp_path / "mine" / "collision.toml").unlink()
+    words = ["run", "--driver", "so101", "--port", "/dev/none", "--motion", str(tmp_path / "pan.txt"), "--yes"]
+    assert main([*words, "--robot", str(tmp_path / "mine"), "--limits-from", str(tmp_path / "mine")]) == 2
+    assert "so101 has no collision.toml" in " ".join(capsys.readouterr().err.split())
+    assert main(["run", "--driver", "unitree", "--topic", "lowcmd", "--motion", "sweep-left_elbow", "--yes"]) == 2
+    assert "legs and torso go off, and a robot that stands falls; say --hangs" in " ".join(
+        capsys.readouterr().err.split()
+    )

@@ -1,0 +1,125 @@
+"""Recordings that grow in a file: what memory holds of them, and what is left after a full disk or a kill."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from gaponet.base.errors import FolderError, LogError
+from gaponet.hw.control import rows as module
+from gaponet.hw.control.driver import State
+from gaponet.hw.control.recording import Recording
+from gaponet.hw.control.rows import CHUNK, Row, Rows
+
+NAMES = ("elbow", "wrist")
+
+
+def row(k: int, names: tuple[str, ...] = NAMES) -> Row:
+    q = np.full(len(names), 0.001 * k)
+    return Row(0.02 * k, "run", q, q if k % 50 else None, State(0.02 * k - 0.001, q, 2 * q, 3 * q, 40 + q, k, 0.1))
+
+
+def recording(count: int, folder=None) -> Recording:
+    made = Recording("arm", True, NAMES, NAMES, 0.02)
+    if folder:
+        made.grow_in(folder)
+    for k in range(count):
+        made.rows.append(row(k))
+    return made
+
+
+@pytest.mark.parametrize("count", [0, 1, CHUNK, 3 * CHUNK + 5])
+def test_rows_come_back_as_they_were(count):
+    rows = Rows(NAMES)
+    for k in range(count):
+        rows.append(row(k))
+        if k == CHUNK + 3:
+            assert len(rows) == k + 1  # looking at it half-way changes nothing
+    assert len(rows) == count
+    for k, found in enumerate(rows):
+        want = row(k)
+        assert (found.time, found.phase, found.state.refused) == (want.time, "run", k)
+        assert (found.ctrl is None) == (want.ctrl is None)
+        np.testing.assert_array_equal(found.state.tau, want.state.tau)
+    assert [r.time for r in rows[-2:]] == [row(k).time for k in range(count)][-2:]
+
+
+def test_memory_holds_none_of_an_hours_rows():
+    names = tuple(f"joint_{i}" for i in range(27))
+    rows, one = Rows(names), row(1, tuple(map(str, range(27))))
+    tracemalloc.start()
+    try:
+        for k in range(20_000):
+            rows.append(one)
+            if k % 1000 == 0:
+                rows._todo.join()  # a busy machine's disk may be behind; what waits for it is in memory
+        rows.close()
+        assert tracemalloc.get_traced_memory()[1] < 10e6  # bytes; all rows are 28 MB
+    finally:
+        tracemalloc.stop()
+    assert len(rows) == 20_000
+
+
+def test_a_killed_process_leaves_its_periods_readable_by_name(tmp_path):
+    script = (
+        "import os, sys; sys.path.insert(0, 'tests')\n"
+        "from pathlib import Path; from hw.control.test_rows import recording\n"
+        "made = recording(300, Path(sys.argv[1])); made.rows._todo.join(); os.kill(os.getpid(), 9)\n"
+    )
+    folder = tmp_path / "logs"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", script, folder], env=environment).returncode == -9
+    (left,) = folder.glob("*.cycles.npy")
+    found = np.load(left)
+    assert len(found) == 300 // CHUNK * CHUNK
+    np.testing.assert_allclose(found["qpos.wrist"], 0.001 * np.arange(len(found)))
+    recording(10, folder).save(folder, "next")  # which removes nothing
+    assert left.exists()
+
+
+def test_a_disk_that_is_full_keeps_what_was_written_and_says_so(tmp_path, monkeypatch):
+    folder, real = tmp_path / "logs", os.pwrite
+
+    def full(descriptor: int, data: bytes, at: int) -> int:
+        if at > 20_000 and len(data) > 3_000:
+            return real(descriptor, data[:3_000], at)  # in the middle of a row
+        if at > 20_000:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(descriptor, data, at)
+
+    monkeypatch.setattr(module.os, "pwrite", full)
+    made = recording(500, folder)
+    kept = len(made.rows)
+    assert CHUNK <= kept < 500
+    assert made.rows.trouble.strerror == "No space left on device"
+    with pytest.raises(LogError, match="not whole, No space left on device; make room"):
+        made.log("sway")
+    path = made.save(folder, "sway")
+    np.testing.assert_allclose(np.load(folder / "sway.cycles.npy")["qpos.elbow"], 0.001 * np.arange(kept))
+    assert json.loads((folder / "sway.json").read_text())["not_whole"] == "No space left on device"
+    assert path.exists()  # there was room for the table
+
+
+def test_what_cannot_be_written_at_the_end_leaves_the_periods(tmp_path, monkeypatch):
+    made = recording(200, tmp_path / "logs")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "sway.json")
+
+    monkeypatch.setattr("gaponet.hw.control.recording.write_text", full)
+    with pytest.raises(OSError, match=r"No space left on device; all periods that were written are in sway\.cycles"):
+        made.save(tmp_path / "logs", "sway")
+    assert len(np.load(tmp_path / "logs" / "sway.cycles.npy")) == 200
+
+
+def test_a_folder_of_somebody_else_is_refused_before_anything_moves(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(FolderError, match=r"thesis\.tex"):
+        recording(0, tmp_path)

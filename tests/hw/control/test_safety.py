@@ -1,0 +1,177 @@
+"""Limits hold for every state and target; every watchdog says why."""
+
+import numpy as np
+import pytest
+
+from gaponet.base.errors import UsageError
+from gaponet.hw.control.driver import State
+from gaponet.hw.control.safety import FAULTS, Limits, SafetyConfig, Watch, damping, limit_command, limit_delta
+from gaponet.robot.spec import RobotSpec
+
+DT = 0.02
+MILLION = 1_000_000
+
+
+@pytest.fixture
+def limits(arm: RobotSpec) -> Limits:
+    return Limits.of(arm, arm.joint_names, SafetyConfig())
+
+
+def drawn(rng: np.random.Generator, scale: float, rows: int) -> np.ndarray:
+    """Mostly of a sensible size, some enormous, some not numbers."""
+    values = scale * rng.standard_normal((rows, 2)) * rng.choice([0.1, 1.0, 30.0], (rows, 1), p=[0.45, 0.45, 0.1])
+    values[rng.random((rows, 2)) < 1e-3] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
+    return values
+
+
+def test_no_command_ever_leaves_range_rate_or_torque(arm):
+    rng = np.random.default_rng(0)
+    limits = Limits.of(arm, arm.joint_names, SafetyConfig(), gains=(np.array([20.0, 3.0]), np.array([0.0, 1.5])))
+    for _ in range(4):
+        rows = MILLION // 4
+        target, previous, qpos, qvel = (drawn(rng, s, rows) for s in (2.0, 1.5, 1.5, 3.0))
+        age = 0.04 * rng.random((rows, 1)) ** 2
+        out = limit_command(target, previous, qpos, qvel, DT, limits, age)
+        sent = out.feasible.all(axis=1)
+        u, q, v = out.ctrl[sent], qpos[sent], qvel[sent]
+        assert 0.1 < sent.mean() < 0.99
+        assert (u >= limits.low).all()
+        assert (u <= limits.high).all()
+        before = np.clip(previous[sent], limits.low, limits.high)
+        assert (np.abs(u - before) <= limits.speed * DT).all()
+        assert (np.abs(limits.kp * (u - q) - limits.kd * v) <= limits.effort).all()
+        # Where the joint really is by then, after any acceleration up to the stated one.
+        pushed = limits.acceleration * rng.uniform(-1, 1, v.shape).round(rng.integers(3))
+        q, v = q + v * age[sent] + pushed * age[sent] ** 2 / 2, v + pushed * age[sent]
+        assert (np.abs(limits.kp * (u - q) - limits.kd * v) <= limits.effort * (1 + 1e-9)).all()
+
+
+def test_a_command_is_refused_only_where_the_three_intervals_do_not_meet(limits):
+    rng = np.random.default_rng(1)
+    target, previous, qpos = (s * rng.standard_normal((3000, 2)) for s in (1.0, 0.8, 0.8))
+    qvel = rng.standard_normal(qpos.shape)
+    out = limit_command(target, previous, qpos, qvel, DT, limits)
+    grid = np.linspace(0, 1, 401)[:, None, None]  # try commands all over the range-and-rate interval
+    before = np.clip(previous, limits.low, limits.high)
+    low, high = np.maximum(limits.low, before - 0.1), np.minimum(limits.high, before + 0.1)
+    for part in np.array_split(np.arange(len(qpos)), 6):
+        u = low[part] + grid * (high - low)[part]
+        possible = (np.abs(limits.kp * (u - qpos[part]) - limits.kd * qvel[part]) <= limits.effort).any(axis=0)
+        assert not (possible & ~out.feasible[part]).any()
+
+
+def test_identified_gains_are_not_those_of_the_real_servo(arm):
+    identified = arm.with_servos({"elbow": {"kp": 3.0}})
+    assert Limits.of(identified, arm.joint_names, SafetyConfig()).kp.tolist() == [20.0, 20.0]
+
+
+def test_a_harmless_command_passes_unchanged(limits):
+    q = np.array([0.2, -0.3])
+    out = limit_command(q + 0.05, q, q, np.zeros(2), DT, limits)
+    np.testing.assert_array_equal(out.ctrl, q + 0.05)
+    assert not out.cut.any()
+
+
+def test_a_joint_pushed_away_faster_than_the_rate_leaves_no_command(limits):
+    # kp 20, 0.95 · 5 N·m: the torque interval is q ± 0.2375; the rate interval is 0 ± 0.1
+    assert limit_command(*np.zeros((2, 2)), np.array([0.33, 0.0]), np.zeros(2), DT, limits).feasible.all()
+    assert not limit_command(*np.zeros((2, 2)), np.array([0.34, 0.0]), np.zeros(2), DT, limits).feasible[0]
+
+
+def test_nan_is_never_sent(limits):
+    q, nan = np.zeros(2), np.array([np.nan, 0.0])
+    for arguments in ((nan, q, q, q), (q, nan, q, q), (q, q, nan, q), (q, q, q, nan)):
+        assert not limit_command(*arguments, DT, limits).feasible[0]
+
+
+def test_a_correction_is_bounded_in_size_and_rate(limits):
+    first = limit_delta(np.array([1.0, -1.0]), np.zeros(2), DT, limits)
+    np.testing.assert_allclose(first, [0.04, -0.04])
+    delta = first
+    for _ in range(20):
+        delta = limit_delta(np.array([1.0, np.nan]), delta, DT, limits)
+    np.testing.assert_allclose(delta, [0.5, -0.04])
+
+
+def test_damping_never_asks_for_more_than_the_effort_limit():
+    kd = damping(np.full(3, 8.0), np.array([1.0, 100.0, np.nan]), np.full(3, 20.0))
+    np.testing.assert_allclose(kd, [8.0, 0.2, 8.0])
+
+
+def test_a_share_above_the_effort_limit_is_refused():
+    with pytest.raises(UsageError, match=r"torque_share is 1\.5; give at most 1"):
+        SafetyConfig(torque_share=1.5)
+
+
+def test_a_margin_wider_than_the_range_is_refused(arm):
+    with pytest.raises(UsageError, match="leaves nothing of the range of shoulder"):
+        Limits.of(arm, arm.joint_names, SafetyConfig(margin=2.0))
+
+
+def watched(change: dict[str, object], noisy: bool = True, periods: int = 40) -> tuple[str, int]:
+    """Kind of the first fault and its period, of a state that moves gently until period 10 and is then changed."""
+    rng = np.random.default_rng(0)
+    watch = Watch(("shoulder", "elbow"), np.arange(2), DT, SafetyConfig(), noisy)
+    good = None
+    for k in range(periods):
+        now, wrong = k * DT, k >= 10
+        fields = {
+            "time": now, "qpos": 0.01 * k + 1e-4 * rng.standard_normal(2), "qvel": 0.5 + 1e-2 * rng.standard_normal(2),
+            "tau": rng.standard_normal(2), "temperature": np.full(2, 40.0),
+        }  # fmt: skip
+        ctrl = np.full(2, 0.01 * k)
+        if wrong:
+            fields |= {n: v(k, fields, good) if callable(v) else v for n, v in change.items() if n != "late"}
+        else:
+            good = fields
+        fault = watch.check(now, State(**fields), ctrl, change.get("late", 0.0) if wrong else 0.0)
+        if fault:
+            assert fault.kind in FAULTS
+            return fault.kind, k
+    return "none", periods
+
+
+def keep(name):
+    return lambda k, fields, good: good[name]
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "period"),
+    [
+        ({}, "none", 40),
+        ({name: keep(name) for name in ("time", "qpos", "qvel", "tau")}, "stale", 12),
+        ({"time": lambda k, *_: k * DT - 0.05}, "stale", 10),  # late packets: they come, but old
+        ({name: keep(name) for name in ("qpos", "qvel", "tau")}, "frozen", 11),
+        ({"qvel": np.array([np.nan, 0.0])}, "nan", 10),
+        ({"qpos": lambda k, f, _: f["qpos"] + [0.4, 0.0]}, "jump", 10),
+        ({"temperature": np.array([40.0, 90.0])}, "temperature", 10),
+        ({"temperature": np.full(2, np.nan)}, "none", 40),
+        ({"qpos": lambda k, f, _: f["qpos"] - 0.051 * np.minimum(k - 9, 16)}, "tracking", 33),
+        ({"refused": lambda k, *_: 3 * (k - 9)}, "checksum", 16),
+        ({"late": 0.041}, "overrun", 10),
+        ({"late": 0.039}, "none", 40),
+        ({"tilt": 0.71}, "tilt", 10),
+        ({"tilt": 0.69}, "none", 40),
+        ({"tilt": np.nan}, "tilt", 10),  # an IMU that gives no attitude
+    ],
+)
+def test_each_watchdog_speaks_in_time(change, kind, period):
+    assert watched(change) == (kind, period)
+
+
+def test_seventeen_wrong_checksums_in_each_second_are_ignored():
+    assert watched({"refused": lambda k, *_: (k - 9) // 3}, periods=200) == ("none", 200)
+
+
+def test_a_coarse_encoder_may_rest_but_not_while_the_command_moves_on():
+    change = {name: keep(name) for name in ("qpos", "qvel", "tau")}
+    kind, period = watched(change, noisy=False, periods=60)
+    assert kind == "frozen"
+    assert period in (39, 40)  # 0.3 rad at 0.01 rad a period
+
+
+def test_where_the_real_joints_end_earlier_commands_do(arm):
+    limits = Limits.of(arm, arm.joint_names, SafetyConfig(margin=0.1), qpos_range=np.array([[-0.5, 9.0], [-9.0, 0.4]]))
+    mjcf = arm.qpos_range
+    np.testing.assert_allclose(limits.low, [-0.4, mjcf[1, 0] + 0.1])
+    np.testing.assert_allclose(limits.high, [mjcf[0, 1] - 0.1, 0.3])

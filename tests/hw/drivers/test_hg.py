@@ -1,0 +1,90 @@
+"""hg messages: layout and checksum against other implementations."""
+
+import numpy as np
+import pytest
+
+from gaponet.hw.drivers import hg
+
+
+def slow_crc(words: np.ndarray) -> int:
+    """CRC-32/MPEG-2, bit by bit."""
+    crc = 0xFFFFFFFF
+    for word in words.tolist():
+        for bit in range(31, -1, -1):
+            top = (crc >> 31) ^ ((word >> bit) & 1)
+            crc = ((crc << 1) & 0xFFFFFFFF) ^ (0x04C11DB7 if top else 0)
+    return crc
+
+
+def test_the_checksum_is_crc32_mpeg2_of_the_padded_struct():
+    import struct
+
+    rng = np.random.default_rng(0)
+    data = hg.LowCmd.new()
+    values = {name: rng.standard_normal(35).astype("f4") for name in ("q", "dq", "tau", "kp", "kd")}
+    for name, column in values.items():
+        hg.LowCmd.set_motors(data, name, column)
+    hg.LowCmd.set_motors(data, "mode", np.arange(35))
+    hg.LowCmd.view(data, "mode_pr")[:] = 1
+    hg.LowCmd.view(data, "mode_machine")[:] = 4
+    packed = struct.pack("<2B2x", 1, 4)
+    for i in range(35):
+        packed += struct.pack("<B3x5fI", i, *(values[n][i] for n in ("q", "dq", "tau", "kp", "kd")), 0)
+    packed += struct.pack("<4I", 0, 0, 0, 0)
+    assert hg.LowCmd.packed_size == 1004  # as the C struct
+    assert hg.LowState.packed_size == 2092
+    assert hg.LowCmd.checksum(data) == slow_crc(np.frombuffer(packed, "<u4"))
+
+
+@pytest.mark.parametrize("message", [hg.LowState, hg.LowCmd])
+def test_a_changed_bit_anywhere_is_noticed(message):
+    rng = np.random.default_rng(0)
+    data = message.new()
+    message.set_motors(data, "q", rng.standard_normal(35))
+    message.seal(data)
+    assert message.intact(data)
+    used = np.setdiff1d(message._gather, [message.wire_size])
+    for byte in rng.choice(used, 50):
+        broken = data.copy()
+        broken[byte] ^= 1 << int(rng.integers(8))
+        assert not message.intact(broken)
+
+
+def test_the_wire_layout_is_that_of_cyclonedds():
+    pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
+    from cyclonedds.idl import IdlStruct
+
+    from gaponet.hw.drivers import dds
+
+    counter = iter(range(10**6))
+
+    def build(cls, fields):
+        values = []
+        for _, kind, count in fields:
+            one = (
+                (lambda k=kind: next(counter) % 100)
+                if isinstance(kind, str)
+                else (lambda k=kind: build(inner[id(k)], k))
+            )
+            values.append(one() if count == 1 else [one() for _ in range(count)])
+        return cls(*values)
+
+    inner = {id(hg.IMU): dds.IMUState, id(hg.MOTOR_STATE): dds.MotorState, id(hg.MOTOR_CMD): dds.MotorCmd}
+    for cls, message, fields in ((dds.LowState, hg.LowState, hg.LOW_STATE), (dds.LowCmd, hg.LowCmd, hg.LOW_CMD)):
+        sample = build(cls, fields)
+        wire = IdlStruct.serialize(sample)
+        assert wire[:4] == hg.HEADER
+        data = np.frombuffer(wire[4:], np.uint8)
+        assert len(data) == message.wire_size
+        motors = sample.motor_state if cls is dds.LowState else sample.motor_cmd
+        for name in ("mode", "q", "dq"):
+            np.testing.assert_array_equal(message.motors(data, name), [getattr(m, name) for m in motors])
+        assert message.view(data, "crc")[0] == sample.crc
+        assert message.view(data, "mode_machine")[0] == sample.mode_machine
+        again = message.new()
+        for name in message.columns:
+            message.set_motors(again, name, message.motors(data, name))
+        for path in message._at:
+            if "[" not in path:
+                message.view(again, path)[:] = message.view(data, path)
+        np.testing.assert_array_equal(again, data)

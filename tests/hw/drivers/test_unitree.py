@@ -1,0 +1,199 @@
+"""What the Unitree driver makes of messages, and the virtual H1-2 of commands."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="pip install 'gaponet[dds]'")
+
+from gaponet.hw.control.driver import DriverError
+from gaponet.hw.drivers import hg
+from gaponet.hw.drivers.unitree import MOTOR_NAMES, TickClock, UnitreeDriver
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.unitree_virtual import VirtualH12
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotSpec:
+    return load_robot("h1_2")
+
+
+@pytest.fixture(scope="module")
+def served(robot: RobotSpec) -> VirtualH12:
+    return VirtualH12(robot, load_fleet("easy", robot).unit("virtual-4"), domain=180 + os.getpid() % 40, rate=100.0)
+
+
+def message(motors: int = 27, machine: int = 6) -> np.ndarray:
+    data = hg.LowState.new()
+    q = np.zeros(hg.MOTORS)
+    q[:motors] = np.linspace(0.1, 0.2, motors)
+    hg.LowState.set_motors(data, "q", q)
+    hg.LowState.view(data, "mode_machine")[0] = machine
+    hg.LowState.view(data, "imu_state.quaternion")[0] = 1.0
+    return data
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (message(29), "motors in slots 27, 28, a G1's"),
+        (message(12), "no motor in slot 12, torso_joint"),
+        (message(27, 5), "mode_machine is 5"),
+    ],
+)
+def test_another_robot_is_refused(robot, data, why):
+    with pytest.raises(DriverError, match=why):
+        UnitreeDriver(robot)._require_h1_2([data])
+
+
+def decoded(robot, data):
+    driver = UnitreeDriver(robot)
+    driver._require_h1_2([data])
+    driver._clock = TickClock([0.0], [0])
+    return driver._decode(data, 0.0), driver
+
+
+def test_the_trunk_leans_by_what_the_quaternion_says_and_none_is_not_upright(robot):
+    data = message()
+    assert decoded(robot, data)[0].tilt == pytest.approx(0.0, abs=1e-3)
+    hg.LowState.view(data, "imu_state.quaternion")[:] = (np.cos(0.4), 0.0, np.sin(0.4), 0.0)
+    assert decoded(robot, data)[0].tilt == pytest.approx(0.8, abs=1e-5)
+    hg.LowState.view(data, "imu_state.quaternion")[:] = (np.cos(0.4), 0.0, 0.0, np.sin(0.4))  # turned, not leaning
+    assert decoded(robot, data)[0].tilt == pytest.approx(0.0, abs=1e-3)
+    hg.LowState.view(data, "imu_state.quaternion")[:] = 0.0
+    assert np.isnan(decoded(robot, data)[0].tilt)
+
+
+def test_only_the_stop_keys_of_the_remote_stop(robot):
+    told = decoded(robot, message())[1]._told
+    pressed = message()
+    for keys, stops in ((0x0008, True), (0x0220, True), (0x0020, False), (0x0200, False), (0x0104, False)):
+        hg.LowState.view(pressed, "wireless_remote")[2:4] = keys & 0xFF, keys >> 8
+        assert (told(pressed) is not None and told(pressed).kind == "stop") == stops, hex(keys)
+
+
+def test_what_one_of_several_messages_says_stops_for_good(robot):
+    pressed, well = message(), message()
+    hg.LowState.view(pressed, "wireless_remote")[2] = 0x08  # select
+    for data in (pressed, well):
+        hg.LowState.seal(data)
+    _, driver = decoded(robot, message())
+    queue = [[pressed, well], [well]]
+    driver._reader, driver._dds = None, SimpleNamespace(receive=lambda reader: queue.pop(0))
+    assert [driver.read().fault.kind, driver.read().fault.kind] == ["stop", "stop"]
+
+
+def unplugged(robot: RobotSpec, **how: str) -> tuple[UnitreeDriver, list[np.ndarray]]:
+    """A driver without a bus, and the list of what it sends."""
+    driver, sent = UnitreeDriver(robot, **how), []
+    driver._bus, driver._dds = object(), type("dds", (), {"LowCmd": None, "send": lambda *a: sent.append(a[-1].copy())})
+    driver._writer = None
+    return driver, sent
+
+
+def test_on_arm_sdk_the_torso_is_held_where_it_was_found_with_its_gains(robot):
+    at, torso = MOTOR_NAMES.index("torso_joint"), robot.index(["torso_joint"])[0]
+    for how, held in (({}, True), ({"joints": "upper_body"}, False), ({"topic": "lowcmd"}, False)):
+        driver, sent = unplugged(robot, **how)
+        for angle in (0.3, 0.7):
+            driver.write(np.where(np.arange(27) == torso, angle, 0.0), 1.0)
+        driver.damp()
+        q, kp, kd, mode = ([hg.LowCmd.motors(data, name)[at] for data in sent] for name in ("q", "kp", "kd", "mode"))
+        if held:
+            assert (q, kp, mode) == (pytest.approx([0.3] * 3), [robot.kp[torso]] * 3, [1] * 3)
+            assert kd == [robot.kd[torso]] * 3
+        else:
+            assert kp[-1] == 0, "what is commanded is damped, what is not is off"
+
+
+def test_an_identified_robot_is_commanded_with_the_gains_of_its_real_servos(robot):
+    driver, sent = unplugged(robot.with_servos({"left_elbow_joint": {"kp": 60.0}}))
+    driver.write(robot.qpos_home)
+    at = MOTOR_NAMES.index("left_elbow_joint")
+    assert hg.LowCmd.motors(sent[0], "kp")[at] == robot.kp[robot.index(["left_elbow_joint"])[0]] != 60.0
+
+
+def command(robot: RobotSpec, **columns: np.ndarray) -> np.ndarray:
+    data = hg.LowCmd.new()
+    for name, values in {"mode": np.ones(hg.MOTORS), **columns}.items():
+        hg.LowCmd.set_motors(data, name, values)
+    return data
+
+
+@pytest.mark.parametrize("field", ["q", "dq", "tau", "kp", "kd"])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_command_that_is_not_a_number_is_refused(served, robot, field, wrong):
+    before, refused = served.live.ctrl.copy(), served.refused
+    values = np.full(hg.MOTORS, 0.5)
+    values[16] = wrong
+    served._apply("lowcmd", command(robot, **{field: values}), 0.0)
+    assert served.refused == refused + 1
+    np.testing.assert_array_equal(served.live.ctrl, before)
+
+
+def test_torque_and_velocity_targets_are_followed(served, robot):
+    elbow, at = robot.index(["left_elbow_joint"])[0], MOTOR_NAMES.index("left_elbow_joint")
+    one = np.eye(hg.MOTORS)[at]
+    speed = []
+    for columns in ({"tau": 12.0 * one}, {"dq": -1.0 * one, "kd": 8.0 * np.ones(hg.MOTORS)}):
+        served._apply("lowcmd", command(robot, **columns), 0.0)
+        for _ in range(15):
+            served.live.step()
+        speed.append(served.live.read()[1][elbow])
+    assert speed[0] > 0.5
+    assert -2.0 < speed[1] < -0.3
+
+
+FORCED = (
+    '<CycloneDDS><Domain Id="any"><General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces>'
+    "<AllowMulticast>true</AllowMulticast></General></Domain></CycloneDDS>"
+)
+FORCING = """
+import sys
+from cyclonedds.domain import Domain, DomainParticipant
+domain = Domain(int(sys.argv[1]), sys.argv[2])
+participant = DomainParticipant(int(sys.argv[1]))
+sys.stdin.read()
+"""
+
+
+def test_a_program_that_is_made_to_use_multicast_on_loopback_is_found():
+    from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+
+    from gaponet.hw.drivers import dds
+
+    domain = 225 + os.getpid() % 5
+    other = subprocess.Popen([sys.executable, "-c", FORCING, str(domain), FORCED], stdin=subprocess.PIPE)
+    try:
+        bus, deadline, found = dds.Bus(domain, "lo"), time.monotonic() + 30, set()
+        reader = BuiltinDataReader(bus._participant, BuiltinTopicDcpsParticipant)
+        while len(found) < 2 and time.monotonic() < deadline:
+            found |= {entry.key for entry in reader.read(N=50) if hasattr(entry, "key")}
+            time.sleep(0.05)
+        assert len(found) == 2
+    finally:
+        other.kill()
+        other.wait()
+
+
+def test_a_process_ends_although_the_deletion_of_its_dds_domain_never_does():
+    program = (
+        "import threading\n"
+        "from gaponet.hw.drivers import dds\n"
+        "class Stuck:\n"
+        "    def __del__(self):\n"
+        "        if threading.current_thread() is not threading.main_thread():\n"
+        "            threading.Event().wait()\n"
+        "dds._DOMAINS[0] = Stuck()\n"
+        "print('done')\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stdout) == (0, "done\n"), ended.stderr

@@ -1,0 +1,108 @@
+"""The LeRobot plug-in's motions, with stand-ins for the classes of LeRobot that it derives from."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from contacts import Contacts
+
+from gaponet.base.errors import UsageError
+
+PLUGIN = Path(__file__).parents[3] / "plugins" / "lerobot_robot_gaponet" / "lerobot_robot_gaponet.py"
+FOUND = {"shoulder_pan": 11.5, "shoulder_lift": -68.8, "elbow_flex": 0.0, "wrist_flex": 80.2, "wrist_roll": 22.9}
+
+
+class Base:
+    """Robot, Teleoperator and their configurations."""
+
+    def __init__(self, config: object = None) -> None:
+        self.config = config
+
+    @classmethod
+    def register_subclass(cls, name: str):
+        return lambda made: made
+
+    register = register_subclass
+
+
+@pytest.fixture
+def plugin(monkeypatch):
+    pytest.importorskip("torch")
+    parts = {
+        "lerobot": {}, "lerobot.cameras": {"CameraConfig": Base, "make_cameras_from_configs": dict},
+        "lerobot.lerobot_types": {"EnvTransition": dict, "TransitionKey": SimpleNamespace()},
+        "lerobot.processor": {"ProcessorStep": Base, "ProcessorStepRegistry": Base},
+        "lerobot.robots": {"Robot": Base, "RobotConfig": type("RobotConfig", (Base,), {"__init__": object.__init__})},
+        "lerobot.teleoperators": {
+            "Teleoperator": Base, "TeleoperatorConfig": type("Config", (Base,), {"__init__": object.__init__}),
+        },
+        "lerobot.utils": {}, "lerobot.utils.errors": {"DeviceNotConnectedError": ConnectionError},
+    }  # fmt: skip
+    for name, holds in parts.items():
+        module = ModuleType(name)
+        vars(module).update(holds)
+        monkeypatch.setitem(sys.modules, name, module)
+    spec = importlib.util.spec_from_file_location("lerobot_robot_gaponet", PLUGIN)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def seen(gripper: float) -> dict[str, float]:
+    return {f"{joint}.pos": value for joint, value in FOUND.items()} | {"gripper.pos": gripper, "camera": None}
+
+
+def test_a_cameras_depth_is_observed_beside_its_colours(plugin, so101):
+    wrist = SimpleNamespace(height=4, width=6, read_latest=lambda: "colours")
+    front = SimpleNamespace(**vars(wrist), use_rgb=True, use_depth=True, read_latest_depth=lambda: "depth")
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.units, robot.cameras = plugin.Units(so101), {"wrist": wrist, "front": front}
+    shapes = {"wrist": (4, 6, 3), "front": (4, 6, 3), "front_depth": (4, 6, 1)}
+    assert robot.observation_features == robot.action_features | shapes
+    assert [read() for *_, read in robot._pictures()] == ["colours", "colours", "depth"]
+
+
+def test_an_arm_is_not_moved_without_consent(plugin, monkeypatch):
+    monkeypatch.setattr("sys.stdin", None)
+    monkeypatch.setattr("subprocess.Popen", lambda *_, **__: pytest.fail("a controller was started"))
+    robot = plugin.GaponetSO101.__new__(plugin.GaponetSO101)
+    robot.config = plugin.GaponetSO101Config()
+    with pytest.raises(UsageError, match=r"nothing was commanded; give --robot\.yes=true"):
+        robot.connect()
+
+
+def test_its_motions_are_one_plan_from_where_the_arm_is_and_the_gripper_keeps_what_it_holds(plugin, so101, tmp_path):
+    (tmp_path / "roll.csv").write_text("time,wrist_roll\n" + "\n".join(f"{0.1 * k},{0.05 * k}" for k in range(5)))
+    config = plugin.GaponetMotionConfig(motions=f"{tmp_path / 'roll.csv'},sweep-shoulder_pan", fps=20.0, lead=0.5)
+    motion = plugin.GaponetMotion(config)
+    motion.connect()
+    with pytest.raises(ConnectionError, match="plans from where the arm is"):
+        motion.get_action()
+    plugin.saw(seen(gripper=62.0))
+    said = [motion.get_action()]
+    said += [motion.get_action() for _ in range(len(motion._rows) + 5)]
+    units = motion.units
+    rows = np.array([units.rad(action) for action in said])
+    np.testing.assert_allclose(rows[:10], np.repeat(units.rad(seen(62.0))[None], 10, axis=0), atol=1e-9)
+    assert {round(action["gripper.pos"], 6) for action in said} == {62.0}, "no motion of these names the gripper"
+    first = np.abs(rows[:, 4] - 0.2).argmin()
+    assert np.ptp(rows[: first + 1], axis=0).argmax() == 4
+    assert (np.ptp(rows[: first + 1, [0, 1, 2, 3]], axis=0) == 0).all(), "the file names one joint"
+    assert Contacts(so101).along(rows, 0.02)[0] == 0
+    assert np.abs(np.diff(rows, axis=0)).max() * 20 < 5.0
+
+
+def test_a_motion_that_goes_into_the_table_is_refused_before_a_row_is_said(plugin, tmp_path):
+    (tmp_path / "roll.csv").write_text("time,wrist_roll\n0,0.4\n0.1,0.4\n")
+    (tmp_path / "shove.csv").write_text("time,shoulder_lift,elbow_flex\n0,1.7,0.3\n0.1,1.7,0.3\n")
+    motion = plugin.GaponetMotion(plugin.GaponetMotionConfig(motions=str(tmp_path)))
+    motion.connect()
+    plugin.saw(seen(gripper=10.0))
+    with pytest.raises(UsageError, match=r"'shove' begins with .* and the plane at 0 m"):
+        motion.get_action()

@@ -1,0 +1,244 @@
+"""What the wires bring: JSON over ZeroMQ and through a pipe, ROS 2's messages on a real DDS bus between processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from environments import environment
+
+from gaponet.base.errors import UsageError
+from gaponet.hw.control.driver import DriverError
+from gaponet.hw.targets.live import LARGEST, Heard
+from gaponet.hw.targets.pipe import PipeWire
+
+STATE = {"time": 7.0, "joint_names": ("a", "b"), "commanded": ("b",), "qpos": [0.1, 0.2], "qvel": [0, 0], "tau": [1, 2]}
+
+
+def heard(wire, count, seconds=20.0):
+    """At least that many messages."""
+    found, deadline = [], time.monotonic() + seconds
+    while len(found) < count and time.monotonic() < deadline:
+        found += wire.receive()
+        time.sleep(0.002)
+    return found
+
+
+@pytest.fixture
+def listening():
+    zeromq = pytest.importorskip("gaponet.hw.targets.zeromq")
+    wire = zeromq.ZeroMQWire("tcp://127.0.0.1:*")
+    wire.address = wire._socket.last_endpoint.decode()
+    yield wire
+    wire.close("over")
+
+
+def test_a_policy_takes_states_sends_targets_and_hears_why_it_is_over(listening):
+    from gaponet.hw.targets.client import RemoteRobot
+
+    with RemoteRobot(listening.address, patience=20.0) as robot:
+        with pytest.raises(DriverError, match="take a state first"):
+            robot.send(np.zeros(2))
+        (hello,) = heard(listening, 1)
+        assert not hello.target
+        listening.publish(hello.sender, STATE)
+        states = iter(robot)
+        state = next(states)
+        assert (robot.joint_names, robot.commanded) == (("a", "b"), ("b",))
+        np.testing.assert_array_equal(state.qpos, STATE["qpos"])
+        robot.send(state.qpos + 1)
+        robot.send({"b": 3})
+        one, other = heard(listening, 2)
+        assert (one.target, other.target) == ({"b": 1.2}, {"b": 3.0})
+        assert one.sender == other.sender == hello.sender
+        assert hello.time < one.time < other.time
+        listening.close("damped")
+        assert list(states) == []
+        assert robot.ended == "damped"
+
+
+def test_a_policy_that_leaves_ends_the_run_and_one_that_crashes_does_not(listening):
+    from gaponet.hw.targets.client import RemoteRobot
+
+    with pytest.raises(ZeroDivisionError), RemoteRobot(listening.address):
+        raise ZeroDivisionError
+    with RemoteRobot(listening.address):
+        pass
+    said = heard(listening, 3)
+    assert [m.end for m in said] == [False, False, True]
+    assert len({m.sender for m in said}) == 2
+
+
+def test_a_stranger_who_says_too_much_is_cut_off_and_nobody_else(listening):
+    import zmq
+
+    context = zmq.Context()
+    try:
+        stranger, sender = (context.socket(zmq.DEALER) for _ in range(2))
+        for socket in (stranger, sender):
+            socket.linger = 0
+            socket.connect(listening.address)
+        stranger.send(b"x" * (LARGEST + 1))
+        stranger.send_multipart([b"", b"\x80\x04pickle"])
+        sender.send(json.dumps({"time": 1.0, "target": {"a": 0.5}}).encode())
+        found = heard(listening, 1)
+        found += heard(listening, 1, 0.5)
+        assert [m.target for m in found if not m.wrong] == [{"a": 0.5}]
+        assert len(listening.receive()) == 0
+        listening.publish(b"nobody", STATE)
+    finally:
+        context.destroy(linger=0)
+
+
+def test_no_more_messages_are_taken_at_a_look_than_a_period_can_bear(listening):
+    import zmq
+
+    context = zmq.Context()
+    try:
+        sender = context.socket(zmq.DEALER)
+        sender.connect(listening.address)
+        for k in range(300):
+            sender.send(json.dumps({"time": k}).encode())
+        most = found = 0
+        deadline = time.monotonic() + 20
+        while found < 300 and time.monotonic() < deadline:
+            now = len(listening.receive())
+            most, found = max(most, now), found + now
+        assert found == 300
+        assert most <= 64
+    finally:
+        context.destroy(linger=0)
+
+
+def test_two_cannot_listen_at_one_address(listening):
+    from gaponet.hw.targets.zeromq import ZeroMQWire
+
+    with pytest.raises(UsageError, match=r"cannot listen at .* is another run there"):
+        ZeroMQWire(listening.address)
+
+
+def test_lines_through_a_pipe_may_come_in_parts_be_too_long_and_cease():
+    read, write = os.pipe()
+    wire = PipeWire(read)
+    assert wire.receive() == []
+    line = b'{"time": 1, "target": {"a": 0.5}}\n'
+    os.write(write, line[:7])
+    assert wire.receive() == []
+    os.write(write, line[7:] + line[:-1])
+    assert wire.receive() == [Heard("stdin", 1.0, {"a": 0.5})]
+    os.write(write, b"\n")
+    assert len(wire.receive()) == 1
+    os.write(write, b"x" * (LARGEST + 1))
+    assert "has more than" in wire.receive()[0].wrong
+    os.write(write, b"x" * 100 + b'"time": 9}\n' + line)
+    assert [m.target for m in wire.receive()] == [{"a": 0.5}]
+    os.close(write)
+    assert "closed the pipe" in wire.receive()[0].wrong
+    assert wire.receive() == []
+    os.close(read)
+
+
+def trajectory(names, positions, stamp=(5, 7), due=20_000_000, points=1):
+    """CDR of a JointTrajectory by rosbags, whose reader and writer of ROS messages are its own."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = store.types
+    header = kind["std_msgs/msg/Header"](kind["builtin_interfaces/msg/Time"](*stamp), "base")
+    none = np.array([])
+    due = kind["builtin_interfaces/msg/Duration"](0, due)
+    point = kind["trajectory_msgs/msg/JointTrajectoryPoint"](np.array(positions, float), none, none, none, due)
+    message = kind["trajectory_msgs/msg/JointTrajectory"](header, list(names), [point] * points)
+    return bytes(store.serialize_cdr(message, "trajectory_msgs/msg/JointTrajectory"))
+
+
+@pytest.fixture
+def ros2():
+    pytest.importorskip("rosbags", reason="pip install 'gaponet[ros]'")
+    return pytest.importorskip("gaponet.hw.targets.ros2", reason="pip install 'gaponet[dds]'")
+
+
+def test_ros_messages_are_on_the_wire_as_another_library_has_them(ros2):
+    from rosbags.typesys import Stores, get_typestore
+
+    data = trajectory(["left", "right_elbow"], [0.1, -0.2])
+    said = ros2.decode(ros2.JointTrajectory, data[4:])
+    assert ros2.encode(said) == data[4:]
+    assert ros2.heard("a", data[4:]) == Heard("a", 5 + 7e-9, {"left": 0.1, "right_elbow": -0.2})
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    state = ros2.JointState(ros2.Header(ros2.Time(3, 4), ""), ["left", "b"], [0.1, 0.2], [1.0, 2.0], [])
+    read = store.deserialize_cdr(data[:4] + ros2.encode(state), "sensor_msgs/msg/JointState")
+    assert (read.header.stamp.sec, read.name, read.velocity.tolist()) == (3, ["left", "b"], [1.0, 2.0])
+    assert bytes(store.serialize_cdr(read, "sensor_msgs/msg/JointState"))[4:] == ros2.encode(state)
+
+
+def test_plans_and_what_is_no_trajectory_are_refused(ros2):
+    assert "a plan" in ros2.heard("a", trajectory("ab", [1, 2], points=2)[4:]).wrong
+    assert "a plan" in ros2.heard("a", trajectory("ab", [1, 2], due=900_000_000)[4:]).wrong
+    assert "1 positions for 2 joints" in ros2.heard("a", trajectory("ab", [1])[4:]).wrong
+    assert "2 positions for 1 joints" in ros2.heard("a", trajectory("aa", [1, 2])[4:]).wrong
+    assert ros2.heard("a", trajectory("ab", [1, 2], stamp=(0, 0))[4:]).time is None
+    assert ros2.heard("a", trajectory("ab", [], points=0)[4:]).end
+    whole = trajectory("ab", [1, 2])[4:]
+    assert "has more than" in ros2.heard("a", whole + bytes(LARGEST)).wrong
+    rng = np.random.default_rng(0)
+    for cut in range(len(whole)):
+        broken = bytearray(whole[: cut + 1])
+        broken[rng.integers(len(broken))] = rng.integers(256)
+        message = ros2.heard("a", bytes(broken))
+        assert message.wrong or message.end or message.target is not None
+
+
+def meet(ros2, domain: int, peer: list, **environ: str) -> tuple[dict, list[Heard]]:
+    """What a program at the other end of ROS 2's topics says it has heard, and what it told us."""
+    wire = ros2.ROS2Wire(domain)
+    other = subprocess.Popen(peer, stdout=subprocess.PIPE, text=True, env={**os.environ, **environ})
+    try:
+        found, deadline = [], time.monotonic() + 60
+        while other.poll() is None and time.monotonic() < deadline:
+            wire.publish(None, STATE)
+            found += wire.receive()
+            time.sleep(0.01)
+        assert other.stdout
+        said = json.loads(other.stdout.read())
+    finally:
+        other.kill()
+        other.wait()
+        wire.close("over")
+    assert (
+        said.items()
+        >= {"name": ["a", "b"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [1.0, 2.0]}.items()
+    )
+    assert [m.wrong for m in found if m.wrong] == []
+    assert {m.sender for m in found} == {found[0].sender}
+    times = [m.time for m in found]
+    assert times == sorted(times)
+    return said, found
+
+
+def test_both_ends_of_ros_2s_topics_between_processes(ros2):
+    domain = 30 + os.getpid() % 150
+    _, found = meet(ros2, domain, [sys.executable, Path(__file__).with_name("ros2_peer.py"), str(domain)])
+    assert found[-1].target == {"a": 0.25, "b": -0.5}
+
+
+@pytest.mark.peers
+@pytest.mark.parametrize("version", ["jazzy", "kilted"])
+def test_ros_2_itself_is_heard_and_hears_us(ros2, version):
+    """rclpy on Fast DDS, whose descriptions of types Cyclone DDS does not take: make peers."""
+    packages = (f"ros-{version}-{name}" for name in ("rclpy", "rmw-fastrtps-cpp", "sensor-msgs", "trajectory-msgs"))
+    python, domain = environment(f"ros-{version}", "3.12", tuple(packages)), 30 + os.getpid() % 150
+    there = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    said, found = meet(ros2, domain, [python, Path(__file__).with_name("rclpy_peer.py"), "b"], **there)
+    assert said["targets"] > 5
+    targets = [m.target["b"] for m in found if m.target]
+    assert len(targets) > 5
+    assert 0.2 <= min(targets) < 0.25
+    assert 0.35 < max(targets) <= 0.4
+    assert found[-1].end

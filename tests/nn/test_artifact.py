@@ -1,0 +1,172 @@
+"""What ships answers as what was trained, and refuses what it was not made for."""
+
+import copy
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from arm import TOML, recordings, write_arm
+
+from gaponet.base.errors import ModelError
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.onnx_export import export
+from gaponet.sim.replay import replay
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def artifact(robot, tmp_path_factory):
+    torch.manual_seed(0)
+    config = ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,))
+    net = build_network(config, 2)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.1)
+    folder = tmp_path_factory.mktemp("run") / "model"
+    samples = np.random.default_rng(0).normal(size=(32, config.observation_dim(2) + 2)).astype(np.float32)
+    difference = export(net, folder, make_card(config, robot, dt=[0.02]), samples)
+    return folder, net, samples, difference
+
+
+def test_onnx_equals_torch(artifact):
+    folder, net, samples, difference = artifact
+    assert difference <= 1e-5
+    with torch.inference_mode():
+        expected = net(torch.from_numpy(samples)).numpy()
+    np.testing.assert_allclose(GapModel.load(folder).infer(samples), expected, atol=1e-5)
+
+
+def test_export_refuses_to_write_what_differs(artifact, robot, tmp_path, monkeypatch):
+    _, net, samples, _ = artifact
+    monkeypatch.setattr("gaponet.nn.onnx_export.PARITY", -1.0)
+    with pytest.raises(ModelError, match="ONNX and torch differ by"):
+        export(net, tmp_path / "out", {}, samples)
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_of_two_exports_are_not_taken_for_one_model(artifact, robot, tmp_path):
+    """An export that was killed between its files."""
+    folder, net, samples, _ = artifact
+    card = json.loads((folder / "card.json").read_text())
+    other = copy.deepcopy(net)
+    torch.nn.init.zeros_(other.trunk[-1].weight)
+    export(other, tmp_path / "out", card, samples)
+    (tmp_path / "out" / "card.json").write_text(json.dumps(card))
+    for backend in ("onnxruntime", "numpy"):
+        with pytest.raises(ModelError, match=r"is not of its card\.json: an export was cut short"):
+            GapModel.load(tmp_path / "out", backend)
+
+
+def test_a_corrected_replay_applies_the_artifacts_corrections(artifact, robot):
+    model = GapModel.load(artifact[0].parent)
+    sequences = recordings(robot, 2, rows=30)
+    twins = replay(sequences, robot, model.corrector(robot))
+    first = np.abs(twins[0].ctrl - sequences[0].ctrl)[:-1]
+    assert 0 < first.max() <= model.config.delta_max + 1e-6
+
+
+def test_another_rate_is_refused(artifact, robot):
+    model = GapModel.load(artifact[0])
+    model.require(robot, 0.02006)  # the clock of a real 50 Hz loop
+    with pytest.raises(ModelError, match=r"trained at 50\.0 Hz, asked to run at 100\.0 Hz"):
+        model.require(robot, 0.01)
+
+
+def test_a_card_of_the_simulator_in_which_friction_crept_is_read_and_refused(artifact, tmp_path):
+    shutil.copytree(artifact[0], tmp_path / "model")
+    card = json.loads((tmp_path / "model" / "card.json").read_text())
+    (tmp_path / "model" / "card.json").write_text(json.dumps(card | {"simulator": "a127234c3d89"}))
+    with pytest.raises(ModelError, match=r"trained in simulator a127234c3d89.*before friction held.*train again"):
+        GapModel.load(tmp_path / "model").require(write_arm(tmp_path / "arm"))
+
+
+def test_other_gains_are_refused(artifact, tmp_path):
+    stiff = write_arm(tmp_path, TOML.replace("kp = 20.0", "kp = 21.0"))
+    with pytest.raises(ModelError, match="gains or limits differ"):
+        GapModel.load(artifact[0]).require(stiff)
+
+
+def test_another_joint_set_is_refused(artifact, robot):
+    with pytest.raises(ModelError, match="made for arm with joints shoulder, elbow"):
+        GapModel.load(artifact[0]).require(dataclasses.replace(robot, operated=("elbow",)))
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "newer", "onnx"])
+def test_a_damaged_artifact_says_what_to_do(artifact, tmp_path, damage):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for file in artifact[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    card = folder / "card.json"
+    if damage == "missing":
+        card.unlink()
+    elif damage == "cut":
+        card.write_text(card.read_text()[:100])
+    elif damage == "newer":
+        card.write_text(json.dumps(json.loads(card.read_text()) | {"format": 99}))
+    else:
+        (folder / "model.onnx").write_bytes(b"nothing")
+    with pytest.raises(ModelError, match=r"give a run folder|restore it|upgrade|train or copy it again"):
+        GapModel.load(folder)
+
+
+@pytest.fixture
+def copied(artifact, tmp_path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for file in artifact[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"qpos_range": [[float("nan"), 1.0], [-1.0, 1.0]]}, r"qpos_range\[0\]\[0\]: should be a finite number"),
+        ({"qpos_range": [[-1.0, 1.0]]}, "qpos_range: should have one entry for each of 2 joints"),
+        ({"qpos_range": [[1.0, -1.0], [-1.0, 1.0]]}, "is no range"),
+        ({"joint_names": "ab"}, "joint_names: should be"),
+        ({"dt": [0]}, r"dt\[0\]: should be greater than"),
+        ({"payload_seen": []}, "payload_seen: "),
+        ({"model": {"history": 1e9}}, "history: should be a valid integer"),
+        ({"model": {"history": 10**9}}, "history: should be less than or equal to 1000"),
+        ({"model": {"branch_hidden": [10**9]}}, r"branch_hidden\[0\]: should be less"),
+        ({"model": {"colour": "red"}}, "colour: is not a known field"),
+        ({"model": {"transformer_width": 3, "transformer_heads": 2}}, "cannot be shared by 2 heads"),
+        ({"model": {"history": 3}}, "does not fit its card"),
+        ({"model": {"delta_max": 1e-9}}, "does not fit its card"),
+        ({"joint_names": ["a"], "kp": [1.0], "kd": [1.0], "qpos_range": [[-1, 1]]}, "does not fit its card"),
+    ],
+)
+@pytest.mark.parametrize("backend", ["onnxruntime", "numpy"])
+def test_a_card_that_asks_for_another_network_is_refused_with_file_and_field(copied, changed, said, backend):
+    card = json.loads((copied / "card.json").read_text())
+    model = card["model"] | changed.get("model", {})
+    (copied / "card.json").write_text(json.dumps(card | changed | {"model": model}))
+    with pytest.raises(ModelError, match=said) as error:
+        GapModel.load(copied, backend)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("damage", ["shape", "nan", "absent", "text", "pickle", "cut"])
+def test_weights_that_do_not_fit_are_refused_before_anything_is_corrected(copied, damage):
+    file = copied / "weights.npz"
+    with np.load(file) as found:
+        weights = {name: found[name] for name in found.files}
+    changes = {"shape": np.zeros((3, 3), np.float32), "nan": np.full_like(weights["bias"], np.nan),
+               "text": np.array("x"), "pickle": np.array([{}], object)}  # fmt: skip
+    weights |= {"bias": changes[damage]} if damage in changes else {}
+    if damage == "absent":
+        del weights["relative"]
+    np.savez(file, **weights)
+    if damage == "cut":
+        file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(ModelError, match=r"weights\.npz: (does not fit its card|not readable)"):
+        GapModel.load(copied, "numpy")

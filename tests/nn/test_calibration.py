@@ -1,0 +1,136 @@
+"""A unit that differs from those trained on in gain and delay, and a model that corrects nothing."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, record, write_arm
+
+from gaponet import api
+from gaponet.base.errors import ModelError, NoGainError, UsageError
+from gaponet.data.store import Dataset
+from gaponet.nn import calibration
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.calibration import Calibration
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.onnx_export import export
+from gaponet.robot.spec import load_robot
+from gaponet.sim.replay import replay
+from gaponet.sysid.refit import refit
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("robots") / "arm")
+
+
+@pytest.fixture(scope="module")
+def model(robot, tmp_path_factory):
+    config, folder = ModelConfig(history=2, num_probes=2), tmp_path_factory.mktemp("run") / "model"
+    net = build_network(config, 2).eval()
+    export(net, folder, make_card(config, robot, dt=[0.02]), np.zeros((4, net.features.dim), np.float32))
+    return GapModel.load(folder)
+
+
+@pytest.fixture(scope="module")
+def logs(robot):
+    return [record(robot, commands(450, seed), f"m{seed}", kp=0.6, delay=2) for seed in range(3)]
+
+
+@pytest.fixture(scope="module")
+def found(model, robot, logs):
+    return Calibration.fit(model, robot, logs[:2], seconds=16.0)
+
+
+def test_gain_and_delay_of_the_unit_are_found(found, robot):
+    for i, joint in enumerate(robot.operated):
+        assert found.servos[joint]["kp"] == pytest.approx(0.6 * robot.kp[i], rel=0.2)
+        assert found.servos[joint]["delay"] == pytest.approx(0.04, abs=0.008)
+        assert abs(found.servos[joint]["offset"]) < 0.01
+    assert found.after < 0.1 * found.before
+
+
+def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs):
+    def error(simulator):
+        twin = replay(logs[2:], simulator, model.corrector(robot))[0]
+        return np.abs(twin.qpos - logs[2].qpos).mean()
+
+    assert error(found.robot(robot)) < 0.2 * error(robot)
+
+
+def test_a_calibration_is_read_as_it_was_written(found, tmp_path):
+    odd = replace(found, unit_id="lab/arm 2")
+    assert odd.save(tmp_path).name == "lab_arm_2.json"
+    assert calibration.Calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
+    with pytest.raises(ModelError, match="made for another model"):
+        calibration.Calibration.load(tmp_path, "0123456789ab")
+
+
+def test_a_calibration_for_an_earlier_model_is_replaced(found, tmp_path):
+    replace(found, weights="0123456789ab").save(tmp_path)
+    found.save(tmp_path)
+    assert calibration.Calibration.load(tmp_path, found.weights) == {found.unit_id: found}
+
+
+def test_a_payload_that_nobody_weighed_is_found(model, robot):
+    logs = [record(robot, commands(450, seed), f"m{seed}", payload=0.2) for seed in range(2)]
+    untold = [replace(s, meta=replace(s.meta, payload_mass=0.0)) for s in logs]
+    found = Calibration.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
+    assert found.payload_mass == pytest.approx(0.2, abs=0.02)
+    assert found.payload_std < 0.02
+    with pytest.raises(UsageError, match="one and the same"):
+        Calibration.fit(model, robot, [untold[0], logs[1]], unknown_payload=True)
+
+
+def test_recordings_of_two_units_are_refused(model, robot, logs):
+    other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
+    with pytest.raises(UsageError, match="give those of one unit"):
+        Calibration.fit(model, robot, [logs[1], other])
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"servos": {"elbow": {"kp": float("nan")}}}, r"servos\.elbow\.kp: should be a finite number"),
+        ({"servos": {"elbow": {"mass": 1.0}}}, "servos.elbow.mass"),
+        ({"servos": []}, "servos: should be an object"),
+        ({"logs": "abc"}, "logs: should be"),
+        ({"payload_mass": -1}, "payload_mass: "),
+    ],
+)
+def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, changed, said):
+    file = found.save(tmp_path)
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+    with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
+        calibration.Calibration.load(tmp_path, found.weights)
+
+
+def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for log in logs:
+        data.append(log)
+    found = api.calibrate_robot(robot, data, tmp_path / "today", seconds=16.0)
+    assert found.errors["after"].mean() < 0.2 * found.errors["before"].mean()
+    written = load_robot(tmp_path / "today")
+    np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
+    np.testing.assert_array_equal(written.nominal.kp, robot.kp)
+    same = Dataset.create(tmp_path / "same", robot)
+    same.append(record(robot, commands(450, 0), "m0"))
+    with pytest.raises(NoGainError, match="nothing is written"):
+        api.calibrate_robot(robot, same, tmp_path / "again", seconds=8.0)
+    assert not (tmp_path / "again" / "robot.toml").exists()
+
+
+def test_one_short_command_calibrates_nothing_and_windows_of_several_are_judged_by_motions_left_out(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for payload in (0.0, 0.1):
+        data.append(record(robot, commands(60, 0), "m0", payload))
+    with pytest.raises(NoGainError, match="is all there is of each joint"):
+        api.calibrate_robot(robot, data, tmp_path / "one")
+    several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
+    found = refit(several, robot, judge=True)
+    assert (len(found.judged[0]), found.kept) == (3, True)
+    assert (found.judged[1] < 0.5 * found.judged[0]).all()
+    assert not refit([record(robot, commands(450, seed), f"m{seed}") for seed in range(3)], robot, judge=True).kept

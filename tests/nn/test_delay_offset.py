@@ -1,0 +1,29 @@
+"""The cheap baseline finds what it is made to find."""
+
+import numpy as np
+from arm import commands, record, write_arm
+
+from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.sim.replay import replay
+
+
+def test_a_delay_of_three_periods_is_found(tmp_path):
+    robot = write_arm(tmp_path)
+    found = DelayOffset.fit([record(robot, commands(400, s), f"m{s}", delay=3) for s in range(3)], robot)
+    assert found.delay == {"shoulder": 0.06, "elbow": 0.06}
+    assert max(map(abs, found.offset.values())) < 0.002
+
+
+def test_with_the_true_delay_the_simulator_follows_exactly(tmp_path):
+    robot = write_arm(tmp_path)
+    sequence = record(robot, np.round(commands(80, 1) * 256) / 256, "m", delay=2)
+    values = DelayOffset({"shoulder": 0.04, "elbow": 0.04}, {"shoulder": 0.0, "elbow": 0.0})
+    twin = replay([sequence], robot, values.corrector(robot))[0]
+    np.testing.assert_allclose(twin.qpos, sequence.qpos, atol=1e-6)
+
+
+def test_pieces_cover_long_sequences(tmp_path):
+    robot = write_arm(tmp_path)
+    sequence = record(robot, commands(2500, 0), "m")
+    assert sum(map(len, DelayOffset.pieces([sequence], seconds=20.0))) == 2500
+    assert sum(map(len, DelayOffset.pieces([sequence] * 40, seconds=20.0, frames=10_000))) < 20_000

@@ -1,0 +1,126 @@
+"""The loop around a network: what it is given and what is made of its answer, the same in training and in free run."""
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.nn.backends import Bound, FunctionNetwork
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.corrector import DeltaCorrector
+from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.observation import Layout
+from gaponet.nn.training.config import RewardConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.sim.replay import replay
+
+LIMITS = np.array([[-10.0, 10.0]] * 2)
+
+
+def corrector(infer, config, robot):
+    return DeltaCorrector(FunctionNetwork(infer, config.input_dim(2), 2), config, robot)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        ModelConfig(),
+        ModelConfig(payload_input=False),
+        ModelConfig(kind="paper", sensor_source="fixed", real_state=True),
+    ],
+)
+def test_the_parts_of_x_touch_and_fill_it(config):
+    layout = Layout(config, 3)
+    parts = [layout.q, layout.v, layout.past, layout.payload, layout.action, layout.sensors, layout.real]
+    assert np.concatenate([np.arange(layout.dim)[part] for part in parts]).tolist() == list(range(layout.dim))
+
+
+class FirstRow:
+    """In a generator's place: every environment starts at its motion's first row."""
+
+    def random(self, size):
+        return np.zeros(size)
+
+    def integers(self, low, high):
+        return low
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"stride": 2}, {"kind": "paper", "sensor_hold": 3}, {"kind": "paper", "sensor_source": "fixed"},
+        {"kind": "paper", "sensor_source": "fixed", "sensor_hold": 2},
+    ],
+    ids=["stride", "held sensors", "fixed probes", "held probes"],
+)  # fmt: skip
+def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
+    robot = write_arm(tmp_path)
+    config = ModelConfig(history=2, num_probes=3, **how)
+    sequence = recordings(robot, 2, rows=14, kp=0.6)[1:]
+    free: list = []
+
+    def infer(x):
+        free.append(x.copy())
+        return np.full((1, 2), 0.01, np.float32)
+
+    replay(sequence, robot, corrector(infer, config, robot), nthread=1)
+    env = DeltaEnv(sequence, robot, config, 1, 1000, RewardConfig(), nthread=1)
+    env.rng = FirstRow()
+    env.reset()
+    trained = []
+    while env.row[0] < env.last[0]:
+        trained.append(env.get_observations()["actor"].numpy())
+        env.advance(np.full((1, 2), 0.01, np.float32))
+    assert len(trained) == 13
+    np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
+
+
+class TorchRule:
+    """A rule that looks at all of x, on torch buffers; and the same rule on numpy's."""
+
+    def __init__(self, config):
+        self.dim = config.input_dim(2)
+        self.weights = np.random.default_rng(0).normal(0, 0.1, (self.dim, 2)).astype(np.float32)
+
+    def numpy(self):
+        return FunctionNetwork(lambda x: x @ self.weights, self.dim, 2)
+
+    def bind(self, batch):
+        x, delta, weights = torch.zeros(batch, self.dim), torch.zeros(batch, 2), torch.from_numpy(self.weights)
+        return Bound(x, delta, lambda: delta.copy_(x @ weights))
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("when", [0, 5])
+@pytest.mark.parametrize("tensors", [False, True])
+def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(bad, when, tensors):
+    config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
+    rule, rng = TorchRule(config), np.random.default_rng(1)
+    kind = torch.from_numpy if tensors else np.asarray
+    hit, clean = (DeltaLoop(config, limits, 3, rule if tensors else rule.numpy()) for _ in range(2))
+    for t in range(10):
+        q, v, a = rng.normal(0, 0.3, (3, 3, 2)).astype(np.float32)
+        held, payload = a.copy(), np.zeros(3, np.float32)
+        if t == when:
+            held[1, 0] = np.asarray(clean.applied)[1, 0] if t else q[1, 0]
+            a[1, 0] = bad
+        told = [loop.delta(*map(kind, (q, v, ctrl, payload))) for loop, ctrl in ((hit, a), (clean, held))]
+        np.testing.assert_array_equal(*map(np.asarray, told))
+        np.testing.assert_array_equal(*(np.asarray(loop.applied) for loop in (hit, clean)))
+
+
+@pytest.mark.parametrize("change", [{}, {"stride": 3}, {"payload_input": False}])
+def test_torch_and_numpy_arrays_give_the_same_corrections(change):
+    config = ModelConfig(**{"history": 3} | change)
+    rule, rng = TorchRule(config), np.random.default_rng(1)
+    limits = np.array([[-0.3, 0.3], [-10.0, 10.0]])
+    host, tensors = DeltaLoop(config, limits, 4, rule.numpy()), DeltaLoop(config, limits, 4, rule)
+    for t in range(25):
+        q, v, a = rng.normal(0, 0.3, (3, 4, 2)).astype(np.float32)
+        payload = rng.uniform(0, 3, 4).astype(np.float32)
+        if t == 9:
+            host.reset(np.array([1, 3]))
+            tensors.reset(np.array([1, 3]))
+        theirs = tensors.delta(*(torch.from_numpy(values) for values in (q, v, a, payload)))
+        np.testing.assert_allclose(theirs.numpy(), host.delta(q, v, a, payload), atol=1e-6)
+        np.testing.assert_allclose(tensors.x.numpy(), host.x, atol=1e-6)

@@ -1,0 +1,81 @@
+"""The observation, number by number."""
+
+import numpy as np
+import pytest
+import torch
+
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.observation import History, Layout
+from gaponet.robot.spec import load_robot
+
+
+@pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
+def test_dimensions_are_the_papers(history, dim):
+    assert ModelConfig(history=history, payload_input=False).observation_dim(10) == dim
+    assert ModelConfig(history=4, payload_input=True).observation_dim(10) == 141
+
+
+@pytest.mark.parametrize(("history", "dim"), [(2, 80), (4, 140), (6, 200), (8, 260)])
+def test_so_they_are_of_the_h1_2(history, dim):
+    robot = load_robot("h1_2")
+    n = len(robot.operated)
+    for payload in (0, 1):
+        config = ModelConfig(history=history, payload_input=bool(payload))
+        assert Layout(config, n).observation.stop == dim + payload
+        assert DeltaLoop(config, robot.qpos_range[robot.operated_index], 1).x.shape == (1, dim + payload + n)
+
+
+def test_layout_is_state_then_frames_newest_first_then_payload_and_action():
+    loop = DeltaLoop(ModelConfig(history=2, payload_max=2.0), np.array([[-9.0, 9.0]]), num_envs=1)
+    loop.begin(slice(None), *np.full((3, 1, 1, 1), 9.0))
+    one = lambda value: np.array([[value]])  # noqa: E731
+    loop.push(one(1.0), one(2.0), one(3.0))
+    loop.push(one(4.0), one(5.0), one(6.0))
+    x = loop.observe(one(7.0), one(8.0), one(10.0), np.array([1.0]))
+    np.testing.assert_array_equal(x, [[7, 8, 4, 5, 6, 1, 2, 3, 0.5, 10]])
+
+
+@pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
+@pytest.mark.parametrize(("stride", "seen"), [(1, [5, 4, 3]), (3, [5, 2, -1])])
+def test_frames_are_the_last_ones_a_stride_apart(make, stride, seen):
+    config = ModelConfig(history=3, stride=stride)
+    x = make((2, config.input_dim(1)))
+    history, one = History(config, 1, x), make((2, 1)) + 1
+    history.reset(slice(None), *(one[:, None] * (-1 - k) for k in range(3)))
+    for k in range(1, 6):
+        history.push(k * one, 10 * k * one, 100 * k * one)
+    history.write()
+    frames = np.asarray(x)[:, Layout(config, 1).past].reshape(2, 3, 3)
+    assert frames[0, :, 0].tolist() == seen
+    assert frames[1, :2, 2].tolist() == [100 * k for k in seen[:2]]
+
+
+@pytest.mark.parametrize("make", [np.zeros, torch.zeros], ids=["numpy", "torch"])
+@pytest.mark.parametrize("stride", [1, 3])
+@pytest.mark.parametrize("seed", range(5))
+def test_history_is_what_a_list_of_past_frames_says_whatever_is_pushed_and_reset(make, stride, seed):
+    rng, n, num = np.random.default_rng(seed), 2, 4
+    config = ModelConfig(history=int(rng.integers(1, 5)), stride=stride)
+    x = make((num, config.input_dim(n)))
+    own = lambda values: values if make is np.zeros else torch.from_numpy(values).float()  # noqa: E731
+    history = History(config, n, x)
+    past = [[np.zeros(3 * n, np.float32)] * history.depth for _ in range(num)]
+    for _ in range(30):
+        if rng.random() < 0.3:
+            ids = np.flatnonzero(rng.random(num) < 0.5)
+            frames = rng.random((len(ids), history.depth, 3 * n)).astype(np.float32)
+            history.reset(ids, *(own(part) for part in np.split(frames, 3, axis=2)))
+            for i, mine in zip(ids, frames, strict=True):
+                past[i] = list(mine)
+        else:
+            frame = rng.random((num, 3 * n)).astype(np.float32)
+            history.push(*(own(part) for part in np.split(frame, 3, axis=1)))
+            past = [[new, *old[:-1]] for new, old in zip(frame, past, strict=True)]
+        history.write()
+        want = [np.concatenate(frames[::stride]) for frames in past]
+        np.testing.assert_array_equal(np.asarray(x)[:, Layout(config, n).past], want)
+
+
+def test_history_at_the_start_is_the_first_frame_repeated():
+    assert History.rows_before(np.array([0, 2]), 3).tolist() == [[0, 0, 0], [1, 0, 0]]

@@ -1,0 +1,349 @@
+"""The paper's network: its dimensions, the weights that its authors published, and what it is when it ships."""
+
+import copy
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.base.errors import ModelError, UsageError
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.backends import FunctionNetwork
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.nn.paper import released_inputs, released_network
+from gaponet.nn.sensor import ProbeOracle
+from gaponet.nn.training.budget import Budget
+from gaponet.nn.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.ppo import Learner
+from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.sensor_fit import fit_inputs
+from gaponet.report.evaluate import evaluate
+from gaponet.robot.spec import load_robot
+from gaponet.sim.replay import replay
+
+PAPER = ModelConfig(kind="paper", num_probes=4, history=2)
+
+
+def network(config=PAPER, n=2):
+    """One whose trunk answers something."""
+    torch.manual_seed(0)
+    net = build_network(config, n)
+    torch.nn.init.normal_(net.trunk[-1].weight, std=0.02)
+    return net.eval()
+
+
+@pytest.mark.parametrize(
+    ("history", "payload", "trunk", "seen", "asked"),
+    [(2, False, True, 80, 10), (4, False, True, 140, 10), (6, False, True, 200, 10), (8, False, True, 260, 10),
+     (4, True, True, 141, 11), (4, True, False, 141, 10)],
+)  # fmt: skip
+def test_inputs_have_the_dimensions_of_table_2(history, payload, trunk, seen, asked):
+    net = build_network(ModelConfig(kind="paper", history=history, payload_input=payload, payload_trunk=trunk), 10)
+    assert net.predictor.net[0].in_features == seen
+    assert net.branch[0].in_features == 20 * 2 * 10
+    assert net.trunk[0].in_features == asked
+    assert net.branch[-2].out_features == net.trunk[-1].out_features == 16 * 10
+    assert build_network(net.config, 10)(torch.randn(3, net.config.input_dim(10))).abs().max() == 0
+
+
+def test_the_published_weights_give_the_published_outputs(paper_network):
+    net, pairs = released_network(dict(np.load(paper_network / "weights.npz"))), np.load(paper_network / "pairs.npz")
+    with torch.inference_mode():
+        delta = net(released_inputs(pairs["model_obs"], pairs["action"])).numpy()
+    assert np.abs(delta - pairs["delta"]).max() < 1e-6
+    assert np.abs(pairs["delta"]).max() > 0.1
+
+
+def test_the_published_predictor_answers_the_probes_in_one_order_of_joints(paper_network, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    import released_network as benchmark
+
+    monkeypatch.setattr(benchmark, "STATES", 20)
+    net, robot = released_network(dict(np.load(paper_network / "weights.npz"))), load_robot("h1_2")
+    order, _ = benchmark.inferred_order(net, *benchmark.random_states(net, robot, 0.02))
+    left, right = (robot.operated[5 * arm :][:5] for arm in (0, 1))
+    arms = [arm[i] for arm in (left, right) for i in (0, 2, 1, 3)]  # pitch, yaw, roll, elbow
+    assert [robot.operated[j] for j in order] == [*arms, left[4], right[4]]
+
+
+def test_the_branch_sees_sensor_values_alone():
+    net = network()
+    x = torch.randn(5, net.config.input_dim(2))
+    other = torch.cat([torch.randn(5, net.config.observation_dim(2) - 1), x[:, -3:]], dim=1)
+    assert not torch.allclose(net(x), net(other))
+    for p in net.predictor.net[-1].parameters():
+        torch.nn.init.zeros_(p)
+    assert torch.equal(net(x), net(other))
+
+
+def test_sensors_are_sampled_in_training_and_the_mean_otherwise():
+    net, x = network(), torch.randn(1, PAPER.input_dim(2)).expand(4000, -1)
+    with torch.inference_mode():
+        z = net.sensor_inputs(x)
+        mean = net.sensors(x, z)
+        sample = net.train().sensors(x, z)
+        _, log_var = net.predictor(z)
+    assert torch.equal(mean[0], mean[1])
+    assert torch.allclose(sample.mean(0), mean[0], atol=0.1)
+    assert torch.allclose(sample.var(0), log_var[0].exp(), rtol=0.15)
+
+
+def test_the_limit_changes_no_correction_within_it():
+    net, x = network(), torch.randn(50, PAPER.input_dim(2))
+    with torch.inference_mode():
+        prepared = net.prepare(x)
+        raw = net.train().correct(prepared)
+        small = network(replace(PAPER, delta_max=float(raw.abs().median())))
+        limited = small.correct(prepared)
+    within = raw.abs() < small.config.delta_max
+    assert 0.3 < within.float().mean() < 0.7
+    assert torch.equal(limited[within], raw[within])
+    assert torch.allclose(limited[~within].abs(), torch.tensor(small.config.delta_max))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"payload_input": False}, {"payload_trunk": False}, {"delta_hold": 3}, {"sensor_hold": 5}, {"stride": 2},
+     {"sensor_source": "learned"}, {"branch_observation": True, "relative_action": True, "real_state": True}],
+)  # fmt: skip
+def test_the_artifact_answers_as_the_network(tmp_path, how):
+    config, robot = replace(PAPER, **how), write_arm(tmp_path / "arm")
+    net = network(config)
+    assert export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net)) <= 1e-5
+    model = GapModel.load(tmp_path / "run")
+    assert model.config == config
+    x = torch.randn(7, config.input_dim(2))
+    with torch.inference_mode():
+        np.testing.assert_allclose(model.infer(x.numpy()), net(x).numpy(), atol=1e-6)
+    assert model.loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1).shape == (2,)
+
+
+def loop(infer, **how):
+    config = replace(PAPER, **how)
+    return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, FunctionNetwork(infer, config.input_dim(2), 2))
+
+
+def test_a_correction_is_held_for_its_duration_and_begins_anew_after_a_reset():
+    count = iter(range(100))
+    held = loop(lambda x: np.full((2, 2), next(count), np.float32), delta_hold=3)
+    zero = np.zeros((2, 2))
+    seen = []
+    for t in range(8):
+        if t == 4:
+            held.reset(np.array([1]))
+        seen.append(held.delta(zero, zero, zero, 0.0)[:, 0])
+    assert np.array(seen).T.tolist() == [[0, 0, 0, 3, 3, 3, 6, 6], [0, 0, 0, 3, 4, 4, 4, 7]]
+
+
+def test_held_sensors_see_the_observation_of_the_last_refresh_and_the_trunk_the_present_action():
+    inputs = []
+    held = loop(lambda x: inputs.append(x.copy()) or np.zeros((2, 2), np.float32), sensor_hold=3)
+    for t in range(6):
+        held.delta(*np.full((3, 2, 2), float(t)), 0.0)
+    inputs = np.array(inputs)[:, 0]
+    at = held.layout
+    assert inputs[:, at.q.start].tolist() == [0, 0, 0, 3, 3, 3]
+    assert inputs[:, at.past.start].tolist() == [0, 0, 0, 2, 2, 2]
+    assert inputs[:, at.action.start].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_an_absolute_sensor_value_is_the_next_state(tmp_path):
+    robot = write_arm(tmp_path)
+    q, v = np.array([[0.2, -0.1]]), np.array([[0.5, -0.3]])
+    change, state = (
+        ProbeOracle(robot, replace(PAPER, sensor_target=form), [(0.0, "both", 0.02)])(q, v)
+        for form in ("delta", "absolute")
+    )
+    np.testing.assert_allclose(state - change, np.tile(np.concatenate([q, 0.02 * v], 1), (1, 4, 1)), atol=1e-6)
+
+
+def test_answers_of_the_simulator_are_what_the_branch_sees_and_no_control_loop_has_them(tmp_path):
+    config, robot = replace(PAPER, sensor_source="fixed"), write_arm(tmp_path / "arm")
+    net = network(config)
+    assert config.input_dim(2) == PAPER.input_dim(2) + 4 * 2 * 2
+    x = torch.randn(5, config.input_dim(2))
+    assert torch.equal(net.prepare(x)[:, -16:], x[:, -16:])
+    assert net.predictor is None
+    export(net, tmp_path / "run", make_card(config, robot, dt=[0.02]), drawn_states(net))
+    model = GapModel.load(tmp_path / "run")
+    with pytest.raises(ModelError, match="for gaponet eval alone"):
+        model.loop()
+    (twin,) = replay(recordings(robot, 1, rows=20), robot, model.corrector(robot), nthread=1)
+    assert np.isfinite(twin.qpos).all()
+
+
+def test_learned_probes_start_at_the_fixed_ones_and_gradients_reach_them_alone():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config).train(), torch.randn(9, config.input_dim(2))
+    start = (config.probe_limit * net.probes.tanh()).detach()
+    np.testing.assert_allclose(start, ProbeOracle.offsets_of(config, 2), atol=1e-6)
+    net.predictor.requires_grad_(False)
+    prepared = net.prepare(x)
+    assert not prepared.requires_grad
+    assert torch.equal(net.correct(prepared), net.correct(prepared))  # one sample per state
+    net.correct(prepared).sum().backward()
+    assert (net.probes.grad.abs().sum(1) > 0).all()
+
+
+def test_learned_sensors_are_the_predictor_s_answers_to_each_probe():
+    config = replace(PAPER, sensor_source="learned")
+    net, x = network(config), torch.randn(9, config.input_dim(2))
+    z = net.sensor_inputs(x)
+    each = [net.predictor.mean(torch.cat([z, probe.tanh().expand(9, 2)], dim=1)) for probe in net.probes]
+    assert torch.allclose(net.probed(net.sensors(x, z)), torch.cat(each, dim=1), atol=1e-5)
+
+
+def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.STEPS", 200)
+    config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
+    net = network(config)
+    start, learner = net.probes.clone(), Learner(env, net, TRAINING.ppo)
+    assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
+    fitted = copy.deepcopy(net.predictor.state_dict())
+    learner.update()
+    assert not torch.isclose(net.probes, start).any()
+    assert all(torch.equal(x, fitted[name]) for name, x in net.predictor.state_dict().items())
+
+
+def test_the_branch_sees_the_observation_and_the_trunk_the_lag_where_switches_say_so():
+    net = network(replace(PAPER, branch_observation=True, relative_action=True))
+    x = torch.randn(5, net.config.input_dim(2))
+    relative = net.features(x)
+    assert torch.equal(net.prepare(x)[:, :3], relative[:, -3:])  # payload and A − q
+    assert torch.equal(net.prepare(x)[:, 3 : 3 + net.config.observation_dim(2)], relative[:, : net.seen.stop])
+    assert net.branch[0].in_features == net.config.observation_dim(2) + 16
+
+
+def test_an_unknown_recorded_state_is_no_input_and_a_known_one_is():
+    net, plain = network(replace(PAPER, real_state=True)), network()
+    state = net.state_dict()
+    state["branch.0.weight"] = state["branch.0.weight"][:, 5:]
+    plain.load_state_dict(state)
+    x = torch.randn(5, PAPER.input_dim(2))
+    hidden, known = (torch.cat([x, part], dim=1) for part in (torch.zeros(5, 5), torch.ones(5, 5)))
+    assert torch.allclose(net(hidden), plain(x), atol=1e-6)
+    assert not torch.allclose(net(known), net(hidden), atol=1e-4)
+
+
+def test_half_of_the_episodes_show_the_recorded_state(tmp_path):
+    config, robot = replace(PAPER, real_state=True), write_arm(tmp_path)
+    env = DeltaEnv(recordings(robot, 2, rows=30), robot, config, 200, 1000, RewardConfig(), nthread=1)
+    env.sim.qpos[:] -= 0.1
+    real = env.get_observations()["actor"][:, env.loop.layout.real]
+    shown = real[:, 4] == 1
+    assert 60 < shown.sum() < 140
+    assert not real[~shown].any()
+    assert torch.allclose(real[shown][:, :4], torch.tensor([0.1, 0.1, 0, 0]), atol=1e-6)
+    env.reset()
+    assert not torch.equal(env.get_observations()["actor"][:, -1] == 1, shown)
+
+
+def test_a_loop_shows_what_it_is_given_beside_the_observation_and_else_zeros():
+    seen = []
+    given = loop(
+        lambda x: seen.append(x[0, -21:].copy()) or np.zeros((2, 2), np.float32), sensor_source="fixed", real_state=True
+    )
+    for width in (0, 16, 21):  # nothing, the simulator's answers, these and the recorded state
+        given.extra = (lambda: np.ones((2, width))) if width else None  # noqa: B023
+        given.delta(*np.zeros((3, 2, 2)), 0.0)
+    assert np.array(seen).tolist() == [[1] * width + [0] * (21 - width) for width in (0, 16, 21)]
+
+
+def test_other_networks_refuse_the_paper_s_switches():
+    for how in (
+        {"delta_hold": 3},
+        {"sensor_hold": 3},
+        {"sensor_target": "absolute"},
+        {"payload_trunk": False},
+        {"sensor_source": "learned"},
+        {"branch_observation": True},
+        {"relative_action": True},
+        {"real_state": True},
+    ):
+        with pytest.raises(UsageError, match="use --model paper"):
+            build_network(ModelConfig(**how), 2)
+    with pytest.raises(UsageError, match="hold one of them"):
+        replace(PAPER, delta_hold=3, sensor_hold=3)
+
+
+TRAINING = TrainConfig(
+    PAPER,
+    warm_start=WarmStartConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
+    ppo=PPOConfig(num_envs=8, num_steps=8, mini_batches=2, epochs=1, critic_warmup=0, explained=-1e9, refit_sensors=2,
+                  critic_hidden=(16,)),
+    episode_s=0.5, validate_every=2, threads=1,
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def few_gradient_steps(monkeypatch):
+    monkeypatch.setattr("gaponet.nn.training.sensor_fit.STEPS", 20)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    place = tmp_path_factory.mktemp("world")
+    robot = write_arm(place / "arm")
+    data = Dataset.create(place / "data", robot)
+    for sequence in recordings(robot, 8, rows=60, kp=0.5):
+        data.append(sequence)
+    return data, robot
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"delta_hold": 3}, {"sensor_hold": 3}, {"sensor_source": "fixed", "sensor_hold": 3},
+     {"sensor_source": "learned"}, {"branch_observation": True, "real_state": True}],
+    ids=["plain", "action", "sensors", "fixed", "learned", "beside"],
+)  # fmt: skip
+def test_it_trains_by_ppo_alone_and_a_resumed_run_equals_one_that_was_not_stopped(world, tmp_path, how):
+    config = replace(TRAINING, model=replace(PAPER, **how)).paper_recipe()
+    update = 8 * 8 * config.model.delta_hold
+    run = tmp_path / "whole"
+    model = Trainer(*world, run, config, Budget(steps=4 * update)).run()
+    assert GapModel.how_trained(model.card) == "4 updates of PPO from the untrained network, no supervised start"
+    assert model.card["steps"] == 4 * update
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=2 * update)).run()
+    Trainer(*world, tmp_path / "parts", config, Budget(steps=4 * update), resume=True).run()
+    whole, parts = (torch.load(r / "checkpoint.pt", weights_only=True)["net"] for r in (run, tmp_path / "parts"))
+    assert all(torch.equal(x, parts[name]) for name, x in whole.items())
+    untrained = build_network(config.model, 2)
+    assert whole.keys() == untrained.state_dict().keys()
+
+
+def test_it_trains_by_labels_too_and_eval_says_how_many_corrections_are_at_the_limit(world, tmp_path, capsys):
+    run = tmp_path / "run"
+    card = Trainer(*world, run, TRAINING, Budget(steps=8 * 30 + 2 * 64)).run().card
+    assert GapModel.how_trained(card) == "supervised start (1 rounds), 2 updates of PPO"
+    result = evaluate([run], *world).result
+    assert list(result["methods"]) == ["nominal", "delay_offset", "paper"]
+    assert result["delta"]["paper"]["at_limit"] == 0
+    net = network(replace(PAPER, delta_max=1e-3))
+    export(net, run / "model", card | {"model": asdict(net.config)}, drawn_states(net))
+    assert evaluate([run], *world).result["delta"]["paper"]["at_limit"] > 0.5
+    assert main(["eval", str(run), str(world[0].path)]) == 0
+    assert "of the corrections are at the limit (--model.delta-max)" in capsys.readouterr().out
+
+
+def test_a_refitted_predictor_keeps_the_units_that_the_branch_has_learned(world, tmp_path):
+    fitted = []
+    for every in (0, 2):
+        config = replace(TRAINING, ppo=replace(TRAINING.ppo, refit_sensors=every))
+        config = replace(config, warm_start=replace(config.warm_start, rounds=0))
+        trainer = Trainer(*world, tmp_path / f"run{every}", config, Budget(steps=2 * 64))
+        trainer.run()
+        fitted.append(trainer.net.predictor.state_dict())
+    once, again = fitted
+    assert not torch.equal(once["net.0.weight"], again["net.0.weight"])
+    assert torch.equal(once["outputs.mean"], again["outputs.mean"])
+    assert torch.equal(once["outputs.std"], again["outputs.std"])

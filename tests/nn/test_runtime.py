@@ -1,0 +1,220 @@
+"""The model at run time: numpy, onnxruntime and TorchScript answer alike; the loop is the corrector's."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.base.errors import ModelError, UsageError
+from gaponet.export.program import export_program
+from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.fuse import FusedNet, fuse
+from gaponet.nn.fused import FusedForward
+from gaponet.nn.onnx_export import drawn_states, export
+
+SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
+
+
+def trained(n: int = 2, **how) -> torch.nn.Module:
+    """A network with no weight left at zero or one."""
+    torch.manual_seed(0)
+    net = build_network(ModelConfig(**SMALL | how), n)
+    with torch.no_grad():
+        for p in net.parameters():
+            p.add_(0.1 * torch.randn_like(p))
+    net.features.standardise.mean.normal_()
+    net.features.standardise.std.uniform_(0.05, 1.0)
+    net.bounded.gain.fill_(0.75)
+    return net.eval()
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def artifact(robot, tmp_path_factory):
+    net = trained(stride=2)
+    folder = tmp_path_factory.mktemp("run") / "model"
+    export(net, folder, make_card(net.config, robot, dt=[0.02]), drawn_states(net))
+    return folder
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {}, {"sensors": "predicted"}, {"payload_input": False},
+        {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensors": "predicted", "sensor_hidden": (16,)},
+        {"branch_hidden": (16, 8), "trunk_hidden": (8,)}, {"kind": "shared_mlp"},
+        {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
+    ],
+)  # fmt: skip
+def test_the_fused_form_is_the_network(how):
+    net = trained(n=3, **how)
+    x = drawn_states(net, 20)
+    weights = fuse(net)
+    with torch.inference_mode():
+        expected = net(torch.from_numpy(x)).numpy()
+        np.testing.assert_allclose(FusedNet(weights)(torch.from_numpy(x)).numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(FusedForward(weights, 20)(x), expected, atol=1e-6)
+    assert np.abs(expected).mean() > 1e-3
+
+
+def test_a_large_batch_is_its_rows(artifact):
+    for backend in ("onnxruntime", "numpy"):
+        network = GapModel.load(artifact, backend).infer
+        one, many = network.bind(1), network.bind(150)
+        many.x[:] = np.random.default_rng(0).normal(0, 0.3, many.x.shape)
+        many.run()
+        for row in (0, 63, 64, 149):
+            one.x[:] = many.x[row]
+            one.run()
+            np.testing.assert_allclose(one.delta[0], many.delta[row], atol=1e-6)
+
+
+def test_drawn_states_have_the_statistics_trained_on():
+    net = trained()
+    z = net.features.standardise(net.features.relative(torch.from_numpy(drawn_states(net, 4000))))
+    assert abs(float(z.mean())) < 0.05
+    assert abs(float(z.std()) - 1) < 0.05
+
+
+def test_numpy_answers_as_onnxruntime_step_by_step_and_in_batches(artifact):
+    models = GapModel.load(artifact), GapModel.load(artifact, "numpy")
+    rng = np.random.default_rng(0)
+    for num_envs in (1, 5):
+        a, b = (model.loop(num_envs) for model in models)
+        for _ in range(6):
+            q, v, u = rng.normal(0, 0.5, (3, num_envs, 2))
+            np.testing.assert_allclose(a.delta(q, v, u, 0.1), b.delta(q, v, u, 0.1), atol=1e-6)
+
+
+def test_numpy_needs_neither_the_onnx_file_nor_onnxruntime(artifact, tmp_path, monkeypatch):
+    for name in ("card.json", "weights.npz"):
+        (tmp_path / name).write_bytes((artifact / name).read_bytes())
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    assert GapModel.load(tmp_path, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0).shape == (2,)
+    with pytest.raises(ModelError, match=r"no model\.onnx"):
+        GapModel.load(tmp_path)
+    with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]', or load with backend='numpy'"):
+        GapModel.load(artifact)
+
+
+def test_without_weights_numpy_says_how_to_get_them(artifact, tmp_path):
+    (tmp_path / "card.json").write_bytes((artifact / "card.json").read_bytes())
+    with pytest.raises(ModelError, match="gaponet export RUN"):
+        GapModel.load(tmp_path, "numpy")
+    (tmp_path / "weights.npz").write_bytes((artifact / "weights.npz").read_bytes()[:300])
+    with pytest.raises(ModelError, match="not readable"):
+        GapModel.load(tmp_path, "numpy")
+
+
+def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
+    class Other(type(trained())):
+        """A kind that fuse does not know."""
+
+    net = Other(trained().config, 2).eval()
+    net.load_state_dict(trained().state_dict())
+    assert fuse(net) is None
+    export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), drawn_states(net))
+    assert not (tmp_path / "weights.npz").exists()
+    assert np.isfinite(GapModel.load(tmp_path).loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"kind": "transformer"},
+        {"kind": "mlp", "mlp_match": True},
+    ],
+)  # fmt: skip
+def test_every_kind_of_network_ships(robot, tmp_path, how):
+    net = trained(**how)
+    x = torch.randn(20, net.config.input_dim(2)).numpy()
+    assert export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), x) <= 1e-5
+    model = GapModel.load(tmp_path)
+    assert model.loop().delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
+
+
+def test_a_loop_of_ones_own_gets_what_replay_applies(artifact, robot):
+    model = GapModel.load(artifact)
+    sequences = recordings(robot, 3, rows=30)
+    corrector, loop = model.corrector(robot), model.loop(3)
+    corrector.reset(sequences)
+    for t in range(29):
+        q, v, a = (np.stack([getattr(s, name)[t] for s in sequences]) for name in ("qpos", "qvel", "ctrl"))
+        delta = loop.delta(q, v, a, np.array([s.meta.payload_mass for s in sequences]))
+        np.testing.assert_allclose(a + delta, corrector.correct(t, a, q, v), atol=1e-7)
+
+
+def test_one_robot_among_several_begins_anew(artifact):
+    loop = GapModel.load(artifact).loop(2)
+    q, v, a = np.random.default_rng(1).normal(0, 0.5, (3, 2, 2))
+    first = loop.delta(q, v, a, 0.0)
+    later = loop.delta(q, v, a, 0.0)
+    loop.reset(np.array([0]))
+    again = loop.delta(q, v, a, 0.0)
+    np.testing.assert_array_equal(again[0], first[0])
+    assert not np.array_equal(later, first)
+    assert not np.array_equal(again[1], first[1])
+
+
+def test_robots_that_share_a_model_do_not_share_a_past(artifact):
+    model = GapModel.load(artifact)
+    states = np.random.default_rng(2).normal(0, 0.5, (20, 2, 3, 2))
+    alone = []
+    for robot in range(2):
+        loop = model.loop()
+        alone.append([loop.delta(*state, 0.0) for state in states[:, robot]])
+    loops = model.loop(), model.loop()
+    for t, pair in enumerate(states):
+        for robot in range(2):
+            np.testing.assert_array_equal(loops[robot].delta(*pair[robot], 0.0), alone[robot][t])
+
+
+def test_a_correction_never_leaves_the_joint_limits(artifact, robot):
+    model = GapModel.load(artifact)
+    np.testing.assert_array_equal(model.qpos_range, robot.qpos_range)
+    edge, loop = robot.qpos_range[:, 1], model.loop()
+    for _ in range(5):
+        delta = loop.delta(edge - 0.1, np.zeros(2), edge, 0.0)
+        assert (edge + delta <= edge).all()
+
+
+def test_other_shapes_are_refused(artifact):
+    loop = GapModel.load(artifact).loop()
+    loop.delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.0)
+    with pytest.raises(UsageError, match=r"2 operated joints of 1 robots.*model\.loop\(num_envs\)"):
+        loop.delta(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)), 0.0)
+    with pytest.raises(UsageError, match="give the 2 operated joints"):
+        loop.delta(np.zeros(3), np.zeros(2), np.zeros(2), 0.0)
+
+
+def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    for file in artifact.iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    np.savez(folder / "weights.npz", **fuse(trained(stride=2, num_basis=4)))
+    with pytest.raises(ModelError, match=r"torch.export and .* differ by"):
+        export_program(GapModel.load(folder), folder, tmp_path)
+    assert not (tmp_path / "delta.pt2").exists()
+
+
+def test_a_card_with_switches_of_an_earlier_version_is_read_where_they_had_the_value_that_is_left(artifact):
+    def written(**fields):
+        card = json.loads((artifact / "card.json").read_text())
+        card["model"] |= fields
+        (artifact / "card.json").write_text(json.dumps(card))
+        return GapModel.load(artifact)
+
+    assert (
+        written(sensor_hold=1, context="none", branch="unstacked", payload_trunk=True, coupling="posture").loop().n == 2
+    )
+    with pytest.raises(ModelError, match="trained with branch stacked, which is no more; train again"):
+        written(branch="stacked")

@@ -1,0 +1,145 @@
+"""The training environment against the row convention and the replay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.base.errors import UsageError
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.training.config import RewardConfig, WarmStartConfig
+from gaponet.nn.training.env import AHEAD, DeltaEnv
+from gaponet.nn.training.warm_start import WarmStart
+from gaponet.sim.batch import Condition
+from gaponet.sim.replay import replay
+
+
+@pytest.fixture
+def robot(tmp_path):
+    return write_arm(tmp_path)
+
+
+def make(robot, sequences, num_envs=8, steps=1000, **reward):
+    return DeltaEnv(
+        sequences, robot, ModelConfig(history=2), num_envs, steps, RewardConfig(**reward), seed=0, nthread=1
+    )
+
+
+def test_without_correction_the_environment_is_the_replay(robot):
+    sequences = recordings(robot, 2, rows=60, kp=0.6)
+    env = make(robot, sequences)
+    for i in range(env.num_envs):  # put everyone at a motion's first row
+        env.row[i] = env.here[i] = env.first[i]
+    env.sim.reset(slice(None), env.qpos[env.row], env.qvel[env.row])
+    first = env.first.copy()
+    for _ in range(59):
+        env.advance(np.zeros((env.num_envs, 2)))
+    twins = replay(sequences, robot)
+    for i in range(env.num_envs):
+        twin = twins[int(np.flatnonzero(env.seq_first == first[i])[0])]
+        np.testing.assert_array_equal(env.sim.qpos[i].astype(np.float32), twin.qpos[59])
+
+
+def test_the_reward_of_a_joint_compares_it_one_row_on(robot):
+    env = make(robot, recordings(robot, 2, rows=60, kp=0.6), position=0.02, cap=0.1)
+    row = env.row.copy()
+    reward, done = env.step(np.zeros((env.num_envs, 2), np.float32))
+    error = np.abs(env.sim.qpos - env.qpos[np.minimum(row + 1, len(env.qpos) - 1)])[~done]
+    assert (error > 0.002).any()
+    assert (error < 0.002).any()
+    np.testing.assert_allclose(reward[~done], -np.minimum(error / 0.02, 0.1), rtol=1e-4, atol=1e-6)
+
+
+def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
+    one, other = recordings(robot, 2, rows=60, kp=0.6)
+    said = replace(one.meta, notes={"posture": {robot.joint_names[1]: 0.3}})
+    still = np.tile(np.float32([np.nan, 0.3]), (len(one), 1))
+    stands = lambda x, at: np.where(np.isnan(still), x, at)  # noqa: E731
+    one = replace(one, meta=said, ctrl=stands(one.ctrl, 0.3), qpos=stands(one.qpos, 0.3), qvel=stands(one.qvel, 0.0))
+    env = make(robot, [one, other])
+    warm = WarmStart(build_network(env.config, 2), env, np.ones((120, 2), np.float32), WarmStartConfig(steps=3), 0)
+    warm.collect(follow_labels=True)
+    unknown = env.first == env.seq_first[0]
+    assert 0 < unknown.sum() < len(unknown)
+    assert np.isnan(warm.pool_y[0].numpy().reshape(3, -1, 2)[0][unknown, 1]).all()
+    np.testing.assert_allclose(env.sim.qpos[unknown, 1], 0.3, atol=1e-4)  # whatever it carries
+    reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
+    assert (reward[unknown, 1] == 0).all()
+    assert (reward[:, 0] < 0).all()
+    assert (reward[~unknown, 1] < 0).all()
+    fit = WarmStart(warm.net, env, warm.labels, WarmStartConfig(steps=3, gradient_steps=2), 0).round(lambda: 0.0)
+    assert np.isfinite(fit["label_rmse"])
+
+
+def test_a_robot_without_a_gap_earns_no_penalty(robot):
+    env = make(robot, recordings(robot, 2, rows=60))
+    for _ in range(10):
+        reward, _ = env.step(np.zeros((env.num_envs, 2), np.float32))
+    assert reward.min() > -1e-4
+
+
+def test_the_critic_looks_ahead_of_the_simulation(robot):
+    env = make(robot, recordings(robot, 2, rows=60, kp=0.6))
+    seen, n, many = env.get_observations()["critic"].numpy(), 2, len(AHEAD)
+    q, rows = env.sim.qpos, np.minimum(env.row[:, None] + AHEAD, env.last[:, None])
+    np.testing.assert_allclose(seen[:, :n], env.qpos[env.row] - q, atol=1e-6)
+    ahead = seen[:, 2 * n : 2 * n + many * n].reshape(-1, many, n)
+    np.testing.assert_allclose(ahead, env.qpos[rows] - q[:, None], atol=1e-6)
+    commands = seen[:, 2 * n + many * n : 2 * n + 2 * many * n].reshape(-1, many, n)
+    np.testing.assert_allclose(commands, env.ctrl[rows] - q[:, None], atol=1e-6)
+
+
+def test_payload_of_the_log_is_the_payload_of_the_simulation(robot):
+    sequences = recordings(robot, 4, rows=60)
+    env = make(robot, sequences)
+    masses = {env.conditions[g][0] for g in env.group}
+    assert masses == {0.0, 0.2}
+    for i in range(env.num_envs):
+        member = np.flatnonzero(env.seq_first == env.first[i])[0]
+        assert env.conditions[env.group[i]] == Condition.of(sequences[member], robot)
+
+
+def test_motions_are_drawn_in_proportion_to_their_length_as_numpys_choice_does(robot):
+    sequences = [s for rows in (20, 40, 70) for s in recordings(robot, 4, rows=rows)]
+    env, rng = make(robot, sequences, num_envs=64), np.random.default_rng(5)
+    env.rng = np.random.default_rng(5)
+    env.reset()
+    length, drawn = np.array([len(s) for s in sequences]), []
+    for g, condition in enumerate(env.conditions):
+        mine = np.flatnonzero([Condition.of(s, robot) == condition for s in sequences])
+        drawn += rng.choice(mine, size=(env.group == g).sum(), p=length[mine] / length[mine].sum()).tolist()
+    np.testing.assert_array_equal(env.first, env.seq_first[drawn])
+
+
+def test_a_motions_end_is_a_time_out(robot):
+    env = make(robot, recordings(robot, 2, rows=5))
+    seen = 0
+    for _ in range(6):
+        seen += int(env.step(np.zeros((env.num_envs, 2), np.float32))[1].sum())
+    assert seen >= env.num_envs
+
+
+def test_the_actor_never_sees_the_recorded_state(robot):
+    sequences = recordings(robot, 2, rows=60, kp=0.6)
+    env = make(robot, sequences)
+    before = env.get_observations()
+    env.track[:, :4] += 1.0  # recorded q, q̇
+    env.now[:, :4] += 1.0
+    after = env.get_observations()
+    assert torch.equal(before["actor"], after["actor"])
+    assert not torch.equal(before["critic"], after["critic"])
+
+
+def test_a_step_never_runs_past_the_end_of_a_motion(robot):
+    env = DeltaEnv(recordings(robot, 2, rows=10), robot, ModelConfig(), 8, 1000, RewardConfig(), seed=0, nthread=1)
+    for _ in range(12):
+        assert (env.row < env.last).all()
+        env.step(np.zeros((8, 2), np.float32))
+
+
+def test_a_motion_of_one_row_is_refused(robot):
+    with pytest.raises(UsageError, match="motion motion0 has 1 of the 2 rows that a step needs"):
+        DeltaEnv(recordings(robot, 2, rows=1), robot, ModelConfig(), 8, 1000, RewardConfig())

@@ -1,0 +1,115 @@
+"""The training environment on Warp's CPU device: the same numbers as on C MuJoCo's, and none that go to the host."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+from torch.overrides import TorchFunctionMode
+
+from gaponet.base.errors import UsageError
+from gaponet.data.store import Dataset
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.budget import Budget
+from gaponet.nn.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.run import Trainer
+
+pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
+
+STEPS, CASTS = 200, ("array", "bool", "float", "int", "index")
+
+
+def make(folder, device, servo=None, **model):
+    robot = replace(write_arm(folder), **servo or {})
+    sequences = recordings(robot, 4, rows=60, kp=0.6)
+    return DeltaEnv(sequences, robot, ModelConfig(**model), 8, 90, RewardConfig(), 0, 1, device=device)
+
+
+def test_observation_reward_and_done_are_those_of_c_mujoco(tmp_path):
+    ours, theirs = (make(tmp_path, device, history=2, stride=3) for device in ("cpu", "warp-cpu"))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(STEPS):
+        seen, also = ours.get_observations(), theirs.get_observations()
+        for group in seen:
+            torch.testing.assert_close(also[group], seen[group], atol=1e-5, rtol=1e-5)
+        delta = rng.normal(0, 0.01, (8, 2)).astype(np.float32)
+        reward, done = ours.step(delta)
+        like, same = theirs.step(torch.from_numpy(delta))
+        np.testing.assert_allclose(like.numpy(), reward, atol=1e-5 / RewardConfig().position)  # 1e-5 rad
+        np.testing.assert_array_equal(same.numpy(), done)
+        ends += done.sum()
+    assert ends > 8
+    assert theirs.mean_reward() == pytest.approx(ours.mean_reward(), abs=1e-4)
+
+
+class Crossings(TorchFunctionMode):
+    """Notes every way from a tensor to the host, and what else a GPU is waited for: masks as indices, other arrays."""
+
+    WAYS = ("cpu", "numpy", "item", "tolist", "nonzero", "new_tensor", *(f"__{x}__" for x in CASTS))
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        name = getattr(func, "__name__", "")
+        index = args[1] if name in ("__getitem__", "__setitem__") else ()
+        parts = index if isinstance(index, tuple) else (index,)
+        waits = [isinstance(i, np.ndarray) or getattr(i, "dtype", None) == torch.bool for i in parts]
+        if name in self.WAYS or any(waits):
+            self.seen.append((name, args[0].dtype, tuple(args[0].shape)))
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_tensor_that_goes_to_the_host_is_noted():
+    with Crossings() as crossings:
+        assert float(torch.zeros(1)) == 0
+        np.asarray(torch.zeros(2))
+        torch.zeros(2)[torch.zeros(2) > 0]
+        torch.zeros(2, 2)[:, np.array([0])] = 1.0
+    assert len(crossings.seen) >= 4
+
+
+@pytest.mark.parametrize("servo", [{}, {"stribeck": 0.05, "stribeck_speed": 0.2, "delay": [0.03, 0.0]}])
+def test_nothing_goes_to_the_host_in_a_step(tmp_path, servo):
+    env = make(tmp_path, "warp-cpu", servo, history=2, stride=2)
+    delta, resets = torch.zeros(8, 2), 0
+    for _ in range(60):
+        before = env.elapsed.copy()
+        with Crossings() as crossings:
+            env.get_observations()
+            _, done = env.step(delta)
+        assert crossings.seen == []
+        np.testing.assert_array_equal(env.elapsed, np.where(done, 0, before + 1))
+        np.testing.assert_array_equal(env.here, env.row)
+        np.testing.assert_array_equal(env.until, env.last)
+        resets += int(done.sum())
+    assert resets
+
+
+def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
+    robot, data = write_arm(tmp_path / "arm"), tmp_path / "data"
+    dataset = Dataset.create(data, robot)
+    for sequence in recordings(robot, 8, rows=80, kp=0.5, delay=2):
+        dataset.append(sequence)
+    small = TrainConfig(
+        ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
+        warm_start=WarmStartConfig(
+            rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
+        ),
+        ppo=PPOConfig(num_envs=16, num_steps=8, epochs=1, critic_warmup=0, explained=-1e9),
+        device="warp-cpu",
+    )
+    steps = 2 * 16 * 40 + 2 * 16 * 8
+    Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps)).run()
+    model = Trainer(dataset, robot, tmp_path / "run", small, Budget(steps=steps + 256), resume=True).run()
+    assert model.card["stages"]["ppo_updates"] >= 4
+    assert model.card["val_mpjae"]["model"] < 0.9 * model.card["val_mpjae"]["nominal"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused_before_any_time_is_spent():
+    with pytest.raises(UsageError, match="torch sees no GPU"):
+        TrainConfig(device="cuda").network_device()

@@ -1,0 +1,33 @@
+import pytest
+import torch
+
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.training.validation import choose_gain
+
+
+@pytest.mark.parametrize("kind", ["gaponet", "mlp"])
+@pytest.mark.parametrize(("ideal", "chosen"), [(1.3, 1.0), (0.55, 0.5), (0.0, 0.25)])
+def test_the_gain_with_the_least_error_is_kept(kind, ideal, chosen):
+    net = build_network(ModelConfig(kind=kind), 3)
+    assert choose_gain(net, lambda: abs(net.bounded.gain.item() - ideal), abs(1 - ideal)) == chosen
+    assert net.bounded.gain.item() == chosen
+
+
+def test_no_smaller_gain_is_asked_once_one_does_worse():
+    net, asked = build_network(ModelConfig(), 3), []
+
+    def error():
+        asked.append(net.bounded.gain.item())
+        return abs(asked[-1] - 0.8)
+
+    assert choose_gain(net, error, 0.2) == 0.75
+    assert asked == [0.75, 0.5]
+
+
+def test_the_gain_scales_a_small_correction():
+    net = build_network(ModelConfig(kind="mlp"), 2)
+    torch.nn.init.constant_(net.net[-1].bias, 0.01)
+    net.bounded.gain.fill_(0.5)
+    x = torch.zeros(1, net.features.dim)
+    assert net(x)[0].tolist() == pytest.approx([0.005, 0.005], rel=1e-3)

@@ -1,0 +1,55 @@
+"""A run's command says its configuration, and a shell that types it trains the same."""
+
+import shlex
+from dataclasses import replace
+
+import pytest
+
+from gaponet import api
+from gaponet.base.errors import UsageError
+from gaponet.cli.main import main
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.config import PAPER_PPO, PPOConfig, TrainConfig, WarmStartConfig
+
+CHANGED = TrainConfig(
+    ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
+    warm_start=WarmStartConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
+    rates=(50.0, 100.0),
+)  # fmt: skip
+
+
+def test_the_paper_s_recipe_has_no_supervised_start_and_keeps_what_was_changed():
+    config = TrainConfig(ModelConfig(kind="paper"), ppo=PPOConfig(std=0.03), seed=4).paper_recipe()
+    assert config.warm_start.rounds == 0
+    assert config.ppo == replace(PAPER_PPO, std=0.03)
+    assert (config.model.kind, config.seed) == ("paper", 4)
+
+
+def test_a_gpu_has_simulations_of_its_own_number_unless_told():
+    cuda = TrainConfig(ppo=PPOConfig(num_envs=256), device="cuda")
+    assert (TrainConfig().sized().warm_start.num_envs, TrainConfig().sized().ppo.num_envs) == (256, 256)
+    assert (cuda.sized().warm_start.num_envs, cuda.sized().ppo.num_envs) == (4096, 256)
+    assert cuda.options() == cuda.sized().options() == ["--warm-start.num-envs", "4096", "--device", "cuda"]
+    assert TrainConfig().options() == TrainConfig().sized().options() == []
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        TrainConfig(),
+        CHANGED,
+        TrainConfig(ModelConfig(kind="paper", delta_hold=3)).paper_recipe(),
+        replace(TrainConfig(), seed=9).fast(),
+    ],
+)
+def test_the_options_of_a_configuration_give_it_back(monkeypatch, config):
+    heard = []
+
+    def train(dataset, out, budget, config, model, *_):
+        heard.append(replace(config, model=replace(config.model, kind=model)))
+        raise UsageError("heard")
+
+    monkeypatch.setattr(api, "train", train)
+    words = shlex.split(shlex.join(["train", "data", "--out", "run", *config.options()]))
+    assert main(words) == 2
+    assert heard == [config]

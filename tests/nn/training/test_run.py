@@ -1,0 +1,287 @@
+"""Training runs, small: what is kept, what is refused, what survives an interruption."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, record, recordings, write_arm
+
+import gaponet.sim.batch
+from gaponet.base.errors import DatasetError, ModelError, UsageError
+from gaponet.data.pair import require_disjoint
+from gaponet.data.split import split_entries, write_split
+from gaponet.data.store import Dataset
+from gaponet.nn.artifact import GapModel
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.training.budget import Budget
+from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.run import Trainer
+from gaponet.report.evaluate import ORDER, evaluate
+from gaponet.report.methods import METHODS
+from gaponet.report.verdict import LEARNED
+
+SMALL = TrainConfig(
+    model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
+    warm_start=WarmStartConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
+    ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
+    validate_every=4,
+)
+STEPS = Budget(steps=3 * 16 * 60 + 8 * 16 * 16)
+
+
+def dataset(folder, robot, **how):
+    data = Dataset.create(folder, robot)
+    for sequence in recordings(robot, 8, **how):
+        data.append(sequence)
+    return data
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm"))
+
+
+@pytest.fixture(scope="module")
+def trained(robot, tmp_path_factory):
+    place = tmp_path_factory.mktemp("trained")
+    data = dataset(place / "data", robot, kp=0.5, delay=2)
+    return data, place / "run", Trainer(data, robot, place / "run", SMALL, STEPS).run()
+
+
+def test_a_trained_operator_beats_the_nominal_simulator_on_unseen_motions(trained, robot):
+    data, run, _ = trained
+    result = evaluate([run], data, robot).result
+    assert result["unseen"]
+    assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet"]
+    assert result["methods"]["gaponet"]["mpjae"] < 0.7 * result["methods"]["nominal"]["mpjae"]
+
+
+def test_a_run_whose_budget_buys_no_step_fails_and_can_be_resumed(trained, robot, tmp_path):
+    data, _, _ = trained
+    with pytest.raises(ModelError, match=r"the budget ended .* before the first step of training: nothing was learned"):
+        Trainer(data, robot, tmp_path / "run", SMALL, Budget(seconds=1e-6)).run()
+    assert not (tmp_path / "run/model").exists()
+    card = Trainer(data, robot, tmp_path / "run", SMALL, Budget(steps=16 * 60), resume=True).run().card
+    assert GapModel.how_trained(card) == "1 of 3 rounds of the supervised start, no PPO"
+
+
+def test_a_run_takes_its_parts_from_a_split_file(trained, robot, tmp_path):
+    data, _, _ = trained
+    parts = split_entries(data)
+    other = {"train": parts["train"], "val": parts["test"], "test": parts["val"]}
+    path = write_split(data, other, "motion", ("swapped",))
+    config = replace(SMALL, split=str(path))
+    assert Trainer(data, robot, tmp_path / "run", config, STEPS).parts == other
+    with pytest.raises(UsageError, match="leave out --holdout-units, --holdout-payloads, --rates and --train-share"):
+        Trainer(data, robot, tmp_path / "other", replace(config, train_share=0.5), STEPS)
+
+
+@pytest.mark.parametrize("kind", ["mlp", "shared_mlp", "transformer", "inverse"])
+def test_every_kind_trains_and_is_evaluated_as_it_ships(kind, trained, robot, tmp_path):
+    data, run, _ = trained
+    config = replace(
+        SMALL,
+        model=replace(
+            SMALL.model,
+            kind=kind,
+            mlp_hidden=(64,),
+            transformer_width=16,
+            transformer_layers=1,
+        ),
+    )
+    model = Trainer(data, robot, tmp_path / "run", config, STEPS).run()
+    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+    if kind == "inverse":  # one regression, no roll-outs of its own, no PPO
+        assert [line["stage"] for line in lines][:2] == ["start", "warm start"]
+        assert {line["steps"] for line in lines} == {0, 16 * 60}
+    else:
+        assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+        assert model.card["val_mpjae"]["model"] < 0.95 * model.card["val_mpjae"]["nominal"]
+    result = evaluate([run, tmp_path / "run"], data, robot).result
+    assert [m for m in result["methods"] if m in LEARNED] == [kind, "gaponet"]
+    assert set(ORDER) | {"target", "recorded"} <= set(METHODS)
+
+
+def test_the_card_says_what_the_model_is(trained):
+    card = trained[2].card
+    assert card["joint_names"] == ["shoulder", "elbow"]
+    assert card["payload_seen"] == [0.0, 0.2]
+    assert card["virtual"] is True
+    assert card["parity_rad"] <= 1e-5
+    assert card["val_mpjae"]["model"] < card["val_mpjae"]["nominal"]
+
+
+def test_the_kept_model_is_the_best_on_validation(trained):
+    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
+    assert trained[2].card["val_mpjae"]["model"] == min(line["val_mpjae"] for line in lines)
+    assert {line["stage"] for line in lines} - {"gain"} == {"start", "warm start", "ppo"}
+
+
+def test_progress_says_how_far_labels_are_fitted(trained):
+    lines = [json.loads(line) for line in (trained[1] / "progress.jsonl").read_text().splitlines()]
+    fitted = [line for line in lines if line["stage"] == "warm start"]
+    assert all(0 < line["label_rmse"] < 0.1 and line["label_rmse_before"] > 0 for line in fitted)
+    assert fitted[0]["label_rmse"] < fitted[0]["label_rmse_before"]
+
+
+def test_parts_of_the_split_share_no_content(trained):
+    parts = split_entries(trained[0])
+    hashes = [{e.hash for e in entries} for entries in parts.values()]
+    assert sum(map(len, hashes)) == len(set().union(*hashes)) == 8
+
+
+def test_one_recording_under_two_names_in_two_parts_is_refused(robot):
+    a, b = recordings(robot, 1), recordings(robot, 1)
+    with pytest.raises(DatasetError, match="two parts of the split"):
+        require_disjoint(a, b)
+
+
+def test_a_robot_without_a_gap_is_left_alone(robot, tmp_path):
+    data = dataset(tmp_path / "data", robot)
+    Trainer(data, robot, tmp_path / "run", SMALL, STEPS).run()
+    assert evaluate([tmp_path / "run"], data, robot).result["delta"]["gaponet"]["max"] < 0.005
+
+
+def test_ctrl_c_leaves_a_usable_run_that_resumes(robot, tmp_path):
+    data = dataset(tmp_path / "data", robot, kp=0.5)
+    calls = 0
+
+    def interrupt(status):
+        nonlocal calls
+        calls += status.stage == "warm start"
+        if status.stage == "warm start" and calls == 150:
+            raise KeyboardInterrupt
+
+    model = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, show=interrupt).run()
+    assert model.card["interrupted"]
+    assert np.isfinite(evaluate([tmp_path / "run"], data, robot).result["methods"]["gaponet"]["mpjae"])
+    with pytest.raises(UsageError, match="--resume"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+    again = Trainer(data, robot, tmp_path / "run", SMALL, STEPS, resume=True).run()
+    assert not again.card["interrupted"]
+    assert again.card["steps"] > model.card["steps"]
+    assert again.card["val_mpjae"]["model"] <= model.card["val_mpjae"]["model"]
+
+
+def test_threads_reach_every_simulation(robot, tmp_path, monkeypatch):
+    asked, batch = set(), gaponet.sim.batch.Batch
+
+    def note(*args, nthread, **rest):
+        asked.add(nthread)
+        return batch(*args, nthread=nthread, **rest)
+
+    monkeypatch.setattr(gaponet.sim.batch, "Batch", note)
+    data = dataset(tmp_path / "data", robot, rows=40)
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, threads=1), Budget(steps=16 * 60 + 16)).run()
+    assert asked == {1}
+
+
+def test_a_held_out_unit_is_never_trained_on(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for unit, kp in (("a", 0.6), ("b", 0.8)):
+        for sequence in recordings(robot, 6, rows=40, kp=kp, unit=unit):
+            data.append(sequence)
+    parts = split_entries(data, ("b",))
+    assert {e.meta.unit_id for e in parts["train"] + parts["val"]} == {"a"}
+    assert {e.meta.unit_id for e in parts["test"]} == {"a", "b"}
+    with pytest.raises(UsageError, match="unit 'c' is not in"):
+        split_entries(data, ("c",))
+
+
+def test_a_held_out_payload_is_never_trained_on(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for seed in range(4):
+        for payload in (0.0, 0.2):
+            data.append(record(robot, commands(40, seed), f"motion{seed}", payload))
+    parts = split_entries(data, holdout_payloads=(0.2,))
+    assert {e.meta.payload_mass for e in parts["train"] + parts["val"]} == {0.0}
+    assert {e.meta.payload_mass for e in parts["test"]} == {0.0, 0.2}
+    with pytest.raises(UsageError, match=r"no recording with 3 kg .* it holds 0, 0.2 kg"):
+        split_entries(data, holdout_payloads=(3.0,))
+
+
+@pytest.mark.parametrize("sensors", ["predicted", "off"])
+def test_ppo_alone_has_statistics_of_its_inputs_and_sensors_that_answer(sensors, robot, tmp_path):
+    data = dataset(tmp_path / "data", robot, kp=0.5)
+    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=0), model=replace(SMALL.model, sensors=sensors))
+    trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
+    model = trainer.run()
+    assert trainer.net.features.standardise.std.min() < 0.9
+    assert (trainer.kept.sensor_r2 is None) == (sensors == "off")
+    if sensors == "predicted":
+        assert model.card["sensor_r2"]["mean"] > 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds", "steps"), [("90s", 90, None), ("10m", 600, None), ("2e6", None, 2_000_000)]
+)
+def test_budgets(text, seconds, steps):
+    assert Budget.parse(text) == Budget(seconds, steps)
+
+
+@pytest.mark.parametrize("text", ["", "-5m", "ten", "5 weeks", "0s", "10"])
+def test_a_budget_that_makes_no_sense_is_refused(text):
+    with pytest.raises(UsageError, match="--budget"):
+        Budget.parse(text)
+
+
+def test_a_run_from_the_identified_simulator_is_scored_beside_the_nominal_one(trained, robot, tmp_path):
+    data = trained[0]
+    fitted = robot.with_servos({j: {"kp": 11.0, "delay": 0.03} for j in robot.operated})
+    Trainer(data, fitted, tmp_path / "run", SMALL, Budget(steps=2 * 16 * 60)).run()
+    result = evaluate([tmp_path / "run"], data, robot).result
+    assert list(result["methods"]) == ["nominal", "delay_offset", "identified", "identified+gaponet"]
+    assert result["methods"]["nominal"] == evaluate([trained[1]], data, robot).result["methods"]["nominal"]
+    assert result["methods"]["identified"]["mpjae"] < 0.6 * result["methods"]["nominal"]["mpjae"]
+    assert result["methods"]["identified+gaponet"]["mpjae"] < 1.2 * result["methods"]["identified"]["mpjae"]
+
+
+def test_half_of_a_correction_is_kept_where_all_of_it_does_harm(tmp_path, robot, trained, monkeypatch):
+    def error(trainer, net, robot=None):  # nominal 0.5; the fitted network 0.6 as it is and 0.4 at half
+        fitted = net is not None and bool(net.trunk[-1].weight.any())
+        mean = 0.4 + 0.4 * abs(net.bounded.gain.item() - 0.5) if fitted else 0.5
+        return np.full(len(trainer.val_set), mean)
+
+    monkeypatch.setattr(Trainer, "validate", error)
+    model = Trainer(trained[0], robot, tmp_path / "run", SMALL, STEPS).run()
+    assert model.card["gain"] == 0.5
+    assert model.card["val_mpjae"]["model"] == pytest.approx(0.4)
+
+
+def test_ppo_begins_anew_where_the_warm_start_is_worse_than_nothing(tmp_path, robot, trained, monkeypatch):
+    seen = []
+
+    def error(trainer, net, robot=None):
+        seen.append((trainer.stage, net is not None and bool(net.trunk[-1].weight.any())))
+        return np.full(len(trainer.val_set), 0.6 if trainer.stage == "warm start" else 0.5)
+
+    monkeypatch.setattr(Trainer, "validate", error)
+    config = replace(SMALL, warm_start=replace(SMALL.warm_start, rounds=2), validate_every=1,
+                     ppo=replace(SMALL.ppo, critic_warmup=3))  # fmt: skip
+    model = Trainer(trained[0], robot, tmp_path / "run", config, STEPS).run()
+    rounds, updates = [s for s in seen if s[0] == "warm start"], [s for s in seen if s[0] == "ppo"]
+    assert rounds == [("warm start", True)] * 2
+    assert updates[:3] == [("ppo", False)] * 3  # the critic alone, beside a network that corrects nothing
+    assert updates[4:-1] == [("ppo", True)] * len(updates[4:-1])
+    assert GapModel.how_trained(model.card) == (
+        f"supervised start (2 rounds), worse than no correction; {len(updates) - 1} updates of PPO from the untrained "
+        "network"
+    )
+
+
+def test_recordings_with_two_stiffnesses_are_mixed_only_when_told(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for i, sequence in enumerate(recordings(robot, 8)):
+        data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0 + i % 2, 5.0), kd=(0.1, 0.1))))
+    with pytest.raises(UsageError, match="--mixed-gains"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)
+    Trainer(data, robot, tmp_path / "run", replace(SMALL, mixed_gains=True), STEPS)
+
+
+def test_gains_other_than_the_robots_are_named(robot, tmp_path):
+    data = Dataset.create(tmp_path / "data", robot)
+    for sequence in recordings(robot, 8):
+        data.append(replace(sequence, meta=replace(sequence.meta, kp=(5.0, 5.0), kd=(0.1, 0.1))))
+    with pytest.raises(UsageError, match=r"kp \(5.0, 5.0\) .*robot.toml says others"):
+        Trainer(data, robot, tmp_path / "run", SMALL, STEPS)

@@ -1,0 +1,37 @@
+"""The predictor learns what the simulator answers, also where no motion has been."""
+
+import numpy as np
+import pytest
+import torch
+from arm import recordings, write_arm
+
+from gaponet.nn.config import ModelConfig
+from gaponet.nn.deeponet import build_network
+from gaponet.nn.training.config import RewardConfig
+from gaponet.nn.training.env import DeltaEnv
+from gaponet.nn.training.sensor_fit import fit_inputs
+
+
+def test_moving_a_posture_changes_no_relative_feature():
+    config = ModelConfig(history=2)
+    features = build_network(config, 2).features
+    x = torch.randn(5, config.observation_dim(2) + 2)
+    moved = x + torch.from_numpy(features.layout.shifted(np.full((5, 2), 0.7))).float()
+    change = (features.relative(moved) - features.relative(x)).abs()
+    assert torch.allclose(change[:, :2], torch.tensor(0.7))
+    assert change[:, 2:].max() < 1e-5
+
+
+def test_the_predictor_explains_most_of_the_answers_on_held_out_states(tmp_path):
+    torch.manual_seed(0)
+    robot = write_arm(tmp_path)
+    config = ModelConfig(history=2, sensors="predicted", num_probes=4, sensor_hidden=(64, 64))
+    env = DeltaEnv(recordings(robot, 6), robot, config, 64, 10**9, RewardConfig(), nthread=1)
+    net = build_network(config, 2)
+    report = fit_inputs(net, env, env.get_observations()["actor"], 2048, seed=0)
+    assert report["mean"] > 0.7
+    assert list(report["by_joint"]) == ["shoulder", "elbow"]
+    assert np.mean(list(report["by_joint"].values())) == pytest.approx(report["mean"])
+    assert np.mean(report["by_probe"]) == pytest.approx(report["mean"])
+    assert len(report["by_probe"]) == 4
+    assert not any(p.requires_grad for p in net.predictor.parameters())

@@ -1,0 +1,156 @@
+"""Against which baseline, and on what: the run's own simulator, and nothing that one of the runs has seen."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from arm import TOML, commands, record, write_arm
+from runs import untrained
+
+from gaponet.base.errors import DatasetError, ModelError
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.report.candidate import Candidate, choose
+from gaponet.report.evaluate import evaluate
+from gaponet.report.gap import gap_by_step
+from gaponet.report.view.side_by_side import side_by_side
+from gaponet.robot.folder import kept_robot
+from gaponet.robot.spec import load_robot
+from gaponet.share.reading import open_dataset
+from gaponet.sim.model import model_hash
+
+STIFF = TOML.replace("kp = 20.0", "kp = 90.0")
+
+
+@pytest.fixture
+def data(arm, tmp_path):
+    made = Dataset.create(tmp_path / "data", arm)
+    for i in range(4):
+        made.append(record(arm, commands(80, i), f"m{i}", kp=0.5))
+    return made
+
+
+@pytest.fixture
+def run(arm, data, tmp_path):
+    return untrained(tmp_path / "run", arm, data, train=("m0", "m1"), val=("m2",), test=("m3",))
+
+
+def without_robot(data):
+    """As datasets were written before they kept their robot."""
+    shutil.rmtree(data.path / "robot")
+    return Dataset(data.path)
+
+
+def test_a_folder_named_like_the_robot_in_the_current_directory_changes_nothing(
+    arm, data, run, tmp_path, monkeypatch, capsys
+):
+    write_arm(tmp_path / "elsewhere" / "arm", toml=STIFF)
+    before = evaluate([run], data, arm).result["methods"]["nominal"]["mpjae"]
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    for old in (False, True):
+        dataset, robot = open_dataset(without_robot(data).path if old else data.path, None, run)
+        found = evaluate([run], dataset, robot).result
+        assert found["methods"]["nominal"]["mpjae"] == before
+        assert found["simulator_hash"] == model_hash(arm)
+        assert gap_by_step(Candidate.load(run, robot), dataset)["left"]["nominal"] == pytest.approx(before)
+    assert main(["gap", str(data.path)]) == 2  # no run here that keeps one
+    assert "keeps no robot, and the package has no 'arm'; say which robot it is with --robot" in capsys.readouterr().err
+
+
+def test_another_robots_simulator_is_refused_whatever_its_name(data, run, tmp_path):
+    stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
+    for ask in (
+        lambda: evaluate([run], data, stranger),
+        lambda: gap_by_step(Candidate.load(run, stranger), data),
+        lambda: side_by_side(data, data.entries[3], stranger, [run]),
+    ):
+        with pytest.raises(ModelError, match=r"run: its nominal simulator is \w{12}, that of .*other.arm is \w{12}: "):
+            ask()
+
+
+def test_an_identified_simulator_of_the_same_robot_is_another_start_and_the_same_baseline(arm, data, run, tmp_path):
+    fitted = arm.with_servos({"elbow": {"kp": 11.0}})
+    second = untrained(tmp_path / "fitted", fitted, data, kind="mlp", train=("m0", "m1"), val=("m2",), test=("m3",))
+    found = evaluate([run, second], data, arm).result
+    assert found["simulator_hash"] == model_hash(arm)
+    errors = {name: m["mpjae"] for name, m in found["methods"].items()}
+    assert errors["identified"] == pytest.approx(errors["identified+mlp"], rel=1e-6)
+
+
+def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(data, arm, tmp_path, capsys):
+    assert model_hash(kept_robot(data.path, "arm")) == model_hash(arm)
+    shutil.rmtree(arm.folder)
+    assert open_dataset(data.path, None)[1].kp.tolist() == [20.0, 20.0]
+    stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
+    (tmp_path / "new.csv").write_text("time,ctrl.elbow\n")
+    words = ["import", str(tmp_path / "new.csv"), "--out", str(data.path), "--unit-id", "a", "--payload-mass", "0"]
+    assert main([*words, "--robot", str(stranger.folder)]) == 2
+    assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
+    words = [
+        "record",
+        "--motion",
+        "elbow-chirp-0",
+        "--out",
+        str(data.path),
+        "--driver",
+        "virtual",
+        "--payload-mass",
+        "0",
+    ]
+    assert main([*words, "--robot", str(stranger.folder)]) == 2
+    assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
+    assert not (data.path / "recordings").exists()
+    assert kept_robot(data.path, "arm").kp.tolist() == [20.0, 20.0]
+
+
+def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm, tmp_path):
+    made = Dataset.create(tmp_path / "d", arm.with_servos({"elbow": {"kp": 11.0}}))
+    assert model_hash(load_robot(made.path / "robot")) == model_hash(arm)
+
+
+def test_what_any_of_the_runs_has_seen_is_not_unseen(arm, data, run, tmp_path):
+    other = untrained(tmp_path / "other", arm, data, kind="mlp", train=("m2", "m3"), val=("m0",), test=("m1",))
+    assert [e.meta.motion for e in choose([run], data)[0]] == ["m3"]
+    with pytest.raises(DatasetError, match="every sequence was used in training"):
+        choose([run, other], data)
+    assert choose([run], data, ("m3",))[1] is True
+    assert choose([run, other], data, ("m3",))[1] is False
+    assert evaluate([run, other], data, arm, ("m3",)).result["unseen"] is False
+    less = untrained(tmp_path / "less", arm, data, kind="mlp", train=("m0",), val=("m1",), test=("m2", "m3"))
+    assert [e.meta.motion for e in choose([less], data)[0]] == ["m2", "m3"]
+    assert [e.meta.motion for e in choose([less, run], data)[0]] == ["m3"]  # m2 was the other's to choose by
+
+
+def test_a_motion_trained_on_is_not_unseen_when_another_unit_plays_it(arm, run, tmp_path):
+    again = Dataset.create(tmp_path / "unit-b", arm)
+    for i in (0, 3):
+        again.append(record(arm, commands(80, i), f"m{i}", kp=0.7, unit="b"))
+    entries, unseen = choose([run], again)
+    assert ([e.meta.motion for e in entries], unseen) == (["m3"], True)
+    assert choose([run], again, ("m0",))[1] is False
+    trained = Dataset.create(tmp_path / "unit-c", arm)
+    trained.append(record(arm, commands(80, 0), "m0", kp=0.7, unit="c"))
+    entries, unseen = choose([run], trained)
+    assert ([e.meta.motion for e in entries], unseen) == (["m0"], False)
+
+
+def test_a_split_by_unit_tests_motions_that_were_trained_on_with_other_units(arm, tmp_path):
+    both = Dataset.create(tmp_path / "units", arm)
+    for unit in "ab":
+        for i in range(3):
+            both.append(record(arm, commands(80, i), f"m{i}", kp=0.5 + 0.1 * (unit == "b"), unit=unit))
+    run = untrained(tmp_path / "by-unit", arm, both, train=("m0", "m1"), val=("m2",))
+    ours, theirs = ({e.id: e.hash for e in both.entries if e.meta.unit_id == unit} for unit in "ab")
+    val = {i: h for i, h in ours.items() if i.startswith("m2")}
+    parts = {"train": {i: h for i, h in ours.items() if i not in val}, "val": val, "test": theirs}
+    (run / "split.json").write_text(json.dumps(parts))
+    entries, unseen = choose([run], both)
+    assert ({e.hash for e in entries}, unseen) == (set(theirs.values()), True)
+
+
+def test_an_untrained_model_leaves_the_nominal_simulator_as_it_is(arm, data, run):
+    found = evaluate([run], data, arm)
+    np.testing.assert_allclose(
+        found.result["methods"]["gaponet"]["mpjae"], found.result["methods"]["nominal"]["mpjae"], rtol=1e-3
+    )

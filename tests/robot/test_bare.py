@@ -1,0 +1,78 @@
+"""A robot whose MJCF includes, names meshes and turns frames fits into one file and moves the same."""
+
+import mujoco
+import numpy as np
+import pytest
+from arm import TOML
+from arm import XML as PLAIN
+from files_arm import XML, write_files_arm
+
+from gaponet.base.errors import RobotError
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sim.model import build_model, model_hash
+
+
+def fall(robot, payload):
+    """Positions of a motion of one second, (steps, n)."""
+    model = build_model(robot, payload)
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.3, -0.2]
+    out = []
+    for step in range(200):
+        data.ctrl[:] = 0.5 * np.sin(step * 0.05), 0.3 * np.cos(step * 0.03)
+        mujoco.mj_step(model, data)
+        out.append(data.qpos.copy())
+    return np.array(out)
+
+
+@pytest.mark.parametrize("contacts", [False, True])
+def test_the_copy_needs_no_other_file_has_the_same_hash_and_moves_the_same(tmp_path, contacts):
+    robot = write_files_arm(tmp_path / "arm", contacts=contacts)
+    save_robot(robot, tmp_path / "kept")
+    moved = (tmp_path / "kept").rename(tmp_path / "moved")
+    before = [fall(robot, payload) for payload in (0.0, 0.7)], model_hash(robot)
+    for file in sorted((tmp_path / "arm").rglob("*.*")):
+        file.unlink()
+    copy = load_robot(moved)
+    text = copy.mjcf.read_text(encoding="utf-8")
+    assert sorted(p.name for p in moved.glob("[!.]*")) == ["robot.toml", "robot.xml"]
+    assert str(tmp_path) not in text + (moved / "robot.toml").read_text(encoding="utf-8")
+    assert model_hash(copy) == before[1]
+    for payload, qpos in zip((0.0, 0.7), before[0], strict=True):
+        assert np.abs(fall(copy, payload) - qpos).max() < (1e-6 if contacts else 1e-12)
+
+
+def test_a_copy_of_the_copy_is_the_same_file(tmp_path):
+    save_robot(write_files_arm(tmp_path / "arm"), tmp_path / "once")
+    save_robot(load_robot(tmp_path / "once"), tmp_path / "twice")
+    for name in ("robot.toml", "robot.xml"):
+        assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
+
+
+def test_what_one_file_cannot_hold_with_all_its_digits_is_refused_and_nothing_is_left(tmp_path):
+    tendon = '<tendon><fixed name="t" stiffness="1.23456789"><joint joint="elbow" coef="1"/></fixed></tendon></mujoco>'
+    robot = write_files_arm(tmp_path / "arm", xml=XML.replace("</mujoco>", tendon))
+    with pytest.raises(RobotError, match="does not fit into one file that moves the same; write it without"):
+        save_robot(robot, tmp_path / "kept")
+    assert [p.name for p in tmp_path.iterdir()] == ["arm"]
+
+
+def test_a_mesh_that_is_only_looked_at_becomes_its_box(tmp_path):
+    robot = write_files_arm(tmp_path / "arm")
+    save_robot(robot, tmp_path / "kept")
+    model = build_model(load_robot(tmp_path / "kept"))
+    assert model.nmesh == 0
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    assert (model.geom_type == box).any()
+    assert model.geom_size[model.geom_type == box].max() == pytest.approx(0.1, rel=0.1)
+
+
+def test_the_mjcf_may_lie_in_a_folder_of_its_own(tmp_path):
+    (tmp_path / "arm" / "model").mkdir(parents=True)
+    (tmp_path / "arm" / "model" / "arm.xml").write_text(PLAIN)
+    (tmp_path / "arm" / "robot.toml").write_text('mjcf = "model/arm.xml"\n' + TOML)
+    robot = load_robot(tmp_path / "arm")
+    save_robot(robot, tmp_path / "kept")
+    assert (tmp_path / "kept" / "robot.xml").read_text() == PLAIN
+    assert model_hash(load_robot(tmp_path / "kept")) == model_hash(robot)

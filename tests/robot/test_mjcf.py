@@ -1,0 +1,44 @@
+"""A stranger's MJCF is refused in one line, before it takes memory or time."""
+
+import os
+
+import pytest
+from arm import XML, write_arm
+
+from gaponet.base.errors import RobotError
+from gaponet.sim.model import build_model
+
+BIG = '<worldbody><replicate count="200000"><body><geom size="1"/></body></replicate>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("<worldbody>", BIG, "far larger than a robot"),
+        ("<worldbody>", BIG.replace("200000", "1e9"), "far larger than a robot"),
+        ("<worldbody>", BIG.replace("200000", "0x7fffffff"), "far larger than a robot"),
+        ("<worldbody>", '<worldbody><composite count="3000 3000 1"/>', "far larger than a robot"),
+        ("<worldbody>", '<asset><texture builtin="flat" width="100000" height="100000"/></asset><worldbody>', "larger"),
+        ("<worldbody>", '<size memory="900G"/><worldbody>', "memory"),
+        ("<worldbody>", '<include file="robot.xml"/><worldbody>', "includes robot.xml twice"),
+        ("<worldbody>", '<include file="/dev/zero"/><worldbody>', "is missing, not a file"),
+        ("<worldbody>", '<asset><mesh name="m" file="/dev/zero"/></asset><worldbody>', "is not a file"),
+        ("<worldbody>", "<worldbody", "not valid MJCF"),
+        ("<worldbody>", "<wordbody></wordbody><worldbody>", "not valid MJCF"),
+        ('name="elbow"', 'name="wing"', "elbow"),
+    ],
+)
+@pytest.mark.parametrize("ask", [build_model, lambda robot: robot.qpos_range])
+def test_it_says_what_is_wrong_whoever_asks_first(tmp_path, old, new, said, ask):
+    robot = write_arm(tmp_path / "arm", xml=XML.replace(old, new))
+    with pytest.raises(RobotError, match=said) as error:
+        ask(robot)
+    assert "\n" not in str(error.value)
+
+
+def test_a_pipe_as_a_mesh_is_not_waited_for(tmp_path):
+    mesh = '<asset><mesh file="m.obj"/></asset><worldbody>'
+    robot = write_arm(tmp_path / "arm", xml=XML.replace("<worldbody>", mesh))
+    os.mkfifo(tmp_path / "arm" / "m.obj")
+    with pytest.raises(RobotError, match=r"m\.obj is not a file"):
+        build_model(robot)

@@ -1,0 +1,259 @@
+"""gaponet robot new: a vendor's model becomes a robot folder that moves as the model does."""
+
+import tomllib
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from vendors import MJCF, URDF, write_mjcf, write_urdf
+
+from gaponet.base.errors import RobotError, UsageError
+from gaponet.robot.mjcf import read_mjcf
+from gaponet.robot.new import Made, Wanted, new_robot
+from gaponet.sim.model import build_model
+from gaponet.sim.robot_check import check_robot
+
+GAINS = {"kp": ("20",), "kd": ("1",)}
+ARM = ("shoulder", "elbow", "roll")
+
+
+def make(tmp_path: Path, model: Path | None = None, **wanted) -> Made:
+    return new_robot(model or write_mjcf(tmp_path / "repo"), tmp_path / "out", Wanted(**(GAINS | wanted)))
+
+
+def written(made: Made) -> dict[str, dict]:
+    table = tomllib.loads((made.robot.folder / "robot.toml").read_text(encoding="utf-8"))
+    return {joint["name"]: joint for joint in table["joint"]}
+
+
+def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    columns = np.zeros((model.nv, model.nv))
+    for column, unit in zip(columns, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, column, unit)
+    return columns
+
+
+def furthest(made: Made) -> tuple[float, float]:
+    """Largest difference of gravity (N·m) and inertia (kg·m²) at kept joints over 50 postures, other joints at home."""
+    ours, theirs = build_model(made.robot), made.vendor
+    a, b = mujoco.MjData(ours), mujoco.MjData(theirs)
+    places = np.array([theirs.joint(name).qposadr[0] for name in made.robot.joint_names])
+    dofs = np.array([theirs.joint(name).dofadr[0] for name in made.robot.joint_names])
+    rng, worst = np.random.default_rng(0), np.zeros(2)
+    for _ in range(50):
+        a.qpos[:] = rng.uniform(*np.clip(made.robot.qpos_range.T, -3, 3))
+        b.qpos[:] = made.pose
+        b.qpos[:7] = theirs.qpos0[:7] if theirs.nq > 7 else b.qpos[:7]
+        b.qpos[places] = a.qpos
+        mujoco.mj_forward(ours, a)
+        mujoco.mj_forward(theirs, b)
+        gravity = np.abs(a.qfrc_bias - b.qfrc_bias[dofs]).max()
+        worst = np.maximum(worst, [gravity, np.abs(inertia(ours, a) - inertia(theirs, b)[np.ix_(dofs, dofs)]).max()])
+    return float(worst[0]), float(worst[1])
+
+
+def test_base_fingers_and_leg_are_frozen_and_the_arm_weighs_what_it_did(tmp_path):
+    made = make(tmp_path, joints=ARM)
+    assert made.robot.joint_names == ("shoulder", "elbow", "roll")
+    assert max(furthest(made)) < 1e-9
+    made.vendor.body_mass[made.vendor.body("left_finger").id] *= 1.1
+    assert max(furthest(made)) > 1e-3  # and 5 g of a finger are seen
+    assert any("left_slide at 0.03 m" in note and "hip at -0.4 rad" in note for note in made.notes)
+
+
+def test_a_finger_that_follows_another_and_a_base_that_hangs_are_said_to_be_held(tmp_path):
+    body = '<body><joint name="{0}" axis="1 0 0" range="-1 1"/><geom type="sphere" size=".02" pos="0 0 .1"/>{1}</body>'
+    file = tmp_path / "fingers.xml"
+    file.write_text(
+        f'<mujoco><worldbody><body><freejoint/><geom size=".1"/>{body.format("thumb", body.format("tip", ""))}</body>'
+        '</worldbody><equality><joint joint1="tip" joint2="thumb"/></equality>'
+        '<actuator><position joint="thumb" kp="2"/></actuator></mujoco>'
+    )
+    notes = make(tmp_path, file).notes
+    assert any(note.startswith("tip moves with thumb and is held still here") for note in notes)
+    assert any("the base is held still here" in note for note in notes)
+
+
+def test_frozen_joints_stand_where_the_keyframe_says(tmp_path):
+    made = make(tmp_path, joints=ARM, keyframe="low")
+    assert max(furthest(made)) < 1e-9
+    np.testing.assert_allclose(made.robot.qpos_home, [0.0, 0.5, 0.0])
+
+
+def test_the_folder_needs_nothing_of_the_repository_and_names_nothing_that_was_dropped(tmp_path):
+    made = make(tmp_path, joints=ARM)
+    text = made.robot.mjcf.read_text(encoding="utf-8")
+    assert not any(word in text for word in ("slide", "file=", "<sensor", "<keyframe", "<tendon", "<equality"))
+    spec = read_mjcf(made.robot.mjcf)
+    assert not any(g.contype or g.conaffinity for g in spec.geoms)
+
+
+def test_gains_and_limits_come_from_actuators_through_their_gears_and_say_so(tmp_path):
+    made = make(tmp_path, kp=("hip=200", "roll=3"), kd=("hip=9", "roll=0.2"))
+    joints = written(made)
+    assert joints["shoulder"]["kp"] == 60.0
+    assert joints["shoulder"]["kd"] > 1.0  # dampratio
+    assert joints["shoulder"]["effort_limit"] == 9.0
+    assert (joints["elbow"]["kp"], joints["elbow"]["kd"]) == (40.0, 2.0)  # gear 2, twice
+    assert joints["elbow"]["effort_limit"] == 6.0  # actuatorfrcrange, before forcerange times gear, 8
+    assert joints["roll"]["effort_limit"] == 1.5  # ctrlrange of a motor, times gear
+    assert joints["shoulder"]["aliases"] == ["shoulder_servo"]
+    text = (made.robot.folder / "robot.toml").read_text(encoding="utf-8")
+    for source in ("its actuator in vendor.xml", "actuatorfrcrange (in a URDF, effort) in vendor.xml",
+                   "# N·m/rad: --kp", 'keyframe "home"', "a guess: tcp", "vendor.xml has 0.004"):  # fmt: skip
+        assert source in text
+
+
+def test_made_robots_pass_the_check_at_the_model_s_own_step(tmp_path):
+    made = make(tmp_path, kp=("20", "hip=200"))
+    assert made.robot.timestep == 0.004
+    assert [f.message for f in check_robot(made.robot, (0.0, 0.2)) if f.level in ("warning", "error")] == []
+
+
+def test_the_payload_hangs_at_the_tool_s_site(tmp_path):
+    (mount,) = make(tmp_path, joints=ARM).robot.payload_mounts
+    assert (mount.side, mount.body, mount.pos) == ("hand", "wrist", (0.12, 0.0, 0.01))
+
+
+def test_mounts_and_operated_joints_are_what_the_user_says(tmp_path):
+    made = make(tmp_path, mounts=("left=fore:0.1,0,0.02",), operated=("*l*ow*", "roll"))
+    assert [(m.side, m.body, m.pos) for m in made.robot.payload_mounts] == [("left", "fore", (0.1, 0.0, 0.02))]
+    assert made.robot.operated == ("elbow", "roll")
+
+
+def test_contacts_are_kept_by_choice(tmp_path):
+    made = make(tmp_path, contacts=True)
+    assert made.robot.contacts
+    assert any(g.contype for g in read_mjcf(made.robot.mjcf).geoms)
+
+
+def test_meshes_that_are_not_there_are_left_out_and_said(tmp_path):
+    made = make(tmp_path, write_mjcf(tmp_path / "repo", mesh=False))
+    assert any("1 mesh(es) are not in" in note and note.endswith("link") for note in made.notes)
+
+
+def test_names_with_a_slash_and_classes_with_a_material_are_taken(tmp_path):
+    model = write_mjcf(tmp_path / "repo")
+    text = model.read_text().replace('"elbow"', '"left/elbow"').replace("<asset>", '<asset><material name="dark"/>')
+    text = text.replace("<default>\n", '<default>\n<default class="dark"><geom material="dark"/></default>\n', 1)
+    model.write_text(text.replace('<body name="wrist"', '<body name="wrist" childclass="dark"'))
+    robot = make(tmp_path, model, joints=("*shoulder", "*elbow", "*roll")).robot
+    assert robot.joint_names == ("shoulder", "left_elbow", "roll")
+    assert build_model(robot, 1.0).nv == 3
+    assert robot.resolve("left/elbow", "a.csv") == "left_elbow"
+
+
+def test_a_urdf_in_its_package_becomes_a_robot(tmp_path):
+    made = make(tmp_path, write_urdf(tmp_path), kp=("50",))
+    assert made.robot.joint_names == ("lift", "bend")
+    assert made.robot.effort_limit.tolist() == [30.0, 12.0]
+    assert max(furthest(made)) < 1e-9
+    assert made.robot.payload_mounts[0].body == "tool0"
+    assert made.vendor.nmesh == 1  # of package://
+    assert any(note.startswith("1 mesh(es) were not found") and "link.dae" in note for note in made.notes)
+    spec = read_mjcf(made.robot.mjcf)
+    assert (float(spec.joint("lift").damping[0]), float(spec.joint("lift").frictionloss)) == (0.3, 0.2)
+
+
+LINK = """<link name="{0}"><inertial><mass value="{1}"/><inertia ixx="{2}" iyy="{2}" izz="{2}" ixy="0" ixz="0" iyz="0"/>
+</inertial>{3}</link>"""
+TURN = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5" velocity="1"/></joint>"""
+
+
+def hand(*links: str) -> str:
+    """A URDF: base, left_arm, left_palm, and two fingers on it; what `links` say of arm, palm and fingers."""
+    chain = (
+        ("base", "left_arm"),
+        ("left_arm", "left_palm"),
+        ("left_palm", "left_hand_a"),
+        ("left_palm", "left_hand_b"),
+    )
+    turns = [TURN.format(f"turn_{child}", parent, child) for parent, child in chain]
+    return "".join(['<robot name="r"><link name="base"/>', *links, *turns, "</robot>"])
+
+
+def test_what_vendors_write_and_no_body_has_is_mended_and_said(tmp_path):
+    links = [LINK.format("left_arm", 1.0, 0.01, ""), LINK.format("left_palm", 0.5, 0, ""),
+             LINK.format("left_hand_a", 0, 0, ""), LINK.format("left_hand_b", 0.1, 1e-4, "")]  # fmt: skip
+    (tmp_path / "r.urdf").write_text(hand(*links))
+    made = make(tmp_path, tmp_path / "r.urdf")
+    told = " ".join(made.notes)
+    assert "inertia that no body has, taken as a ball's of the link's mass: left_palm" in told
+    assert "links without mass behind a joint, taken as 1 mg: left_hand_a" in told
+    palm, tip = (made.vendor.body(name) for name in ("left_palm", "left_hand_a"))
+    radius = (3 * 0.5 / (4 * np.pi * 1000)) ** (1 / 3)
+    assert palm.mass[0] == 0.5
+    assert palm.inertia == pytest.approx(np.full(3, 0.4 * 0.5 * radius**2))
+    assert tip.mass[0] == pytest.approx(1e-6)
+    assert [(m.side, m.body) for m in made.robot.payload_mounts] == [
+        ("left", "left_palm")
+    ]  # not a finger, and not twice
+
+
+def test_a_mesh_that_cannot_be_read_is_left_out_and_said(tmp_path):
+    (tmp_path / "bad.stl").write_bytes(b"solid nothing of the kind" * 10)
+    shape = '<visual><geometry><mesh filename="bad.stl"/></geometry></visual>'
+    links = [LINK.format(name, 0.5, 0.01, shape) for name in ("left_arm", "left_palm", "left_hand_a", "left_hand_b")]
+    (tmp_path / "r.urdf").write_text(hand(*links))
+    made = make(tmp_path, tmp_path / "r.urdf")
+    assert any(note.startswith("mesh left out:") for note in made.notes)
+    assert made.vendor.nmesh == 0
+
+
+def test_a_package_elsewhere_is_named(tmp_path):
+    urdf = write_urdf(tmp_path / "a", URDF.replace("bar_description", "other"))
+    assert make(tmp_path / "b", urdf, kp=("50",), packages=(f"other={tmp_path}/a/bar_description",)).vendor.nmesh == 1
+
+
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({"joints": ("left_slide",)}, "is a slide joint, and gaponet knows angles alone"),
+        ({"joints": ("base",)}, "is a free joint"),
+        ({"joints": ("*knee*",)}, "no such joint; there are: shoulder, elbow, roll, hip"),
+        ({"kp": ("hip=1",)}, "has no position gain for roll: give those of the controller that recorded"),
+        ({"kp": ("20", "hip=much")}, "--kp hip=much: give a number from 0"),
+        ({"kd": ("toe=2",)}, "--kd toe=2: no such joint"),
+        ({"effort_limit": ("-3",)}, "--effort-limit -3"),
+        ({"keyframe": "high"}, "vendor.xml has home, low"),
+        ({"mounts": ("hand=claw",)}, "--mounts hand=claw: write SIDE=BODY"),
+        ({"rate": 0.0}, "--rate 0.0"),
+    ],
+)
+def test_what_does_not_fit_the_model_is_refused_and_nothing_is_written(tmp_path, wanted, words):
+    with pytest.raises(UsageError) as error:
+        make(tmp_path, **wanted)
+    assert words in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_holds_a_robot_is_left_alone(tmp_path):
+    made = make(tmp_path)
+    before = (made.robot.folder / "robot.toml").read_bytes()
+    with pytest.raises(UsageError, match="holds a robot; choose another"):
+        make(tmp_path, kp=("5",))
+    assert (made.robot.folder / "robot.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("arm.urdf.xacro", URDF, "expand it first: xacro"),
+        ("arm.urdf", URDF.replace('<mass value="0.7"/>', ""), "arm.urdf"),
+        ("arm.urdf", "<robot", "not valid"),
+        ("arm.urdf", URDF.replace('iyy="0.006"', 'iyy="1e308"'), r"arm.urdf: body inertia is above 1e\+10"),
+        (
+            "arm.xml",
+            MJCF.replace('"hinge"', "").replace('type="slide"', 'type="ball"').replace("range", "user"),
+            "arm.xml",
+        ),
+    ],
+)
+def test_broken_models_are_refused_with_their_file(tmp_path, name, text, words):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RobotError, match=words):
+        make(tmp_path, tmp_path / name)
+    with pytest.raises(RobotError, match="is a folder; name the model in it"):
+        make(tmp_path, tmp_path)

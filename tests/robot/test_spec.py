@@ -1,0 +1,187 @@
+"""Robots are folders: names, gains and limits come from there, and a broken folder says what is wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm import TOML, XML, write_arm
+
+from gaponet.base.errors import JointMismatchError, RobotError
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import as_option, available, load_robot
+from gaponet.sim.model import build_model, model_hash
+
+
+def test_the_package_holds_its_robots():
+    assert available() == ["fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"]
+
+
+def test_h1_2_operates_the_ten_arm_joints_of_27():
+    robot = load_robot("h1_2")
+    assert len(robot.joint_names) == 27
+    assert len(robot.operated) == 10
+    assert robot.joint_names[robot.operated_index[3]] == "left_elbow_joint"
+
+
+def test_so101_leaves_its_gripper_alone(so101):
+    assert so101.joint_names[-1] == "gripper"
+    assert "gripper" not in so101.operated
+    assert so101.log_units[-1] == "fraction"
+
+
+def test_20_ms_in_steps_of_5_ms_is_4_steps(so101):
+    assert so101.decimation == 4
+
+
+def test_gains_cannot_be_changed_after_loading(so101):
+    with pytest.raises(ValueError, match="read-only"):
+        so101.kp[0] = 1.0
+
+
+def test_an_unlimited_joint_has_an_infinite_range(tmp_path):
+    robot = write_arm(tmp_path / "arm", xml=XML.replace(' range="-1.5 1.5"', "", 1))
+    assert robot.qpos_range.tolist() == [[-np.inf, np.inf], [-1.5, 1.5]]
+
+
+@pytest.mark.parametrize("name", ["Pitch", "shoulder_lift", "/so101/upper_arm/shoulder_lift", " Pitch "])
+def test_a_joint_is_known_by_its_aliases_and_by_the_end_of_a_path(so101, name):
+    assert so101.resolve(name, "a.csv") == "shoulder_lift"
+
+
+def test_the_users_map_wins_over_aliases(so101):
+    assert so101.resolve("Pitch", "a.csv", {"Pitch": "elbow_flex"}) == "elbow_flex"
+
+
+def test_an_unknown_joint_names_the_file_and_the_nearest_joints(so101):
+    with pytest.raises(JointMismatchError, match=r"a\.csv names joint 'elbow', which robot 'so101' does not have; "
+                       r"nearest: elbow_flex, \w+, \w+\. Map it with --map elbow=elbow_flex$"):  # fmt: skip
+        so101.resolve("elbow", "a.csv")
+    with pytest.raises(JointMismatchError, match=r"nearest: elbow_flex, \w+, \w+$"):  # nothing to map there
+        so101.index(["elbow"])
+
+
+def test_an_unknown_robot_names_those_of_the_package():
+    with pytest.raises(
+        RobotError,
+        match=r"no robot 'nope': in the package are fr3, g1_23, .*, xl330_bench; or give a folder",
+    ):
+        load_robot("nope")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "arm"', "", r"robot\.toml: name: is missing; docs/new-robot\.md lists the fields"),
+        ('name = "arm"', 'name = "../arm"', "name: should be 1 to 200 letters"),
+        ("kp = 20.0", "", r"joint\[0\]\.kp: is missing"),
+        ("kp = 20.0", 'kp = "much"', r"joint\[0\]\.kp: should be a valid number, not 'much'"),
+        ("kp = 20.0", "kp = -20.0", r"joint\[0\]\.kp: should be greater than or equal to 0"),
+        ("kp = 20.0", "kp = 20.0\nkdd = 1.0", r"joint\[0\]\.kdd: is not a known field"),
+        ("kp = 20.0", 'kp = 20.0\nkd = "0.1"', r"joint\[0\]\.kd: should be a valid number"),
+        ("dt = 0.02", "dt = nan", "dt: should be a finite number"),
+        ("timestep = 0.005", "timestep = 0", "timestep: should be greater than"),
+        ('name = "elbow"', 'name = "shoulder"', "a joint name appears twice in shoulder, shoulder"),
+        ("timestep = 0.005", "timestep = 0.003", "dt / timestep = 0.02 / 0.003 = 6.667 is not a whole number"),
+        ("kp = 20.0", 'kp = 20.0\nlog_unit = "grad"', r"joint\[0\]\.log_unit: should be 'rad', 'deg' or"),
+        ("kp = 20.0", "kp = 20.0\noperated = false", "no joint has operated = true"),
+        ("dt = 0.02", "dt = ", "not valid TOML"),
+        ("[[joint]]", "[[joints]]", "joint: is missing"),
+        ('body = "fore"\n', "", r"payload_mount\[0\]\.body: is missing"),
+    ],
+)
+def test_a_broken_robot_toml_says_what_is_wrong(tmp_path, old, new, message):
+    toml = TOML.replace(old, new)
+    if "operated" not in new and old == "kp = 20.0":
+        toml = TOML.replace(old, new, 1)
+    with pytest.raises(RobotError, match=message):
+        write_arm(tmp_path / "arm", toml=toml)
+
+
+def test_a_folder_without_mjcf_says_where_to_put_it(tmp_path):
+    write_arm(tmp_path / "arm")
+    (tmp_path / "arm" / "robot.xml").unlink()
+    with pytest.raises(RobotError, match=r"robot\.xml is missing beside it"):
+        load_robot(tmp_path / "arm")
+
+
+def test_identified_values_survive_a_folder_and_the_nominal_robot_stays_known(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    fitted = robot.with_servos({"elbow": {"kp": 12.5, "frictionloss": 0.11, "delay": 0.03, "offset": -0.01}})
+    save_robot(fitted, tmp_path / "fitted")
+    back = load_robot(tmp_path / "fitted")
+    assert model_hash(back) == model_hash(fitted) != model_hash(robot)
+    assert model_hash(back.nominal) == model_hash(robot)
+    model = build_model(back)
+    np.testing.assert_allclose(model.dof_frictionloss, [0.05, 0.11])
+    np.testing.assert_allclose(model.actuator_biasprm[1, :2], [-0.125, -12.5])
+    np.testing.assert_allclose(model.actuator_delay, [0.0, 0.03])
+    save_robot(back.nominal, tmp_path / "again")
+    assert load_robot(tmp_path / "again").nominal is None
+
+
+def test_scaled_gains_survive_a_folder_and_are_not_scaled_twice(tmp_path):
+    fitted = write_arm(tmp_path / "arm").with_servos({"elbow": {"kp": 12.5}}).with_gain_scale(10.0)
+    save_robot(fitted, tmp_path / "firm")
+    back = load_robot(tmp_path / "firm").with_gain_scale(10.0)
+    assert model_hash(back) == model_hash(fitted)
+    assert (back.kp.tolist(), back.nominal.kp.tolist()) == ([200.0, 125.0], [200.0, 200.0])
+
+
+def test_an_identified_joint_that_does_not_exist_is_refused(tmp_path):
+    with pytest.raises(RobotError, match=r"identified\.wing"):
+        write_arm(tmp_path, TOML + "[identified.wing]\nkp = 3.0\n")
+    with pytest.raises(RobotError, match=r"identified\.elbow\.mass: is not a known field"):
+        write_arm(tmp_path, TOML + "[identified.elbow]\nmass = 3.0\n")
+
+
+@pytest.mark.parametrize("name", ["so101", "h1_2", "g1_29", "g1_23", "fr3", "ur10e"])
+def test_a_packaged_robot_is_kept_whole_and_may_be_moved(name, tmp_path):
+    save_robot(load_robot(name), tmp_path / "here")
+    (tmp_path / "here").rename(tmp_path / "there")
+    assert load_robot(tmp_path / "there").mjcf.parent == tmp_path / "there"
+
+
+def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(Path("mine"))
+    for folder in (Path("mine"), tmp_path / "mine", Path("..") / tmp_path.name / "mine"):
+        assert load_robot(as_option(folder)).name == "arm"
+
+
+def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(tmp_path / "arm")
+    with pytest.raises(RobotError, match=r"no robot 'arm': in the package are fr3, .*, xl330_bench; for the folder "
+                       r"here write \./arm"):  # fmt: skip
+        load_robot("arm")
+    for way in ("./arm", str(tmp_path / "arm"), Path("arm")):
+        assert load_robot(way).name == "arm"
+    with pytest.raises(RobotError, match=r"no robot\.toml there"):
+        load_robot("./so101")
+
+
+def test_a_name_that_could_mean_two_robots_is_refused_with_both(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_arm(tmp_path / "so101")
+    with pytest.raises(RobotError, match=r"'so101' is a robot of the package and a folder here; write (.*) or \./so101"
+                       ) as refused:  # fmt: skip
+        load_robot("so101")
+    packaged = str(refused.value).split("write ")[1].split(" or ")[0]
+    assert load_robot(packaged).name == "so101"
+    assert load_robot("./so101").name == "arm"
+    monkeypatch.chdir(Path(packaged).parent)
+    assert load_robot("so101").name == "so101"  # one and the same
+
+
+def test_shapes_for_collision_and_for_looking_are_kept_too(tmp_path):
+    save_robot(load_robot("h1_2"), tmp_path / "h1_2")
+    assert (tmp_path / "h1_2" / "collision.toml").is_file()
+
+
+def test_identified_tables_anywhere_in_the_file_belong_to_the_identified_robot_alone(tmp_path):
+    robot = write_arm(tmp_path / "arm", TOML.replace("[[payload", "[identified.elbow]\nkp = 9.0\n[[payload"))
+    save_robot(robot, tmp_path / "both")
+    save_robot(robot.nominal, tmp_path / "nominal")
+    assert load_robot(tmp_path / "both").kp.tolist() == [20.0, 9.0]
+    assert load_robot(tmp_path / "nominal").kp.tolist() == [20.0, 20.0]
+    assert load_robot(tmp_path / "nominal").payload_mounts == robot.payload_mounts

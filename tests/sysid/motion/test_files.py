@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+from motion_files import write_motion
+
+from gaponet.base.errors import JointMismatchError, LogError
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.motion.files import read_motion
+from gaponet.sysid.motion.motion import Motion
+
+
+def wave(rows=40):
+    t = np.arange(rows)[:, None] * 0.02
+    return np.hstack([np.sin(t), 0.5 * np.cos(t)])
+
+
+@pytest.mark.parametrize(("suffix", "dt"), [(".txt", 0.02), (".csv", 0.01), (".npz", 0.005)])
+def test_what_is_written_is_read_back(arm, tmp_path, suffix, dt):
+    motion = Motion("wave", "whole_body", dt, wave())
+    write_motion(tmp_path / f"wave{suffix}", motion, arm)
+    back = read_motion(tmp_path / f"wave{suffix}", arm)
+    assert back.name == "wave"
+    assert back.dt == pytest.approx(dt)
+    assert np.allclose(back.ctrl, motion.ctrl, atol=1e-8)
+
+
+def test_sage_names_may_be_paths_and_missing_joints_stay_at_home(tmp_path):
+    robot = load_robot("h1_2")
+    file = tmp_path / "stir.txt"
+    file.write_text(" /h1_2/torso_link/left_shoulder_pitch_joint, /h1_2/x/left_elbow_joint\n0.1, 0.2\n0.3, 0.4\n")
+    motion = read_motion(file, robot)
+    columns = robot.index(["left_shoulder_pitch_joint", "left_elbow_joint"])
+    assert motion.ctrl[:, columns].tolist() == [[0.1, 0.2], [0.3, 0.4]]
+    assert motion.moved(robot) == ("left_shoulder_pitch_joint", "left_elbow_joint")
+    assert motion.level == "upper_body"
+    assert motion.dt == 0.02
+
+
+def test_a_public_sage_motion_is_read_and_can_be_fitted():
+    from conftest import SHARED
+
+    from gaponet.sysid.motion.feasible import Feasibility
+
+    file = SHARED / "sage_motions/motion_files/h1_2/amass/0-Subject_4_F_5_poses_action_sequence.txt"
+    if not file.is_file():
+        pytest.skip(f"no public motions at {file}")
+    robot = load_robot("h1_2")
+    motion = read_motion(file, robot)
+    limits = Feasibility(robot)
+    assert len(motion.ctrl) == 91
+    assert limits.demand(limits.fit(motion).ctrl, motion.dt).met
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("shoulder,elbow\n0,0\n0,x\n", r"bad.txt:3: not a row of numbers: 0,x"),
+        ("shoulder,elbow\n0,0\n0\n", r"bad.txt:3: 1 values for 2 names"),
+        ("shoulder,elbow\n0,0\n", r"1 rows after the line of joint names"),
+        ("shoulder,shoulder\n0,0\n0,0\n", r"two columns are the same joint of arm"),
+    ],
+)
+def test_a_bad_file_is_an_error_with_its_line(arm, tmp_path, text, message):
+    file = tmp_path / "bad.txt"
+    file.write_text(text)
+    with pytest.raises(LogError, match=message):
+        read_motion(file, arm)
+
+
+def test_uneven_time_is_an_error(arm, tmp_path):
+    file = tmp_path / "bad.csv"
+    file.write_text("time,shoulder\n0,0\n0.02,0\n0.05,0\n")
+    with pytest.raises(LogError, match=r"time must rise evenly; it steps by 0\.02 to 0\.03 s"):
+        read_motion(file, arm)
+
+
+def test_a_stranger_is_named_with_the_valid_joints(arm, tmp_path):
+    file = tmp_path / "bad.txt"
+    file.write_text("knee\n0\n1\n")
+    with pytest.raises(JointMismatchError, match=r"names joint 'knee', which robot 'arm' does not have; nearest: "):
+        read_motion(file, arm)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"joint_names": np.array("shoulder")}, "array 'joint_names' must hold text in 1 dimensions"),
+        ({"joint_names": np.array(["shoulder"], object)}, "not a readable npz file"),
+        ({"ctrl": np.array([["x"], ["y"]])}, "array 'ctrl' must hold numbers in 2 dimensions"),
+        ({"ctrl": np.full((3, 1), np.nan)}, r"ctrl has shape \(3, 1\) or holds NaN"),
+        ({"ctrl": np.full((3, 1), 1e9)}, "command 1 of shoulder is .* must be in radians"),
+        ({"dt": [1, 2]}, "array 'dt' must hold numbers in 0 dimensions"),
+        ({"dt": 1e-30}, r"its period is 1e-30 s; expected 0\.0001 to 1"),
+        ({"dt": np.nan}, "its period is nan s"),
+    ],
+)
+def test_arrays_that_are_no_motion_are_refused(arm, tmp_path, arrays, message):
+    np.savez(tmp_path / "bad.npz", **({"joint_names": np.array(["shoulder"]), "ctrl": np.zeros((3, 1))} | arrays))
+    with pytest.raises(LogError, match=rf"bad\.npz: {message}"):
+        read_motion(tmp_path / "bad.npz", arm)
+
+
+def test_an_archive_that_unpacks_to_gigabytes_is_refused_unread(arm, tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("ctrl.npy", bytes(80 << 20))
+    with pytest.raises(LogError, match=r"bomb\.npz: unpacks to more than 64 MiB"):
+        read_motion(tmp_path / "bomb.npz", arm)
+    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04nothing")
+    with pytest.raises(LogError, match=r"bad\.npz: not a readable npz file \(BadZipFile"):
+        read_motion(tmp_path / "bad.npz", arm)
+
+
+def test_commands_in_degrees_are_refused(arm, tmp_path):
+    (tmp_path / "deg.txt").write_text("shoulder,elbow\n0,0\n45,0\n")
+    with pytest.raises(LogError, match=r"deg\.txt: command 2 of shoulder is 45\.000, outside its range"):
+        read_motion(tmp_path / "deg.txt", arm)

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.motion.feasible import MAX_PAYLOAD
+from gaponet.sysid.motion.library import Library, short
+
+SOME = ["sweep-left_shoulder_roll", "steps-right_elbow", "reach-both-0", "punch-right-1", "wave-left-0", "march-all-0"]
+
+
+@pytest.fixture(scope="module")
+def library():
+    return Library(load_robot("h1_2"))
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_a_motion_is_within_all_limits_at_every_payload(library, name):
+    motion = library.make(name)
+    need = library.limits.demand(motion.ctrl, motion.dt)
+    assert library.limits.max_payload == MAX_PAYLOAD
+    assert need.met, need
+    assert np.abs(np.diff(motion.ctrl, axis=0)[[0, -1]]).max() < 1e-3  # from rest to rest
+
+
+def test_per_joint_motions_cover_nine_tenths_of_every_operated_joint_at_three_kilograms(library):
+    robot = library.robot
+    for joint in robot.operated:
+        column = library.make(f"sweep-{short(joint)}").ctrl[:, robot.index([joint])[0]]
+        low, high = robot.qpos_range[robot.index([joint])[0]]
+        assert np.ptp(column) >= 0.9 * (high - low), joint
+
+
+def test_left_and_right_reach_the_same_places_mirrored(library):
+    kit = library.kit
+    for point in ([0.4, 0.2, 1.2], [0.3, 0.35, 1.0]):
+        left, right = kit.at(kit.ready, "left", point), kit.at(kit.ready, "right", point)
+        palm = kit.ik["left"].position(left)
+        assert np.linalg.norm(palm - point) < 2e-3
+        assert np.allclose(kit.ik["right"].position(right) * [1, -1, 1], palm, atol=4e-3)
+
+
+def test_the_same_seed_makes_the_same_motion_and_another_seed_another():
+    robot = load_robot("h1_2")
+    a, b, c = (Library(robot, seed).make("reach-both-0").ctrl for seed in (0, 0, 1))
+    assert np.array_equal(a, b)
+    assert a.shape != c.shape or not np.array_equal(a, c)
+
+
+def test_levels_say_what_moves(library):
+    assert library.make("creep-left_elbow").moved(library.robot) == ("left_elbow_joint",)
+    assert library.make("creep-left_elbow").level == "joint"
+    assert all("hip" not in j for j in library.make("carry-both-0").moved(library.robot))
+    assert library.make("squat-all-0").level == "whole_body"
+
+
+def test_half_the_rate_plays_every_second_row(library):
+    motion = library.make("stir-left-0")
+    assert np.array_equal(motion.sample(0.02), motion.sample(0.01)[::2])
+    assert abs(motion.sample(0.007)[100] - motion.sample(0.01)[70]).max() < 1e-9
+
+
+def test_an_unknown_name_lists_the_forms(library):
+    with pytest.raises(
+        UsageError, match=r"h1_2 has no motion 'dance-left-0'; names are <signal>-<joint> .* sweep, creep"
+    ):
+        library.make("dance-left-0")
+    with pytest.raises(UsageError, match="no operated joint 'left_knee'"):
+        library.make("sweep-left_knee")
+
+
+def test_a_robot_without_arms_by_name_has_signals_and_tours(arm):
+    library = Library(arm, max_payload=0.2)
+    names = library.names()
+    assert "sweep-shoulder" in names
+    assert "tour-all-0" in names
+    assert not [n for n in names if n.startswith(("reach", "squat"))]
+    assert library.limits.demand(library.make("tour-all-0").ctrl, 0.01).met

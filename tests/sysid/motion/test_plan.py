@@ -1,0 +1,70 @@
+"""gaponet excite: motions that a robot can do, as files that come back, and a sheet that says how long."""
+
+import json
+
+import numpy as np
+import pytest
+from contacts import Contacts
+
+from gaponet.base.errors import UsageError
+from gaponet.cli.main import main
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.motion.feasible import Feasibility
+from gaponet.sysid.motion.files import read_motion, write_motion
+from gaponet.sysid.motion.plan import make_plan
+
+
+@pytest.fixture(scope="module")
+def plan(so101):
+    return make_plan(so101, 6.0, (0.0, 0.2))
+
+
+def test_the_plan_is_as_long_as_asked_and_moves_every_joint(so101, plan):
+    longest = max(m.duration for m in plan.motions) * 2 / 60
+    assert 6.0 <= plan.minutes <= 6.0 + longest
+    assert {name for m in plan.motions for name in m.moved(so101)} == set(so101.operated)
+    assert any(len(m.moved(so101)) > 1 for m in plan.motions)
+
+
+def test_every_motion_can_be_done_with_the_heaviest_payload(so101, plan):
+    limits = Feasibility(so101, 0.2)
+    assert all(limits.demand(m.ctrl, m.dt).met for m in plan.motions)
+
+
+def test_no_motion_touches_the_arm_or_the_table_and_none_moves_the_gripper(so101, plan):
+    judge = Contacts(so101)
+    assert [m.name for m in plan.motions if judge.along(m.ctrl[::10], 0.05)[0] > 0] == []
+    assert {name for m in plan.motions for name in m.named(so101)} == set(so101.operated)
+
+
+@pytest.mark.parametrize(("suffix", "rate"), [("txt", 50.0), ("csv", 100.0), ("npz", 30.0)])
+def test_a_motion_comes_back_from_its_file(so101, plan, tmp_path, suffix, rate):
+    motion = plan.motions[0]
+    write_motion(tmp_path / f"m.{suffix}", motion, so101, rate)
+    back = read_motion(tmp_path / f"m.{suffix}", so101)
+    assert back.dt == pytest.approx(1 / rate)
+    np.testing.assert_allclose(back.ctrl, motion.sample(1 / rate), atol=1e-6)
+    assert back.joints == so101.operated
+
+
+def test_sage_files_are_at_50_hz(so101, plan, tmp_path):
+    with pytest.raises(UsageError, match="write csv or npz at 100 Hz"):
+        write_motion(tmp_path / "m.txt", plan.motions[0], so101, 100.0)
+
+
+def test_too_little_time_and_payloads_without_a_mount_are_refused(so101):
+    with pytest.raises(UsageError, match="is too short for so101 at these payloads: give 1"):
+        make_plan(so101, 0.1, (0.0,))
+    with pytest.raises(UsageError, match="give kg ≥ 0"):
+        make_plan(so101, 5.0, (-1.0,))
+
+
+def test_the_command_writes_motions_and_a_sheet(tmp_path, capsys):
+    assert main(["excite", "--robot", "fr3", "--out", str(tmp_path / "m"), "--minutes", "5", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    sheet = (tmp_path / "m" / "sheet.md").read_text(encoding="utf-8")
+    robot = load_robot("fr3")
+    for file in told["motions"]:
+        assert f"| {file} | 0 |" in sheet
+        assert read_motion(tmp_path / "m" / file, robot).duration > 1
+    assert "Warm up for ten minutes" in sheet

@@ -1,0 +1,124 @@
+"""gaponet excite --for: the motions that tell most of a robot that is known in part."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import TOML, XML, commands, record, write_arm
+
+from gaponet.cli.main import main
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.evidence import known
+from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.motion.feasible import Feasibility
+from gaponet.sysid.motion.files import read_motion
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.telling import Telling, candidates, expected, open_gains
+
+HELD = 0.3  # kg
+
+
+def identified(place, xml=XML):
+    """As if two short motions had identified it."""
+    robot = write_arm(place / "arm", TOML, xml)
+    logs = [record(robot, commands(400, seed), f"m{seed}", kp=0.8, delay=1) for seed in range(2)]
+    rng = np.random.default_rng(0)
+    logs = [replace(s, qpos=s.qpos + 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32)) for s in logs]
+    save_robot(robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "known")
+    known(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
+    return load_robot(place / "known")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return identified(tmp_path_factory.mktemp("loaded"))
+
+
+@pytest.fixture(scope="module")
+def pool(robot):
+    return candidates(Library(robot, 3, HELD))[::3]
+
+
+@pytest.fixture(scope="module")
+def told(robot, pool):
+    return Telling.of(robot, Knowledge.load(robot), expected(robot, pool, 0.0, 1), 1)
+
+
+def errors(covariance):
+    return np.sqrt(np.einsum("nii->ni", covariance))
+
+
+def test_every_candidate_is_within_the_limits(robot, pool):
+    limits = Feasibility(robot, HELD)
+    assert all(limits.demand(m.ctrl, m.dt).met for m in pool)
+
+
+def test_what_is_expected_of_a_recording_is_what_it_tells(robot, pool, told):
+    """Played on another arm than the identified one."""
+    mine = Knowledge.load(robot)
+    nominal = load_robot(robot.folder.parent / "arm")
+    played = [record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1) for k, m in enumerate(pool[:4])]
+    there = Telling.of(robot, mine, played, 1)
+    np.testing.assert_allclose(errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5)
+
+
+def test_more_recordings_never_make_it_less_sure(told):
+    now = errors(told.after([]))
+    for more in ([0], [0, 5], range(len(told.seconds))):
+        then = errors(told.after(more))
+        assert (then <= now * (1 + 1e-9)).all()
+        now = then
+
+
+def test_what_is_chosen_fits_the_time_and_tells_more_than_nine_of_ten_random_sets(told):
+    picks = told.choose(24.0)
+    assert len(set(picks)) == len(picks)
+    assert told.seconds[picks].sum() <= 24.0
+    rng, random = np.random.default_rng(1), []
+    for _ in range(40):
+        order = rng.permutation(len(told.seconds))
+        fits = order[np.cumsum(told.seconds[order]) <= 24.0]
+        random.append(np.log(errors(told.after(fits))).mean())
+    assert np.log(errors(told.after(picks))).mean() < np.quantile(random, 0.1)
+
+
+def test_a_robot_that_is_known_well_has_little_more_worth_playing(told):
+    surer = replace(told, covariance=told.after(range(len(told.seconds))) / 100)
+    assert surer.worth() < told.worth()
+    assert surer.worth() == 0
+
+
+def test_where_gravity_turns_nothing_a_known_payload_is_asked_for(tmp_path, robot, pool, told):
+    """Its joints turn about upright axes, and no log has shown what moves: friction over kp is seen, kp is not."""
+    assert open_gains(robot, Knowledge.load(robot), told, pool, (0.0,)) == {}
+    free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
+    mine = Knowledge.load(free)
+    motions = [m for m in candidates(Library(free, 3, HELD)) if m.name.startswith("creep")]
+    slow = Telling.of(free, mine, expected(free, motions, 0.0, 1), 1)
+    unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
+    said = open_gains(free, mine, unsure, motions, (0.0,))
+    assert set(said) == {"shoulder", "elbow"}
+    assert all("so no motion tells kp from friction and damping" in why for why in said.values())
+
+
+def test_the_command_writes_motions_says_what_they_would_tell_and_how_much_more_is_worth(robot, tmp_path, capsys):
+    out = tmp_path / "next"
+    assert main(["excite", "--for", str(robot.folder), "--out", str(out), "--seed", "3", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 60 * said["minutes"] <= 30
+    assert said["worth_seconds"] >= 0
+    for joint, before in said["errors"].items():
+        assert all(said["errors_then"][joint][f] <= e for f, e in before.items())
+    for file in said["motions"]:
+        assert read_motion(out / file, robot).duration > 1
+    assert f"gaponet calibrate {robot.folder} data --out ROBOT_2" in (out / "sheet.md").read_text()
+
+
+def test_a_robot_without_knowledge_or_two_robots_are_refused(robot, tmp_path, capsys):
+    plain = robot.folder.parent / "arm"
+    assert main(["excite", "--for", str(plain), "--out", str(tmp_path / "a")]) == 2
+    assert "keeps only values" in capsys.readouterr().err
+    assert main(["excite", "--for", str(plain), "--robot", "so101", "--out", str(tmp_path / "b")]) == 2
+    assert "--robot NAME" in capsys.readouterr().err

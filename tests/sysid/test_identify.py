@@ -1,0 +1,123 @@
+"""Identification finds the servo that made the recordings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import TOML, recordings, write_arm
+
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.axes import Bounds
+from gaponet.sysid.fit import Tried, _Judge, _Limbs, with_stops
+from gaponet.sysid.free_runs import cut
+from gaponet.sysid.identify import identify
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """A file that claims twice the damping that the servo has, as kd."""
+    sequences = recordings(write_arm(tmp_path_factory.mktemp("real")), 6, rows=200, kp=0.6, delay=2)
+    robot = write_arm(tmp_path_factory.mktemp("arm"), TOML.replace("kp = 20.0", "kp = 20.0\nkd = 0.5"))
+    return robot, identify(sequences, robot, windows=6)
+
+
+def test_gain_and_delay_are_found(found):
+    robot, fit = found
+    np.testing.assert_allclose(fit.robot.kp, 0.6 * robot.kp, rtol=0.03)
+    np.testing.assert_allclose(fit.robot.delay, 0.04, atol=0.004)
+    np.testing.assert_allclose(fit.robot.offset, 0.0, atol=0.002)
+    assert fit.after < 0.05 * fit.before
+
+
+def test_damping_ends_below_a_kd_that_no_recording_states_and_what_is_sent_stays(found):
+    robot, fit = found
+    damping = np.nan_to_num(fit.robot.damping)
+    np.testing.assert_allclose(fit.robot.kd + damping, 0.5, rtol=0.05)
+    np.testing.assert_array_equal(fit.robot.nominal.kd, robot.kd)
+    assert fit.better
+
+
+def test_the_nominal_robot_stays_what_it_is(tmp_path):
+    robot = write_arm(tmp_path)
+    fit = identify(recordings(robot, 4, rows=150), robot, windows=4)
+    assert fit.robot is robot
+    assert not fit.better
+
+
+def test_a_joint_that_never_moves_is_reported_as_undetermined(tmp_path):
+    robot = write_arm(tmp_path)
+    still = [replace(s, ctrl=np.zeros_like(s.ctrl)) for s in recordings(robot, 2, rows=100)]
+    still = [replace(s, qpos=np.zeros_like(s.qpos), qvel=np.zeros_like(s.qvel)) for s in still]
+    assert any("not determined" in w for w in identify(still, robot, windows=2).warnings)
+
+
+def test_windows_cover_all_recordings(tmp_path):
+    robot = write_arm(tmp_path)
+    sequences = recordings(robot, 5, rows=900)
+    parts = cut(sequences, 5)
+    assert len(parts) == 5
+    assert {p.meta.motion for p in parts} == {s.meta.motion for s in sequences}
+    with pytest.raises(UsageError, match="longer"):
+        identify([s.rows(slice(0, 20)) for s in sequences], robot)
+
+
+def test_a_joint_behind_one_command_is_loaded_and_one_behind_many_is_stopped(tmp_path):
+    robot = write_arm(tmp_path)
+    s = recordings(robot, 1, rows=200)[0]
+    ctrl = np.zeros_like(s.ctrl)
+    ctrl[:, 0] = 0.8 * (1 - np.cos(np.linspace(0, 4 * np.pi, len(ctrl)))) / 2  # against it twice
+    ctrl[100:, 1] = 0.5
+    qpos = np.minimum(ctrl, 0.3)
+    found = with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))])
+    assert found.qpos_range[0, 1] == pytest.approx(0.3, abs=1e-3)
+    np.testing.assert_array_equal(found.qpos_range[1], robot.qpos_range[1])
+
+
+def test_a_soft_joint_that_sticks_where_its_command_turned_has_met_no_stop(tmp_path):
+    robot = write_arm(tmp_path)
+    s = recordings(robot, 1, rows=400)[0]
+    ctrl = np.zeros_like(s.ctrl)
+    ctrl[:, 0] = 0.9 * np.sin(np.linspace(0, 6 * np.pi, len(ctrl)))
+    qpos = np.zeros_like(ctrl)
+    for t in range(1, len(ctrl)):  # a spring to the command that is as soft as friction is strong: 0.4 rad of play
+        qpos[t, 0] = np.clip(qpos[t - 1, 0], ctrl[t, 0] - 0.4, ctrl[t, 0] + 0.4)
+    pressed = (ctrl[:, 0] > qpos[:, 0].max() + 0.1) & (qpos[:, 0] > qpos[:, 0].max() - 0.005)
+    assert pressed.sum() >= 50  # as long as against a stop
+    assert with_stops(robot, [replace(s, ctrl=ctrl, qpos=qpos.astype(s.qpos.dtype))]).qpos_range[0, 1] == 1.5
+
+
+def test_what_is_told_of_limbs_is_told_of_their_joints():
+    limbs = _Limbs(load_robot("so101"))
+    assert limbs.at.tolist() == [[0, 1, 2, 3, 4]]
+    limbs.at = np.array([[0, 2, 4], [1, 3, -1]])  # of two limbs, one shorter
+    x = np.arange(30.0).reshape(2, 5, 3)
+    assert limbs.pack(x).shape == (2, 2, 9)
+    np.testing.assert_array_equal(limbs.unpack(limbs.pack(x)), x)
+
+
+@pytest.mark.parametrize(
+    ("falls", "kept"),
+    [
+        ((0.09,), False),  # of one motion, of an error of 1
+        ((0.12,), True),
+        ((0.005,) * 12, False),  # sure, and nothing
+        ((0.01, 0.05), False),  # two that disagree so much say little
+        ((0.03, 0.04), True),
+        ((0.9, 0.95), True),
+        ((0.3, -0.05, 0.05, 0.02, 0.01, 0.06), True),
+        ((0.3, -0.2, 0.05, 0.02, -0.1, 0.06), False),
+    ],
+)
+def test_a_term_is_kept_where_motions_are_surely_followed_better(falls, kept):
+    before = np.arange(len(falls)) ** 2 + 1.0  # some motions are followed worse than others by far
+    assert Tried("load", before, before * (1 - np.array(falls))).kept is kept
+
+
+def test_repetitions_and_gains_of_one_motion_judge_as_one(tmp_path):
+    robot, logs = write_arm(tmp_path), recordings(load_robot(tmp_path))[:3]
+    again = [*logs, replace(logs[0], meta=replace(logs[0].meta, repetition=1, kp=(18.0, 18.0)))]
+    values = Bounds(robot, logs).first
+    once, twice = (_Judge(x, robot, -np.inf, 1).errors(values) for x in (logs, again))
+    assert len(once) == len(twice) == 3
+    np.testing.assert_allclose(twice[1:], once[1:])

@@ -1,0 +1,220 @@
+"""What is known of a robot: how sure its values are, from which logs, and whether later logs are still of it."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import TOML, XML, commands, record, write_arm
+
+from gaponet import api
+from gaponet.base.errors import RobotError
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sim.replay import replay
+from gaponet.sysid.drift import drift
+from gaponet.sysid.evidence import known
+from gaponet.sysid.knowledge import Knowledge, values_of
+
+TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
+
+
+def played(robot, first=0, count=6, seconds=8, noise=4e-4, **how):
+    """Motions of an arm whose servos are softer and late, seen through a noisy encoder."""
+    found = []
+    for seed in range(first, first + count):
+        rows = round(seconds / robot.dt)
+        one = record(robot, commands(rows, seed), f"m{seed}", **({"kp": 0.8, "delay": 1} | how))
+        found.append(replace(one, qpos=one.qpos + noise * np.random.default_rng(seed).standard_normal(one.qpos.shape)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("know") / "arm")
+
+
+@pytest.fixture(scope="module")
+def folder(arm, tmp_path_factory):
+    """As if it had been identified."""
+    right = arm.with_servos(dict.fromkeys(arm.joint_names, TRUE))
+    place = tmp_path_factory.mktemp("know") / "right"
+    save_robot(right, place)
+    known(load_robot(place), played(arm), played(arm, 20, 3), nthread=1).save(place)
+    return place
+
+
+def dataset(arm, place, sequences):
+    data = Dataset.create(place, arm)
+    for one in sequences:
+        data.append(one)
+    return place
+
+
+def checked(capsys, *words):
+    code = 0
+    try:
+        code = main(["check", *map(str, words), "--threads", "1", "--json"])
+    except SystemExit as end:
+        code = end.code
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_a_folder_says_how_sure_it_is_and_from_which_logs(arm, folder):
+    mine = Knowledge.load(load_robot(folder))
+    (source,) = mine.sources
+    assert source["logs"].keys() == {f"m{seed}" for seed in range(6)}
+    assert source["seconds"] == pytest.approx(48.0)
+    for joint in arm.operated:
+        values, covariance = mine.si(joint)
+        np.testing.assert_allclose([values[f] for f in mine.fields], [TRUE[f] for f in mine.fields], atol=1e-5)
+        drawn = np.random.default_rng(0).multivariate_normal(
+            mine.array(joint, "values"), mine.array(joint, "covariance"), 20_000
+        )
+        spread = np.std([values_of(mine.fields, drawn)[f] for f in mine.fields], axis=1)
+        np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
+        assert mine.joints[joint].left < 2e-3
+
+
+def test_what_logs_do_not_show_is_as_sure_as_before_them(arm):
+    """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
+    still = [replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)]
+    mine = known(arm, still, [], nthread=1)
+    assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
+
+
+def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_that_they_judged(arm, folder):
+    robot, judges = load_robot(folder), played(arm, 20, 2)
+    alone = [replace(s, meta=replace(s.meta, notes={"held_at_home": ["elbow"]})) for s in judges]
+    both, one, none = (known(robot, judges, some, nthread=1).joints for some in (judges, [judges[0], alone[1]], alone))
+    assert one["elbow"].left == pytest.approx(known(robot, judges, judges[:1], nthread=1).joints["elbow"].left, rel=0.2)
+    assert one["elbow"].left > 0.5 * both["elbow"].left  # rows that do not hold it are no zeros
+    assert none["elbow"].band == none["shoulder"].band > 0.0
+    off = robot.with_servos({"elbow": {"offset": 0.05}})
+    judged = known(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
+    assert judged.left > 10 * both["elbow"].left
+    assert judged.values == both["elbow"].values
+
+
+def test_a_band_is_wider_where_few_motions_differ_much(arm, folder):
+    robot, judges = load_robot(folder), played(arm, 20, 4)
+    alike = known(robot, judges, judges, nthread=1).joints["elbow"]
+    apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
+    twins = replay(apart, robot, nthread=1, lock_idle=True)
+    pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, twins, strict=True)])
+    wide = known(robot, judges, apart, nthread=1).joints["elbow"].band
+    assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.band
+    one = known(robot, judges, judges[:1], nthread=1).joints["elbow"].band
+    assert np.isfinite(one)
+
+
+def test_more_seconds_make_it_surer_and_are_told(arm, folder):
+    robot = load_robot(folder)
+    mine = Knowledge.load(robot)
+    more = known(robot, played(arm, 40, 4), [], before=mine, nthread=1)
+    assert len(more.sources) == 2
+    for joint in arm.operated:
+        before, after = (np.diag(k.array(joint, "covariance")) for k in (mine, more))
+        assert (after < before).all()
+
+
+def test_what_a_calibration_moves_is_unsure_of_the_old_value(arm, folder):
+    robot = load_robot(folder)
+    mine, found = Knowledge.load(robot), []
+    for by in (0.0, -0.05):
+        there = robot.with_servos({"elbow": {"offset": by}})
+        seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
+        found.append(known(there, seen, [], before=mine, nthread=1).array("elbow", "covariance"))
+    same, moved = (np.diag(covariance)[mine.fields.index("offset")] for covariance in found)
+    assert moved > 1.1 * same
+
+
+def test_a_folder_that_was_edited_is_not_believed(folder, tmp_path):
+    robot = load_robot(folder)
+    save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
+    with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or calibrate again"):
+        Knowledge.load(load_robot(tmp_path / "edited"))
+
+
+def test_a_folder_without_it_loads_and_show_says_what_to_do(arm, capsys):
+    assert Knowledge.load(arm) is None
+    assert main(["show", str(arm.folder)]) == 2
+    assert "keeps only values" in capsys.readouterr().err
+
+
+def test_a_calibration_keeps_what_it_learned(arm, folder, tmp_path):
+    data = dataset(arm, tmp_path / "data", played(arm, 60, 3, kp=0.7))
+    api.calibrate_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
+    mine = Knowledge.load(load_robot(tmp_path / "today"))
+    assert [s["made_by"] for s in mine.sources] == ["identify", "calibrate"]
+    assert mine.sources[1]["logs"].keys() == {"m60", "m61", "m62"}
+
+
+def test_show_prints_and_draws(folder, tmp_path, capsys):
+    assert main(["show", str(folder), "--out", str(tmp_path / "known.svg"), "--json"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert found["joints"]["elbow"]["standard_errors"]["kp"] > 0
+    assert "± standard error" in said.err
+    assert "elbow" in (tmp_path / "known.svg").read_text()
+    assert main(["show", str(folder), "--out", str(tmp_path / "known.pdf")]) == 2
+
+
+def test_the_same_robot_is_the_same(arm, folder, tmp_path, capsys):
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6)))
+    assert (code, said["verdict"], said["moved"]) == (0, "same", [])
+
+
+def test_what_moved_is_named(arm, folder, tmp_path, capsys):
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, kp=0.7)))
+    assert (code, said["verdict"]) == (1, "drifted")
+    moved = {m["joint"]: m["by"] for m in said["moved"] if m["field"] == "kp"}
+    assert moved == pytest.approx(dict.fromkeys(arm.operated, np.log(0.7 / 0.8)), rel=0.35)
+
+
+def test_a_zero_that_moved_is_named_at_its_joint(arm, folder, tmp_path, capsys):
+    shifted = [replace(s, qpos=s.qpos + np.array([0.0, 0.005])) for s in played(arm, 70, 6)]
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", shifted))
+    assert (code, [(m["joint"], m["field"]) for m in said["moved"]]) == (1, [("elbow", "offset")])
+    assert said["moved"][0]["by"] == pytest.approx(0.005, rel=0.2)
+    assert "calibrate" in said["advice"]
+
+
+def test_a_recording_that_says_something_else_is_set_aside_and_half_of_them_contradict(arm, folder, tmp_path, capsys):
+    some = played(arm, 70, 6)
+    for odd in (2, 3, 4):
+        some[odd] = replace(some[odd], qpos=some[odd].qpos + np.array([0.03, 0.0]))
+        if odd == 2:
+            code, said = checked(capsys, folder, dataset(arm, tmp_path / "one", some))
+            assert (code, said["verdict"]) == (0, "same")
+            assert [(a["recording"], a["joint"]) for a in said["against"]] == [("m72", "shoulder")]
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "half", some))
+    assert (code, said["verdict"]) == (1, "contradictory")
+
+
+def test_a_slow_bus_is_one_change_of_every_joint(arm, folder, tmp_path, capsys):
+    code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", played(arm, 70, 6, delay=2)))
+    (moved,) = (m for m in said["moved"] if m["field"] == "delay")
+    assert (code, moved["joint"]) == (1, "every joint")
+    assert moved["by"] == pytest.approx(0.02, rel=0.35)
+
+
+def test_logs_that_cannot_be_read_are_an_error(folder, tmp_path, capsys):
+    assert main(["check", str(folder), str(tmp_path / "nothing")]) == 2
+    assert "nothing" in capsys.readouterr().err
+
+
+def test_another_arm_that_no_number_explains_is_not_the_same(arm, folder, monkeypatch, tmp_path):
+    """Its links are twice as heavy; even where no change of a number counts it is not called the same."""
+    xml = XML.replace('mass="0.3"', 'mass="0.6"').replace('mass="0.2"', 'mass="0.4"')
+    heavy, robot = write_arm(tmp_path / "heavy", TOML, xml), load_robot(folder)
+    mine = Knowledge.load(robot)
+    fresh = drift(robot, mine, played(arm, 70, 6), 1)
+    assert (fresh.verdict, fresh.far) == ("same", {})
+    monkeypatch.setattr("gaponet.sysid.drift.FELT", 1e9)
+    found = drift(robot, mine, played(heavy, 70, 6), 1)
+    assert found.verdict == "drifted"
+    assert "no number explains how far these logs are from the model" in found.advice
+    assert set(found.far) <= set(arm.operated)

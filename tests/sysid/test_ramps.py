@@ -1,0 +1,66 @@
+"""Servos whose own trajectory generator limits the speed of their targets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, write_arm
+
+from gaponet.data.sequence import Sequence, SequenceMeta
+from gaponet.sim.replay import replay
+from gaponet.sysid.identify import identify
+from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.ramps import target_speeds
+
+
+def recorded(robot, count=6, still=()):
+    """What a robot does with jumps and waves, with the noise of an encoder."""
+    made, rng = [], np.random.default_rng(5)
+    for i in range(count):
+        ctrl = 1.5 * commands(400, i)
+        ctrl[:200] = np.repeat(rng.uniform(-1, 1, (4, 2)), 50, axis=0)
+        start = np.tile(ctrl[0], (400, 1))
+        made.append(Sequence(SequenceMeta("arm", "a", f"m{i}", 0.0), robot.joint_names, 0.02, ctrl, start, 0 * start))
+    return [
+        replace(s, qpos=t.qpos + rng.normal(0, 1e-4, t.qpos.shape).astype(np.float32), qvel=t.qvel)
+        for s, t in zip(made, replay(made, robot), strict=True)
+    ]
+
+
+@pytest.fixture
+def servos():
+    return {j: {"kp": 14.0, "delay": 0.02, "damping": 0.8, "armature": 0.02} for j in ("shoulder", "elbow")}
+
+
+def test_the_speed_of_a_ramp_is_read_off_recordings_and_none_where_there_is_none(tmp_path, servos):
+    robot = write_arm(tmp_path)
+    servos["elbow"]["target_speed"] = 0.7
+    assert target_speeds(recorded(robot.with_servos(servos)), robot) == pytest.approx([0.0, 0.7], rel=0.04)
+
+
+@pytest.mark.parametrize("wrong", [{"damping": 4.0}, {"frictionloss": 0.6}])
+def test_slow_and_stiff_servos_are_not_taken_for_ramps(tmp_path, servos, wrong):
+    robot = write_arm(tmp_path)
+    servos["elbow"] |= wrong
+    assert not target_speeds(recorded(robot.with_servos(servos)), robot).any()
+
+
+def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
+    robot = write_arm(tmp_path)
+    servos["shoulder"]["target_speed"] = 0.6
+    logs = recorded(robot.with_servos(servos), 7)
+    found = identify(logs[:5], robot, logs[5:], windows=5, terms=(), table=False, nthread=1)
+    assert found.robot.target_speed == pytest.approx([0.6, 0.0], rel=0.04)
+    assert found.after < 0.1 * found.before
+    assert found.tried[-1].name == "ramp"
+    assert "profile velocity" in found.warnings[0]
+    assert found.robot.before_identification.target_speed.max() == 0
+
+
+def test_joints_on_their_own_run_along_ramps_as_the_whole_robot_does(tmp_path, servos):
+    servos["shoulder"]["target_speed"] = 0.6
+    robot = write_arm(tmp_path).with_servos(servos)
+    runs = JointRuns(recorded(robot), robot, nthread=1)
+    values = {f: np.array([[s[f] for s in servos.values()]]) for f in ("kp", "delay", "damping", "armature")}
+    errors = runs.errors(values | {"offset": np.zeros((1, 2)), "frictionloss": np.full((1, 2), 0.05)})
+    assert np.abs(errors).mean() < 1e-3

@@ -1,0 +1,127 @@
+"""What recorded torque says: gains, where a payload hangs, what hand the model lacks; and when it is believed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, recordings, write_arm
+from logs import arm_sequence, late, wave
+
+from gaponet.base.errors import RobotError
+from gaponet.data.signals import differentiate, lowpass
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sim.dynamics import CUTOFF, inverse_dynamics
+from gaponet.sim.model import build_model, model_hash
+from gaponet.sim.replay import replay
+from gaponet.sysid.identify import identify
+from gaponet.sysid.torque import TorqueFit
+
+
+def moved(robot, metres, hand):
+    """The robot with its payload hung elsewhere, and a hand."""
+    mount = robot.payload_mounts[0]
+    return replace(robot, payload_mounts=(replace(mount, pos=(mount.pos[0] + metres, *mount.pos[1:]), mass=hand),))
+
+
+def test_torque_says_where_the_payload_hangs_and_what_the_hand_weighs(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    true = moved(robot, -0.06, 0.1)
+    windows = []
+    for mass in (0.0, 0.2, 0.4):
+        for s in recordings(robot, 2, rows=200):
+            model = build_model(true, mass, "both", s.dt)
+            qpos = lowpass(s.qpos.astype(float), s.dt, CUTOFF)
+            qvel = differentiate(qpos, s.dt)
+            tau = inverse_dynamics(model, qpos, qvel, differentiate(qvel, s.dt))
+            one = replace(s, tau=tau, meta=replace(s.meta, payload_mass=mass))
+            windows += [one.rows(slice(a, a + 50)) for a in range(0, 200, 50)]
+    found = TorqueFit(windows, robot).hanging().payload_mounts[0]
+    assert found.pos == pytest.approx(true.payload_mounts[0].pos, abs=0.01)
+    assert found.mass == pytest.approx(0.1, abs=0.02)
+
+
+def test_torque_says_the_gains_of_the_servo_and_nothing_where_it_is_not_its_law(arm):
+    rng, made = np.random.default_rng(0), []
+    for seed in range(4):
+        ctrl = wave(200, 2, hertz=0.5 + 0.1 * seed)
+        s = arm_sequence(arm, ctrl, late(ctrl, 3), f"m{seed}")
+        error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
+        tau = np.stack([7.0 * error[:, 0] - 0.3 * s.qvel[:, 0], rng.standard_normal(200)], axis=1)
+        made.append(replace(s, tau=tau + 0.01 * rng.standard_normal(tau.shape)))
+    said = TorqueFit(made, arm)
+    (kp, _, kd, explained), (_, _, _, noise) = said.gains().values()
+    assert (kp, kd) == (pytest.approx(7.0, rel=0.03), pytest.approx(0.3, rel=0.1))
+    assert explained > 0.95 > 0.5 > noise
+    assert said.trusted
+    assert said.robot.kp[0] == pytest.approx(7.0, rel=0.03)
+    assert said.robot.kp[1] == arm.kp[1]
+    assert not TorqueFit([replace(s, tau=None) for s in made], arm).trusted
+
+
+def test_noise_of_position_and_speed_softens_no_gain(arm):
+    rng, made = np.random.default_rng(0), []
+    for seed in range(12):
+        ctrl = wave(120, 2, hertz=0.5 + 0.1 * seed)
+        s = arm_sequence(arm, ctrl, late(ctrl, 4), f"m{seed}")
+        error = np.concatenate([np.zeros((1, 2)), s.ctrl[:-1] - s.qpos[1:]])
+        noisy = [x + spread * rng.standard_normal(x.shape) for x, spread in ((s.qpos, 0.01), (s.qvel, 0.3))]
+        made.append(replace(s, tau=48.0 * error - 1.0 * s.qvel, qpos=noisy[0], qvel=noisy[1]))
+    for kp, _, kd, _ in TorqueFit(made, arm).gains().values():
+        assert (kp, kd) == (pytest.approx(48.0, rel=0.03), pytest.approx(1.0, rel=0.1))
+
+
+def loaded(robot):
+    """Six motions with three payloads each, of an arm with softer servos, a hand, and a payload hung elsewhere."""
+    true, windows = moved(robot, -0.06, 0.3).with_servos({j: {"kp": 12.0, "kd": 0.4} for j in robot.operated}), []
+    for motion in range(6):
+        for mass in (0.0, 0.2, 0.4):
+            ctrl = commands(60, motion)
+            one = arm_sequence(robot, ctrl, ctrl, f"m{motion}")
+            one = replace(one, meta=replace(one.meta, payload_mass=mass))
+            (twin,) = replay([one], true)
+            windows.append(replace(one, qpos=twin.qpos, qvel=twin.qvel, tau=twin.tau))
+    return windows
+
+
+def test_identification_begins_with_torque_where_validation_motions_say_so(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    windows = loaded(robot)
+    found = identify(windows[:12], robot, windows[12:], terms=())
+    (tried,) = found.tried
+    assert (found.chosen, tried.name, tried.kept, len(tried.before)) == ("torque", "torque", True, 2)
+    assert found.robot.kp == pytest.approx([12.0, 12.0], rel=0.03)
+    assert found.robot.payload_mounts[0].mass == pytest.approx(0.3, abs=0.05)
+    assert found.judged is not None
+    assert not (found.judged.kp == found.robot.kp).all()  # fitted once more, to the motions that judged it
+    silent = identify([replace(s, tau=None) for s in windows[:12]], robot, windows[12:], terms=())
+    assert (silent.judged, silent.tried) == (None, ())
+    assert found.after < silent.after
+
+
+def test_a_fit_from_torque_that_comes_to_follow_its_judges_worse_stays_as_they_judged_it(tmp_path, monkeypatch):
+    robot, own = write_arm(tmp_path / "arm"), TorqueFit.fit
+    windows = loaded(robot)
+
+    def astray(self, how):
+        found = own(self, how)
+        return found.with_servos({"elbow": {"offset": 0.1}}) if len(self.sequences) == len(windows) else found
+
+    monkeypatch.setattr(TorqueFit, "fit", astray)
+    found = identify(windows[:12], robot, windows[12:], terms=())
+    assert (found.chosen, found.judged) == ("torque", None)
+    assert abs(found.robot.offset).max() < 0.05
+
+
+def test_a_hand_and_where_payloads_hang_are_kept_in_the_folder(tmp_path):
+    robot = write_arm(tmp_path / "arm")
+    true = replace(moved(robot, -0.06, 0.3), nominal=robot)
+    save_robot(true, tmp_path / "kept")
+    again = load_robot(tmp_path / "kept")
+    assert again.payload_mounts == true.payload_mounts
+    assert again.before_identification.payload_mounts == robot.payload_mounts
+    assert model_hash(again) == model_hash(true) != model_hash(robot)
+    text = (tmp_path / "kept" / "robot.toml").read_text().replace('identified_mount."hand"', "identified_mount.foot")
+    (tmp_path / "kept" / "robot.toml").write_text(text)
+    with pytest.raises(RobotError, match=r"names no \[\[payload_mount\]\]"):
+        load_robot(tmp_path / "kept")

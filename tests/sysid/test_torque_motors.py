@@ -1,0 +1,114 @@
+"""gaponet torque: friction, inertia and delay of arms that are driven by torque or current."""
+
+import json
+
+import mujoco
+import numpy as np
+import pytest
+from arm import commands, write_arm
+
+from gaponet.cli.main import main
+from gaponet.robot.spec import load_robot
+from gaponet.sim.model import build_model
+
+TRUE = {"armature": (0.05, 0.03), "damping": (0.8, 0.3), "frictionloss": (0.12, 0.06)}
+DT, LATE = 0.005, 0.01  # s
+TOLD = """time_unit = "s"
+position_unit = "rad"
+ctrl = "q_{joint}"
+qpos = "q_{joint}"
+tau = "tau_{joint}"
+"""
+
+
+def drive(robot, seed, unit=1.0, rows=1200):
+    """A VIRTUAL arm by plain MuJoCo whose controller tells torques: time, angles, torques in `unit` N·m, (rows, 5)."""
+    model = build_model(robot)
+    model.actuator_gainprm[:] = model.actuator_biasprm[:] = 0
+    for name, values in TRUE.items():
+        getattr(model, f"dof_{name}").reshape(model.nv, -1)[:, 0] = values
+    model.opt.timestep = DT / 2
+    data, wanted, rng = mujoco.MjData(model), 1.6 * commands(rows, seed, DT), np.random.default_rng(seed)
+    data.qpos[:], pitch = wanted[0], rng.uniform(2.5, 3.5)
+    told, seen = [], []
+    for t in range(rows):
+        seen.append(data.qpos + rng.normal(0, 1e-4, 2))
+        probe = 0.8 * np.sin(2 * np.pi * pitch * t * DT)
+        told.append(12 * (wanted[t] - seen[-1]) - 0.6 * data.qvel + probe)
+        data.qfrc_applied[:] = told[max(t - round(LATE / DT), 0)]
+        mujoco.mj_step(model, data, 2)
+    return np.concatenate([DT * np.arange(rows)[:, None], seen, np.array(told) / unit], axis=1)
+
+
+def imported(folder, robot, logs):
+    (folder / "logs").mkdir(parents=True)
+    head = "time,q_shoulder,q_elbow,tau_shoulder,tau_elbow"
+    for name, table in logs.items():
+        np.savetxt(folder / "logs" / f"{name}.csv", table, delimiter=",", header=head, comments="")
+    (folder / "logs" / "logs.toml").write_text(TOLD)
+    words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(folder / "data")]
+    assert main(["import", str(folder / "logs"), *words]) == 0
+    return str(folder / "data")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("arm") / "arm")
+
+
+@pytest.mark.parametrize(("unit", "words"), [(1.0, []), (0.08, ["--current"])])
+def test_a_driven_arm_is_found_and_moves_as_the_simulator_does_after(robot, tmp_path, capsys, unit, words):
+    data = imported(tmp_path, robot, {f"m{k}": drive(robot, k, unit) for k in range(4)})
+    capsys.readouterr()
+    assert main(["torque", data, "--out", str(tmp_path / "found"), "--json", *words]) == 0
+    said = json.loads(capsys.readouterr().out)
+    for i, found in enumerate(said["joints"].values()):
+        assert found["constant"] == pytest.approx(unit, rel=0.03)
+        assert found["delay"] == pytest.approx(LATE, abs=0.003)
+        for name, values in TRUE.items():
+            assert found[name] == pytest.approx(values[i], rel=0.06)
+    before, after = said["angle"]["0.5"]
+    assert np.mean(after) < 0.05 * np.mean(before)
+    again = load_robot(tmp_path / "found")
+    assert again.damping[0] == said["joints"]["shoulder"]["damping"]
+    assert main(["export", str(tmp_path / "found"), "--to", "json"]) == 0  # judged by what the robot itself answers
+
+
+def test_a_push_by_hand_is_not_taken_for_friction(robot, tmp_path, capsys):
+    logs = {f"m{k}": drive(robot, k) for k in range(3)}
+    for table in logs.values():
+        table[400:520, 3] += 5.0  # told, and held by somebody
+    data = imported(tmp_path, robot, logs)
+    capsys.readouterr()
+    assert main(["torque", data, "--out", str(tmp_path / "found"), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["joints"]["shoulder"]
+    assert said["frictionloss"] == pytest.approx(0.12, rel=0.2)
+    assert said["armature"] == pytest.approx(0.05, rel=0.2)
+
+
+def test_commands_for_positions_say_that_there_are_none(robot, tmp_path, capsys):
+    data = imported(tmp_path, robot, {"one": drive(robot, 0, rows=1800)})
+    for words in (
+        ["gap", data],
+        ["identify", data, "--out", str(tmp_path / "x")],
+        ["train", data, "--out", str(tmp_path / "y")],
+    ):
+        capsys.readouterr()
+        assert main(words) == 2, words
+        assert "gaponet torque" in capsys.readouterr().err
+    assert main(["doctor", data]) == 0
+    assert (
+        main(["torque", data, "--out", str(tmp_path / "found")]) == 0
+    )  # one recording: its parts fit and judge in turn
+
+
+def test_logs_of_positions_alone_have_no_torque_to_fit(robot, tmp_path, capsys):
+    table = drive(robot, 0, rows=300)
+    (tmp_path / "logs").mkdir()
+    np.savetxt(tmp_path / "logs/a.csv", table[:, :3], delimiter=",", header="time,q_shoulder,q_elbow", comments="")
+    (tmp_path / "logs/logs.toml").write_text(TOLD.replace('tau = "tau_{joint}"\n', ""))
+    words = ["--robot", str(robot.folder), "--unit-id", "a", "--payload-mass", "0", "--out", str(tmp_path / "data")]
+    assert main(["import", str(tmp_path / "logs"), *words]) == 0
+    assert main(["torque", str(tmp_path / "data"), "--out", str(tmp_path / "found")]) == 2
+    assert "has no torque of every operated joint" in capsys.readouterr().err
+    assert not (tmp_path / "found").exists()

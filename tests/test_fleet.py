@@ -1,0 +1,93 @@
+"""gaponet fleet: a night of many robots, those that drifted calibrated, and who since when."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from arm import commands, record, write_arm
+
+from gaponet.cli.main import main
+from gaponet.data.store import Dataset
+from gaponet.fleet import history, since
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import load_robot
+from gaponet.sysid.evidence import known
+from gaponet.sysid.knowledge import Knowledge
+
+
+def played(robot, unit, first, count, kp):
+    noise = np.random.default_rng(first)
+    made = [record(robot, commands(400, first + k), f"m{first + k}", kp=kp, delay=1, unit=unit) for k in range(count)]
+    return [replace(s, qpos=s.qpos + 4e-4 * noise.standard_normal(s.qpos.shape).astype(np.float32)) for s in made]
+
+
+def logs(robot, place, unit, first, kp=0.8):
+    data = Dataset.create(place / unit, robot)
+    for one in played(robot, unit, first, 5, kp):
+        data.append(one)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Three identified arms; the second is softer from the second night on, the third is silent that night."""
+    place = tmp_path_factory.mktemp("site")
+    robot = write_arm(place / "arm")
+    for k, unit in enumerate(("a1", "a2", "a3")):
+        save_robot(robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "robots" / unit)
+        mine = load_robot(place / "robots" / unit)
+        known(mine, played(robot, unit, 50 * k, 6, 0.8), played(robot, unit, 500 + k, 2, 0.8), nthread=1).save(
+            mine.folder
+        )
+        logs(robot, place / "night1", unit, 1000 + 10 * k)
+        if unit != "a3":
+            logs(robot, place / "night2", unit, 2000 + 10 * k, 0.7 if unit == "a2" else 0.8)
+    return place
+
+
+def asked(site, name, capsys):
+    code = 0
+    words = [site / "robots", site / name, "--out", site / "out", "--night", name, "--workers", "2", "--json"]
+    try:
+        code = main(["fleet", *map(str, words)])
+    except SystemExit as end:
+        code = end.code
+    return code, json.loads(capsys.readouterr().out)["robots"]
+
+
+def test_two_nights_of_three_arms(site, capsys):
+    code, first = asked(site, "night1", capsys)
+    assert (code, {r: n["verdict"] for r, n in first.items()}) == (0, dict.fromkeys(("a1", "a2", "a3"), "same"))
+    code, second = asked(site, "night2", capsys)
+    assert code == 1
+    assert {r: n["verdict"] for r, n in second.items()} == {"a1": "same", "a2": "drifted", "a3": "not asked"}
+    assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
+    before, after = second["a2"]["calibrated"]
+    assert after < 0.5 * before
+    today = Knowledge.load(load_robot(site / "out" / "calibrated" / "a2"))
+    assert [s["made_by"] for s in today.sources][-1] == "calibrate"
+    assert since(history(site / "out" / "a2.json")) == "night2"
+    page = (site / "out" / "fleet.html").read_text(encoding="utf-8")
+    assert "3 robots: 1 same, 1 drifted, 1 not asked" in page
+    assert "shoulder, kp" in page
+
+    # The same command goes on: what was asked is not asked again, what could not be read is.
+    kept = (site / "out" / "a2.json").stat().st_mtime_ns
+    logs(load_robot(site / "arm"), site / "night2", "a3", 2500)
+    code, again = asked(site, "night2", capsys)
+    assert {r: n["verdict"] for r, n in again.items()} == {"a1": "same", "a2": "drifted", "a3": "same"}
+    assert (site / "out" / "a2.json").stat().st_mtime_ns == kept
+    assert [n["night"] for n in history(site / "out" / "a3.json")] == ["night1", "night2"]
+
+
+def test_it_drifted_since_the_first_night_in_a_row():
+    nights = [
+        {"night": str(k), "verdict": v} for k, v in enumerate(("drifted", "same", "drifted", "not asked", "drifted"))
+    ]
+    assert since(nights) == "2"
+    assert since(nights[:2]) == ""
+
+
+def test_a_folder_without_robots_is_refused(tmp_path, capsys):
+    assert main(["fleet", str(tmp_path), str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert "holds no robot folders" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""Extensions of other packages: a broken one is a warning, and none replaces what gaponet has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gaponet import plugins
+from gaponet.base.errors import UsageError
+from gaponet.cli.main import main
+from gaponet.data.formats import FORMATS, detect, formats
+from gaponet.experiments.real.bench import load_method
+from gaponet.hw.drivers.open import open_driver
+
+
+@pytest.fixture
+def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Install a package `rival` with these entry points and modules; HERE is a prefix of module names."""
+
+    def install(points: str, **modules: str) -> None:
+        info = tmp_path / "rival-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: rival\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text(points.replace("HERE", tmp_path.name))
+        for name, text in modules.items():
+            (tmp_path / f"{tmp_path.name}_{name}.py").write_text(text)
+        monkeypatch.syspath_prepend(str(tmp_path))
+        forget()
+
+    def forget() -> None:
+        plugins._points.cache_clear()
+        plugins._WARNED.clear()
+
+    yield install
+    monkeypatch.undo()
+    forget()
+
+
+BROKEN = {
+    "the import fails": ("import no_such_module", "(ModuleNotFoundError"),
+    "the module raises": ("raise ValueError('two\\nlines')", "(ValueError: two"),
+    "the module ends Python": ("raise SystemExit(3)", "(SystemExit"),
+    "it is no reader": ("", "(AttributeError"),
+    "it fails on a file": ("EXTRA = ''\ndef detects(path): raise RuntimeError('no')", "(RuntimeError: no"),
+}
+
+
+@pytest.mark.parametrize(("source", "said"), BROKEN.values(), ids=BROKEN)
+def test_a_broken_format_is_one_warning_and_every_other_is_read(installed, tmp_path, caplog, source, said):
+    installed("[gaponet.formats]\nwav = HERE_wav\n", wav=source)
+    (tmp_path / "log.npz").touch()
+    for _ in range(2):
+        assert detect(tmp_path / "log.npz") == "npz"
+        assert main(["formats"]) == 0
+    (text,) = [r.getMessage() for r in caplog.records]
+    assert text.startswith("Warning: rival: ")
+    assert said in text
+    assert text.endswith("gaponet continues without it")
+
+
+def test_a_built_in_name_is_not_replaced_and_one_line_says_so(installed, caplog):
+    installed("[gaponet.formats]\nsage = json\n[gaponet.drivers]\nso101 = json:loads\n")
+    assert formats() == formats() == FORMATS
+    with pytest.raises(UsageError, match="no driver 'x'; use one of so101, unitree"):
+        open_driver("x", "so101")
+    assert [r.getMessage() for r in caplog.records] == [
+        "Warning: rival: 'sage' of gaponet.formats exists already and is not replaced",
+        "Warning: rival: 'so101' of gaponet.drivers exists already and is not replaced",
+    ]
+
+
+def test_an_extension_adds_a_format_a_driver_and_a_method(installed, tmp_path, capsys, caplog):
+    installed(
+        "[gaponet.formats]\nwav = HERE_wav\n[gaponet.drivers]\ntoy = HERE_toy:Toy\n"
+        "[gaponet.methods]\nhalf = HERE_toy:half\n",
+        wav='"""Sound."""\nEXTRA = ""\ndef detects(path): return path.suffix == ".wav"',
+        toy="class Toy:\n    def __init__(self, robot, port): self.robot, self.port = robot, port\n\n"
+        "def half(q): return q",
+    )
+    assert main(["formats"]) == 0
+    assert "Sound" in capsys.readouterr().out
+    (tmp_path / "a.wav").touch()
+    assert detect(tmp_path / "a.wav") == "wav"
+    driver = open_driver("toy", "so101", port="x")
+    assert (driver.robot.name, driver.port) == ("so101", "x")
+    name, method = load_method("half")
+    assert (name, method(3)) == ("half", 3)
+    assert caplog.records == []
+
+
+def test_a_broken_driver_is_refused(installed):
+    installed("[gaponet.drivers]\ntoy = HERE_toy:Toy\n", toy="import no_such_module")
+    with pytest.raises(UsageError, match="the package that brings driver 'toy' is broken"):
+        open_driver("toy", "so101")
+
+
+def test_a_failure_of_gaponet_itself_is_raised(monkeypatch):
+    with pytest.raises(ZeroDivisionError):
+        plugins.attempt("gaponet.data.formats.npz", lambda: 1 / 0, None)

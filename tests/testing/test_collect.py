@@ -1,0 +1,250 @@
+"""Collecting: complete, virtual on every line, the same on any number of processes and after being killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from arm import write_arm
+
+from gaponet.base.errors import DatasetError, FolderError, UsageError
+from gaponet.base.files import writing
+from gaponet.data.store import Dataset
+from gaponet.robot.spec import load_robot
+from gaponet.sim.model import model_hash
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.recipe import takes
+from gaponet.testing.collect import Recipe, collect, load_recipe
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.physics import Physics
+
+RECIPE = Recipe(
+    "test",
+    payloads=(0.0, 0.2),
+    units=("virtual-2",),
+    motions=("steps-elbow", "tour-all-0"),
+    rates=(50.0, 100.0),
+    repetitions=2,
+)
+
+
+def hashes(folder):
+    """What a dataset holds, in the order of its journal: id → hash of the samples."""
+    return {entry.id: entry.hash for entry in Dataset(folder).entries}
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return write_arm(tmp_path_factory.mktemp("robots") / "arm")
+
+
+@pytest.fixture(scope="module")
+def fleet(spec):
+    return load_fleet("easy", spec)
+
+
+@pytest.fixture(scope="module")
+def whole(spec, fleet, tmp_path_factory):
+    """The recipe, collected in one go in this process."""
+    out = tmp_path_factory.mktemp("collected") / "whole"
+    done = collect(spec, fleet, RECIPE, out, seed=5, nproc=1)
+    return out, done
+
+
+def test_every_take_is_there_once_and_says_virtual(whole, spec):
+    out, done = whole
+    dataset = Dataset(out)
+    assert done.written == len(dataset) == 2 * 2 * 2 * 2
+    assert done.hours == pytest.approx(dataset.hours())
+    keys = {(m.motion, m.unit_id, m.payload_mass, e.dt, m.repetition) for e in dataset.entries for m in [e.meta]}
+    assert len(keys) == 16
+    assert all(
+        e.meta.virtual and e.meta.unit_id.startswith("virtual-") and "virtual" in e.meta.source for e in dataset.entries
+    )
+    assert set(dataset.entries[0].channels) == {"ctrl", "qpos", "qvel", "qacc", "tau", "tau_eq", "temperature"}
+    assert json.loads((out / "collect.json").read_text())["virtual"] is True
+
+
+def test_hidden_numbers_stay_out_of_the_dataset(whole):
+    out, _ = whole
+    text = (out / "sequences.jsonl").read_text() + (out / "collect.json").read_text()
+    names = {f.name for f in fields(Physics)} - {"delay"}  # the importer writes its own estimate of a delay
+    assert not [name for name in names if f'"{name}"' in text]
+
+
+def test_a_row_is_the_state_before_its_command(whole, spec):
+    """Row convention: the robot stands still under row 0's command, and no motion can come before its cause."""
+    dataset = Dataset(whole[0])
+    entry = next(e for e in dataset.entries if e.meta.motion == "steps-elbow" and e.dt == 0.02)
+    s = dataset.read(entry)
+    column = spec.index(["elbow"])[0]
+    assert np.array_equal(s.ctrl, Library(spec, 5, 0.2).make("steps-elbow").sample(0.02).astype(np.float32))
+    told = int(np.argmax(np.abs(s.ctrl[:, column] - s.ctrl[0, column]) > 1e-3))
+    moved = int(np.argmax(np.abs(s.qpos[:, column] - s.qpos[0, column]) > 5e-3))
+    assert np.abs(s.qvel[:5, column]).max() < 0.06  # noise
+    assert told < moved < told + 15
+
+
+def test_events_tell_begin_and_end(whole):
+    dataset = Dataset(whole[0])
+    for entry in dataset.entries:
+        events = entry.meta.notes["events"]
+        assert events[0] == {"time": 0.0, "kind": "motion_start"}
+        assert events[-1] == {"time": pytest.approx(entry.rows * entry.dt), "kind": "motion_end"}
+        assert all(e["kind"] in ("packet_lost", "torque_limit", "hot") for e in events[1:-1])
+    assert any(e["kind"] == "packet_lost" for entry in dataset.entries for e in entry.meta.notes["events"])
+
+
+def test_repetitions_differ_a_little(whole):
+    dataset = Dataset(whole[0])
+    same = [e for e in dataset.entries if e.meta.motion == "tour-all-0" and e.dt == 0.02 and e.meta.payload_mass == 0.2]
+    first, second = (dataset.read(e) for e in same)
+    assert np.array_equal(first.ctrl, second.ctrl)
+    assert not np.array_equal(first.qpos, second.qpos)
+    assert np.abs(first.qpos - second.qpos).mean() < 0.01
+    assert first.temperature[0, 0] != second.temperature[0, 0]
+
+
+def test_several_processes_record_the_same_in_the_same_order(whole, spec, fleet, tmp_path):
+    collect(spec, fleet, RECIPE, tmp_path / "two", seed=5, nproc=2)
+    assert list(hashes(tmp_path / "two").items()) == list(hashes(whole[0]).items())
+
+
+def test_collecting_again_adds_nothing_and_a_larger_recipe_adds_the_rest(whole, spec, fleet, tmp_path):
+    less = replace(RECIPE, rates=(50.0,), repetitions=1)
+    first = collect(spec, fleet, less, tmp_path, seed=5, nproc=1)
+    again = collect(spec, fleet, less, tmp_path, seed=5, nproc=1)
+    rest = collect(spec, fleet, RECIPE, tmp_path, seed=5, nproc=1)
+    assert (first.written, again.written, again.present, rest.written, rest.present) == (4, 0, 4, 12, 4)
+    assert hashes(tmp_path) == hashes(whole[0])
+
+
+CHILD = """
+import sys
+import gaponet.testing.collect
+from gaponet.testing.collect import Recipe, collect
+from gaponet.robot.spec import load_robot
+from gaponet.testing.fleet import load_fleet
+if __name__ == "__main__":
+    gaponet.testing.collect.ROWS = (4, 4)  # four jobs: two are still being played when two are written
+    robot = load_robot(sys.argv[1])
+    recipe = Recipe("test", (0.0, 0.2), ("virtual-2",), ("steps-elbow", "tour-all-0"), (), (50.0, 100.0), 2)
+    collect(robot, load_fleet("easy", robot), recipe, sys.argv[2], seed=5, nproc=2)
+"""
+
+
+def test_killed_at_a_random_moment_it_ends_with_the_same_dataset(whole, spec, tmp_path):
+    """kill -9 while two processes record and write: nothing is lost, doubled or left lying about.
+
+    benchmarks/kills.py does it to every command.
+    """
+    out, script = tmp_path / "killed", tmp_path / "child.py"
+    script.write_text(CHILD)
+    command = [sys.executable, str(script), str(spec.mjcf.parent), str(out)]
+    journal = out / "sequences.jsonl"
+    child = subprocess.Popen(command, start_new_session=True)
+    deadline = time.monotonic() + 600  # on a machine with much other work
+    while time.monotonic() < deadline and child.poll() is None:
+        if journal.is_file() and journal.read_text().count("\n") >= 1:
+            break
+        time.sleep(0.005)
+    time.sleep(np.random.default_rng().uniform(0, 0.05))  # any moment must do
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert 0 < len(Dataset(out)) <= 16  # all of them where this process had to wait for its turn
+    _wait_for_orphans(child.pid)
+    collect(spec, load_fleet("easy", spec), RECIPE, out, seed=5, nproc=1)
+    assert list(hashes(out).items()) == list(hashes(whole[0]).items())
+    assert len(list((out / "sequences").glob("*.parquet"))) == 16
+    assert not list((out / "sequences").glob(".*"))
+    dataset = Dataset(out)
+    assert all(dataset.has_twin(entry, model_hash(spec)) for entry in dataset.entries)
+
+
+def _wait_for_orphans(session):
+    """Workers of a killed parent end by themselves within a second."""
+    deadline = time.monotonic() + 300
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(session, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("workers of a killed collect are still alive after 300 s")
+
+
+def test_a_dataset_keeps_the_robot_with_the_gains_that_its_fleet_sets(spec, fleet, tmp_path):
+    firm, less = replace(fleet, gain_scale=3.0), replace(RECIPE, motions=("steps-elbow",), rates=(50.0,), repetitions=1)
+    collect(spec, firm, less, tmp_path, seed=5, nproc=1)
+    kept = load_robot(tmp_path / "robot")
+    assert kept.kp.tolist() == list(Dataset(tmp_path).entries[0].meta.kp) == [60.0, 60.0]
+    assert collect(kept, firm, less, tmp_path, seed=5, nproc=1).written == 0
+
+
+def test_what_something_else_collected_is_not_mixed(whole, spec):
+    out, _ = whole
+    with pytest.raises(DatasetError, match=r"was collected with seed 5, not 6 \(collect.json\); choose another folder"):
+        collect(spec, load_fleet("easy", spec), RECIPE, out, seed=6, nproc=1)
+    with pytest.raises(DatasetError, match="was collected with fleet 'easy', not 'shifted'"):
+        collect(spec, load_fleet("shifted", spec), RECIPE, out, seed=5, nproc=1)
+
+
+def test_two_collectors_do_not_share_a_folder(spec, fleet, tmp_path):
+    collect(spec, fleet, replace(RECIPE, motions=("creep-elbow",), rates=(50.0,), repetitions=1), tmp_path, nproc=1)
+    with ThreadPoolExecutor(1) as other, writing(tmp_path, "dataset"):
+        asked = other.submit(collect, spec, fleet, RECIPE, tmp_path, nproc=1)
+        with pytest.raises(FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"):
+            asked.result()
+
+
+def test_mistakes_in_a_recipe_are_named(spec, fleet, tmp_path):
+    with pytest.raises(UsageError, match="no recipe 'big': in the package are arm, demo, simlifter, small"):
+        load_recipe("big")
+    with pytest.raises(UsageError, match="recipe 'test': no motion of this robot matches 'reach"):
+        collect(spec, fleet, replace(RECIPE, motions=("reach-*",)), tmp_path / "a", nproc=1)
+    with pytest.raises(UsageError, match="fleet 'easy' has no unit 'virtual-9'"):
+        collect(spec, fleet, replace(RECIPE, units=("virtual-9",)), tmp_path / "a", nproc=1)
+    for wrong in ({"repetitions": 0}, {"units": ()}, {"rates": (0.0,)}):
+        with pytest.raises(UsageError, match=f"recipe: {next(iter(wrong))}.*should"):
+            collect(spec, fleet, replace(RECIPE, **wrong), tmp_path / "a", nproc=1)
+    file = tmp_path / "mine.toml"
+    file.write_text('motions = ["*"]\npayloads = [0]\nunit = ["virtual-1"]\n')
+    with pytest.raises(UsageError, match=r"mine.toml: units: is missing .*; fields are name, payloads, units"):
+        load_recipe(file)
+    file.write_text('motions = ["*"]\nunits = ["virtual-1"]\n')
+    with pytest.raises(UsageError, match=r"mine.toml: payloads: is missing; fields are name, payloads"):
+        load_recipe(file)
+
+
+def test_a_recipe_may_play_motion_files(spec, fleet, tmp_path):
+    (tmp_path / "swing.txt").write_text("shoulder,elbow\n" + "".join(f"{0.001 * t},{-0.001 * t}\n" for t in range(100)))
+    (tmp_path / "mine.toml").write_text('files = ["swing.txt"]\npayloads = [0.1]\nunits = ["virtual-1"]\n')
+    collect(spec, fleet, load_recipe(tmp_path / "mine.toml"), tmp_path / "out", nproc=1)
+    (entry,) = Dataset(tmp_path / "out").entries
+    assert entry.meta.motion == "swing"
+
+
+def test_the_whole_simlifter_recipe_is_as_large_as_the_paper_says():
+    robot = load_robot("h1_2")
+    recipe = load_recipe("simlifter")
+    wanted = takes(recipe, Library(robot).names(recipe.variants))
+    assert len(wanted) == len(set(wanted)) >= 11198
+    assert {t.payload for t in wanted} == {0.0, 1.0, 2.0, 3.0}
+    assert {t.rate for t in wanted} == {50.0, 100.0}
+    levels = {"all" in t.motion.split("-") for t in wanted}
+    assert levels == {True, False}
+
+
+def test_the_demo_recipe_can_be_played_by_h1_2():
+    robot = load_robot("h1_2")
+    recipe = load_recipe("demo")
+    library = Library(robot)
+    names = {t.motion for t in takes(recipe, library.names(recipe.variants))}
+    assert len(names) == 16
+    assert all(library.make(name).duration > 4 for name in sorted(names)[:2])

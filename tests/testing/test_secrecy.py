@@ -1,0 +1,40 @@
+"""Nothing that learns, corrects, commands or measures may look at the hidden physics."""
+
+import ast
+from pathlib import Path
+
+import gaponet
+
+PACKAGE = Path(gaponet.__file__).parent
+BLIND = [p for p in PACKAGE.iterdir() if p.name not in ("testing", "experiments", "cli", "__pycache__")]
+
+
+def trees():
+    for file in (f for place in BLIND for f in ([place] if place.is_file() else place.rglob("*.py"))):
+        if file.suffix == ".py":
+            yield file, list(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+
+
+def imported(nodes):
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (a.name for a in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{a.name}" for a in node.names)
+
+
+def test_no_blind_module_imports_the_virtual_robots():
+    seen = 0
+    for file, nodes in trees():
+        seen += 1
+        for name in imported(nodes):
+            assert not name.startswith("gaponet.testing"), f"{file} imports {name}"
+    assert seen > 150
+
+
+def test_no_blind_module_names_the_fleet_files():
+    for file, nodes in trees():
+        for node in nodes:
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and "\n" not in node.value:
+                assert "fleets" not in node.value, file
+                assert "gaponet.testing" not in node.value, file

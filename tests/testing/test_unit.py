@@ -1,0 +1,393 @@
+"""A virtual robot as a whole: with all effects off it is the nominal simulator, and each effect shows its signature."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from gaponet.robot.spec import load_robot
+from gaponet.sim.batch import BatchSim
+from gaponet.sim.dynamics import static_torque
+from gaponet.sim.model import build_model, idle_joints
+from gaponet.testing.fleet import load_fleet
+from gaponet.testing.physics import EFFECTS, Physics, neutral
+from gaponet.testing.unit import VirtualRobot
+
+KP = 20.0  # of both joints of the test arm
+FIELDS = {e: [f.name for f in fields(Physics) if f.metadata["effect"] == e] for e in EFFECTS}
+
+
+def unit(n=2, **values):
+    """A unit without any effect but these: one number for all joints."""
+    off = neutral(n)
+    return replace(off, **{k: np.full_like(getattr(off, k), v) for k, v in values.items()})
+
+
+def run(robot, units, ctrl, payload=0.0, dt=0.02, start=None, **how):
+    """Play (T, n) targets on every unit; true positions after each period (T, N, n) and the robots."""
+    robots = VirtualRobot(robot, units, [(payload, "both")] * len(units), dt, **how)
+    every = lambda row: np.repeat(row[None], len(units), axis=0)  # noqa: E731
+    robots.reset(every(ctrl[0]), list(range(len(units))), start=None if start is None else every(start))
+    path = []
+    for row in ctrl:
+        robots.step(every(row))
+        path.append(robots.true_qpos())
+    return np.array(path), robots
+
+
+def hold(shoulder, elbow=0.0, seconds=1.0, dt=0.02):
+    return np.repeat(np.array([[shoulder, elbow]]), round(seconds / dt), axis=0)
+
+
+def test_with_all_effects_off_h1_2_is_the_nominal_simulator_for_ten_seconds():
+    robot = load_robot("h1_2")
+    payloads = [(0.0, "both"), (3.0, "both"), (3.0, "left")]
+    robots = VirtualRobot(robot, [neutral(27)] * 3, payloads, timestep=robot.timestep)
+    time = np.arange(round(10 / robot.dt))[:, None] * robot.dt
+    wave = 0.4 * np.sin(2 * np.pi * 0.4 * time + np.arange(27)) - 0.4 * np.sin(np.arange(27))
+    robots.reset(np.repeat(wave[:1], 3, axis=0), [1, 2, 3])
+    nominal = BatchSim(robot, [(mass, side, robot.dt) for mass, side in payloads])
+    nominal.reset(slice(None), robots.true_qpos(), np.zeros(27))
+    for row in wave:
+        targets = np.repeat(row[None], 3, axis=0)
+        robots.step(targets)
+        nominal.step(targets)
+        assert np.abs(robots.true_qpos() - nominal.qpos).max() < 1e-6
+
+
+def test_standing_legs_change_nothing_for_the_arms():
+    robot = load_robot("h1_2")
+    locked = idle_joints(robot, robot.operated)
+    arms = robot.index([n for n in robot.joint_names if n not in locked])
+    time = np.arange(100)[:, None] * robot.dt
+    ctrl = np.zeros((100, 27))
+    ctrl[:, robot.operated_index] = 0.3 * np.sin(2 * time + np.arange(10)) - 0.3 * np.sin(np.arange(10))
+    physics = load_fleet("easy", robot).unit("virtual-1")
+    whole, _ = run(robot, [physics], ctrl, 3.0)
+    upper, _ = run(robot, [physics], ctrl, 3.0, locked=locked)
+    assert len(locked) == 12
+    assert np.abs(whole - upper)[..., arms].max() < 1e-6
+
+
+def test_a_row_does_not_depend_on_its_company(arm):
+    fleet = load_fleet("easy", arm)
+    ctrl = hold(0.3) + 0.3 * np.sin(np.linspace(0, 9, 50))[:, None]
+    alone, _ = run(arm, [fleet.unit("virtual-1")], ctrl, 0.2)
+    among, _ = run(arm, [fleet.unit(f"virtual-{k}") for k in (1, 2, 3, 4)], ctrl, 0.2)
+    assert np.array_equal(alone[:, 0], among[:, 0])
+
+
+def test_a_weak_drive_sags_by_the_torque_over_what_it_delivers(arm):
+    # holding level: τ = 9.81 · (0.3·0.1 + 0.2·0.3) = 0.883 N·m at the shoulder; friction off to see PD alone
+    model = build_model(arm)
+    path, _ = run(arm, [unit(kp_scale=0.8), unit(kt_scale=0.8), unit()], hold(0.0, seconds=3.0))
+    for i, share in enumerate((0.8, 0.8, 1.0)):
+        q = path[-1, i]
+        torque = static_torque(model, q[None])[0]
+        assert (0.0 - q) * KP * share == pytest.approx(torque, abs=0.06)  # the nominal friction band, 0.05 N·m
+
+
+def test_friction_opens_a_hysteresis_loop_of_twice_its_torque(arm):
+    time = np.arange(0, 12, 0.02)
+    slow = 1.2 + 0.2 * np.abs((time / 6 + 1) % 2 - 1)  # up and down at 33 mrad/s, the arm nearly hanging
+    ctrl = np.stack([slow, np.zeros_like(slow)], axis=1)
+    width = {}
+    for friction in (0.0, 0.3):
+        path, _ = run(arm, [unit(friction=friction)], ctrl)
+        q = path[:, 0, 0]
+        width[friction] = q[len(q) * 3 // 4] - q[len(q) // 4]  # same command, coming down and going up
+    assert width[0.0] == pytest.approx(2 * 0.05 / KP + 2 * 0.5 * 0.033 / KP, abs=1e-3)  # nominal friction and damping
+    assert width[0.3] - width[0.0] == pytest.approx(2 * 0.3 / KP, rel=0.1)
+
+
+def test_a_stuck_joint_does_not_creep(arm):
+    path, _ = run(arm, [unit(friction=0.5)], hold(0.4, seconds=20.0), start=np.array([0.42, 0.01]))
+    assert np.abs(path[-1] - path[50]).max() < 5e-4  # friction is a stiff constraint, not a rigid one: 20 µrad/s
+
+
+HANGING = np.array([1.4, np.pi / 2 - 1.4])  # no weight on the elbow
+
+
+def pushed(elbow, seconds=0.4, dt=0.02):
+    return np.repeat(HANGING[None] + [[0.0, elbow]], round(seconds / dt), axis=0)
+
+
+def test_bristles_give_way_like_a_spring_and_come_back(arm):
+    slowly = np.concatenate([np.linspace(0, 0.02, 50), np.linspace(0.02, 0, 50)])
+    ctrl = HANGING + np.stack([0 * slowly, slowly], axis=1)
+    path, _ = run(arm, [unit(friction=1.0, presliding=0.02), unit(friction=1.0)], ctrl, start=HANGING)
+    q = path[:, :, 1] - HANGING[1]
+    # 20 (0.02 − x) = 1.05 (1 − exp(−x / 0.02)) at 6.15 mrad; back, −20 x = −1.05 + 1.33 exp(−(6.15 mrad − x) / 0.02)
+    assert q[49, 0] == pytest.approx(6.15e-3, rel=0.03)
+    assert q[-1, 0] == pytest.approx(0.85e-3, abs=0.2e-3)
+    assert np.abs(q[:, 1]).max() < 1e-4  # rigid friction holds
+
+
+def test_a_robot_at_rest_stays_there_under_bristles(arm):
+    path, _ = run(arm, [unit(friction=1.0, presliding=0.002)], hold(0.4, 0.3, 20.0))
+    assert np.abs(path[-1] - path[0]).max() < 1e-5
+
+
+def test_a_compliant_joint_hangs_below_what_its_encoder_says(arm):
+    # 0.883 N·m at the shoulder through 0.1 rad at 5 N·m: 17.7 mrad that the encoder does not see
+    path, robots = run(arm, [unit(windup=0.1), unit()], hold(0.0, seconds=3.0))
+    seen = robots.read().qpos
+    twist = seen[:, 0] - path[-1, :, 0]
+    load = static_torque(build_model(arm), path[-1, :1])[0, 0]
+    assert abs(load) == pytest.approx(0.883, rel=0.05)
+    assert twist[0] == pytest.approx(0.1 * load / 5.0, abs=0.05 * 0.1 / 5.0)  # less what friction carries
+    assert twist[1] == 0.0
+    assert seen[0, 0] == pytest.approx(seen[1, 0], abs=0.006)  # the drive holds its own side as well as ever
+
+
+def test_the_current_loop_delays_by_its_time_constant(arm):
+    given = []
+    for time in (0.0, 0.05):
+        _, robots = run(arm, [unit(current_time=time, friction=9.0)], pushed(0.0), start=HANGING)
+        force = robots.batch.bind("actuator_force")  # of the call after this
+        robots.step(pushed(0.1)[:1])
+        given.append(force[0, 1])
+    assert given[0] == pytest.approx(0.1 * KP, rel=0.01)
+    assert given[1] == pytest.approx(0.1 * KP * (1 - np.exp(-0.02 / 0.05)), rel=0.02)
+
+
+def test_a_joint_does_not_reach_its_no_load_speed(arm):
+    fastest = []
+    for limit in (np.inf, 2.0):
+        path, _ = run(arm, [unit(no_load_speed=limit, corner=0.5)], pushed(1.2), start=HANGING)
+        fastest.append(np.diff(path[:, 0, 1]).max() / 0.02)
+    assert fastest[0] > 3.0
+    # where 5 N·m · (1 − v/2) / 0.5 is what damping and friction take, 0.5 v + 0.05: v = 1.8
+    assert fastest[1] == pytest.approx(1.8, abs=0.05)
+
+
+def test_a_warm_joint_has_less_friction(arm):
+    ramp = np.stack([np.full(220, HANGING[0]), HANGING[1] + np.minimum(np.arange(220) / 1000, 0.2)], axis=1)
+    short = []
+    for warmth in (0.0, 50.0):
+        robots = VirtualRobot(arm, [unit(friction=1.0, thinning=0.014)], [(0.0, "both")])
+        robots.reset(ramp[:1], [0], warmth, start=HANGING[None])
+        for row in ramp:
+            robots.step(row[None])
+        short.append(ramp[-1, 1] - robots.true_qpos()[0, 1])
+    # it stops short by its friction over kp: 1.05 / 20 cold, exp(−0.7) of that 50 K warmer
+    assert short == pytest.approx([1.05 / KP, 1.05 / KP * np.exp(-0.7)], rel=0.1)
+
+
+def test_load_friction_widens_with_the_payload(arm):
+    time = np.arange(0, 8, 0.02)
+    ctrl = np.stack([0.2 * np.abs((time / 4 + 1) % 2 - 1), np.zeros_like(time)], axis=1)
+    width = []
+    for payload in (0.0, 0.4):
+        path, _ = run(arm, [unit(efficiency=0.85)], ctrl, payload)
+        width.append(path[300, 0, 0] - path[100, 0, 0])
+    # (1 − η + 1/η − 1)·Δτ / kp with Δτ = 9.81 · 0.4 · 0.4 m = 1.57 N·m
+    assert width[1] - width[0] == pytest.approx((1 / 0.85 - 0.85) * 1.57 / KP, rel=0.25)
+
+
+def test_delay_holds_the_joint_still_until_it_has_passed(arm):
+    ctrl = np.concatenate([hold(1.0, seconds=0.2), hold(1.2, seconds=0.3)])
+    path, _ = run(arm, [unit(), unit(delay=0.06)], ctrl)
+    begun = np.abs(path - path[0]) > 1e-4
+    assert [int(begun[:, i, 0].argmax()) for i in range(2)] == [10, 13]  # three periods of 20 ms later
+
+
+def test_backlash_delays_a_reversal(arm):
+    # hanging, so that the PD torque turns with the command
+    ctrl = np.stack([np.full(150, np.pi / 2 - 0.08), np.where(np.arange(150) < 75, 0.1, -0.1)], axis=1)
+    path, _ = run(arm, [unit(), unit(backlash=0.02)], ctrl)
+    late = path[78, 1, 1] - path[78, 0, 1]
+    assert late > 0.01
+
+
+def test_damping_lags_in_proportion_to_speed(arm):
+    time = np.arange(0, 2, 0.02)
+    ctrl = np.stack([1.0 + 0.0 * time, 0.5 * time - 0.5], axis=1)
+    path, _ = run(arm, [unit(), unit(damping=1.0)], ctrl)
+    assert path[60, 0, 1] - path[60, 1, 1] == pytest.approx(1.0 * 0.5 / KP, rel=0.1)
+
+
+def test_a_cable_pulls_towards_its_angle(arm):
+    path, _ = run(arm, [unit(), unit(cable_stiffness=4.0, cable_angle=-1.0)], hold(1.4, 0.3, 2.0))
+    q0, q1 = path[-1, :, 1]
+    # 20 (0.3 − q) + 4 (−1 − q) = gravity, and 20 (0.3 − q0) = the same gravity: q = (20 q0 − 4) / 24
+    assert q1 == pytest.approx((20 * q0 - 4) / 24, abs=0.01)
+
+
+def test_heavier_links_and_a_leaning_base_change_the_sag(arm):
+    units = [unit(), unit(mass_scale=1.5), unit(tilt_pitch=0.2)]
+    path, _ = run(arm, units, hold(0.0, 0.0, 3.0))
+    sag = path[-1, :, 0]
+    # 0.883 N·m of weight at the shoulder, ± friction band of 0.05 N·m on each
+    assert sag[1] / sag[0] == pytest.approx(1.5, abs=0.17)
+    assert sag[2] < sag[0]
+
+
+def test_cogging_ripples_along_the_way(arm):
+    time = np.arange(0, 6, 0.02)
+    ctrl = np.stack([np.full_like(time, 1.2), 0.2 * time - 0.6], axis=1)
+    path, _ = run(arm, [unit(), unit(cogging=0.3, cogging_count=12.0)], ctrl)
+    ripple = path[:, 1, 1] - path[:, 0, 1]
+    q = path[:, 0, 1]
+    assert np.corrcoef(ripple[20:], np.sin(12 * q[20:]))[0, 1] > 0.8
+    assert np.ptp(ripple[20:]) == pytest.approx(2 * 0.3 / KP, rel=0.5)
+
+
+def test_a_hot_motor_sags_more(arm):
+    physics = unit(kt_drift=0.002)
+    sag = []
+    for warmth in (0.0, 50.0):
+        robots = VirtualRobot(arm, [physics], [(0.3, "both")])
+        robots.reset(np.zeros((1, 2)), [0], warmth)
+        for _ in range(100):
+            robots.step(np.zeros((1, 2)))
+        sag.append(robots.true_qpos()[0, 0])
+    assert sag[1] / sag[0] == pytest.approx(1 / 0.9, abs=0.04)
+
+
+def test_a_bent_cable_widens_the_loop_of_its_neighbour(arm):
+    ctrl = hold(0.0) + np.stack([np.zeros(50), 0.3 * np.sin(np.linspace(0, 6 * np.pi, 50))], axis=1)
+    bent, straight = ctrl + np.array([1.2, 0.0]), ctrl
+    behind = []
+    for motion in (straight, bent):
+        path, _ = run(arm, [unit(), unit(drag=0.5)], motion)
+        behind.append(np.abs(path[:, 1, 1] - path[:, 0, 1]).mean())
+    assert behind[0] < 1e-3 < 5e-3 < behind[1]
+
+
+def test_a_limb_whose_motors_ask_for_much_sags_more(arm):
+    path, _ = run(arm, [unit(), unit(limb_loss=1.0)], hold(1.0), 0.2)
+    light, _ = run(arm, [unit(), unit(limb_loss=1.0, limb_budget=10.0)], hold(1.0), 0.2)
+    assert abs(path[-1, 1, 0] - 1.0) > abs(path[-1, 0, 0] - 1.0) + 5e-3
+    assert np.abs(light[-1, 0] - light[-1, 1]).max() < 5e-4  # they came to rest apart
+
+
+def test_a_leaning_base_is_gravity_from_elsewhere(arm):
+    path, robots = run(arm, [unit(), unit(flex=0.02)], hold(1.0), 0.2)
+    gravity = robots.batch.expand("opt.gravity")
+    assert np.array_equal(gravity[0], [0, 0, -9.81])
+    assert 0.01 < np.hypot(*gravity[1, :2]) / 9.81 < 0.2
+    assert np.abs(path[-1, 0] - path[-1, 1]).max() > 1e-3
+
+
+def test_a_payload_beside_the_palm_pulls_with_its_lever(arm):
+    path, _ = run(arm, [unit(), unit(grip_x=0.05)], hold(1.0), 0.2)
+    empty, _ = run(arm, [unit(), unit(grip_x=0.05)], hold(1.0))
+    assert np.abs(path[-1, 0] - path[-1, 1]).max() > 1e-3
+    assert np.abs(empty[-1, 0] - empty[-1, 1]).max() < 5e-4  # they came to rest apart
+
+
+def test_churning_lags_with_the_square_of_the_speed(arm):
+    lag = []
+    for speed in (1.0, 2.0):
+        ramp = np.repeat((speed * 0.02 * np.arange(40))[:, None] - 0.8, 2, axis=1)
+        path, _ = run(arm, [unit(), unit(churning=0.2)], ramp)
+        lag.append((path[-1, 0] - path[-1, 1])[1])
+    assert 3.0 < lag[1] / lag[0] < 5.0
+
+
+def test_firmware_smooths_small_steps_more_than_large_ones(arm):
+    share = []
+    for step in (0.01, 0.4):
+        ctrl = hold(0.0, seconds=0.2)
+        ctrl[1:, 1] = step
+        path, _ = run(arm, [unit(), unit(smoothing=0.05, smoothing_lag=0.05)], ctrl)
+        share.append(((path[:, 0, 1] - path[:, 1, 1]) / step).max())
+    assert share[0] > 1.5 * share[1] > 0
+
+
+def test_targets_come_in_steps(arm):
+    ctrl = hold(0.0) + np.linspace(0, 0.05, 50)[:, None]
+    path, _ = run(arm, [unit(), unit(target_step=0.02)], ctrl)
+    assert 4e-3 < np.abs(path[:, 0, 1] - path[:, 1, 1]).max() < 0.03
+
+
+def test_a_hot_drive_takes_gain_back(arm):
+    robots = VirtualRobot(arm, [unit(derating=0.02)], [(0.2, "both")])
+    sag = []
+    for warmth in (0.0, 45.0):
+        robots.reset(hold(1.0)[:1], [0], warmth)
+        sag.append(abs(1.0 - robots.true_qpos()[0, 0]))
+    assert sag[1] > 1.2 * sag[0] > 0
+
+
+def test_supply_sag_lowers_the_torque_limit(arm):
+    far = hold(-1.4, -1.4, 0.06)  # from where it stands: the drive saturates
+    units = [unit(), unit(supply_voltage=24.0, supply_resistance=2.0, motor_constant=1.0)]
+    _, robots = run(arm, units, far, start=np.array([1.4, 1.4]))
+    bound = robots.batch.bind("actuator_force")  # of the calls after this
+    robots.step(np.repeat(far[:1], 2, axis=0))
+    force = np.abs(bound)
+    assert force[0].max() == pytest.approx(5.0)
+    assert force[1].max() < 4.9
+
+
+def test_readings_are_quantised_shifted_and_noisy_but_the_robot_is_not(arm):
+    step, offset = 0.01, 0.03
+    physics = unit(encoder_step=step, zero_offset=offset, current_noise=0.2, velocity_noise=0.1)
+    plain, _ = run(arm, [unit()], hold(1.0, seconds=2.0))
+    path, robots = run(arm, [physics], hold(1.0, seconds=2.0))
+    reading = robots.read()
+    assert np.allclose(reading.qpos / step, np.round(reading.qpos / step))
+    assert path[-1, 0] == pytest.approx(plain[-1, 0] - offset, abs=6e-3)  # it believes to be where it was told
+    assert reading.qpos[0] == pytest.approx(path[-1, 0] + offset, abs=step / 2 + 1e-9)
+    taus = []
+    for _ in range(200):
+        robots.step(hold(1.0)[:1])
+        taus.append(robots.read().tau[0, 0])
+    assert np.std(taus) == pytest.approx(0.2, rel=0.2)
+
+
+def test_reading_twice_gives_the_same(arm):
+    _, robots = run(arm, [load_fleet("easy", arm).unit("virtual-1")], hold(0.5))
+    assert np.array_equal(robots.read().qpos, robots.read().qpos)
+
+
+def test_current_tells_the_torque_that_the_motor_was_asked_for(arm):
+    """tau is current times the rated torque constant: a weak magnet shows as too high a reading."""
+    _, robots = run(arm, [unit(kt_scale=0.8)], hold(0.3, 0.2, 3.0), 0.3)
+    force = robots.batch.bind("actuator_force")  # of the calls after this
+    robots.step(hold(0.3, 0.2)[:1])
+    assert robots.read().tau[0] * 0.8 == pytest.approx(force[0], abs=1e-3)
+
+
+def test_repetitions_differ_far_less_than_the_gap():
+    robot = load_robot("h1_2")
+    physics = load_fleet("easy", robot).unit("virtual-2")
+    time = np.arange(150)[:, None] * robot.dt
+    ctrl = np.zeros((150, 27))
+    ctrl[:, robot.operated_index] = 0.4 * (1 - np.cos(1.5 * time)) * np.resize([-1.0, 0.5], 10)
+    locked = idle_joints(robot, robot.operated)
+    path, _ = run(robot, [physics] * 3, ctrl, 3.0, locked=locked)
+    nominal, _ = run(robot, [neutral(27)], ctrl, 3.0, locked=locked)
+    op = robot.operated_index
+    gap = np.abs(path - nominal)[..., op].mean()
+    spread = path[..., op].std(axis=1).mean()
+    assert 0 < spread < 0.1 * gap
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_every_effect_has_a_switch_that_matters(arm, effect):
+    """With one effect switched on, something that is seen differs from the robot without any."""
+    physics = load_fleet("shifted", arm).unit("virtual-1").only([effect])
+    if effect in ("presliding", "thinning", "compliance", "current_loop", "torque_speed"):  # not in that fleet
+        physics = load_fleet("hard", arm).unit("virtual-1").only([effect])
+        physics = replace(physics, no_load_speed=physics.no_load_speed / 10)
+    if effect in ("drag", "churning", "limb_current", "derating", "smoothing", "flex", "grip"):
+        physics = load_fleet("unnamed", arm).unit("virtual-1").only([effect, "thermal"])
+    if effect == "stribeck":
+        physics = replace(physics, friction=np.full(2, 0.5))
+    if effect == "backlash":
+        physics = replace(physics, backlash=np.full(2, 0.03))
+    if effect == "supply":
+        physics = replace(physics, motor_constant=np.full(2, 0.3))
+    ctrl = hold(0.2, 0.1, 2.0) + 0.6 * np.sin(np.linspace(0, 25, 100))[:, None]
+    seen = []
+    for u in (physics, replace(physics, **{f: getattr(unit(), f) for f in FIELDS[effect]})):
+        robots = VirtualRobot(arm, [u], [(0.3, "both")])
+        robots.reset(ctrl[:1], [0], 12.0, start=ctrl[:1])
+        for row in ctrl:
+            robots.step(row[None])
+        r = robots.read()
+        seen.append(np.concatenate([r.qpos, r.qvel, r.tau]))
+    assert np.abs(seen[0] - seen[1]).max() > 1e-6
