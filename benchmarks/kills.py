@@ -79,7 +79,7 @@ def trained(out: Path) -> Any:
     """A run without its times."""
     lines = [json.loads(line) for line in (out / "progress.jsonl").read_text().splitlines()]
     curve = [{k: v for k, v in line.items() if k != "seconds"} for line in lines]
-    return [curve, digests(out / "model")["weights.npz"], names(out)]
+    return [curve, digests(out / "model")["model.onnx"], names(out)]
 
 
 def page(out: Path) -> Any:

@@ -43,7 +43,6 @@ from gaponet.base.arrays import Array
 from gaponet.data.split import one_motion
 from gaponet.experiments.real.cards import prepare, read_cards
 from gaponet.experiments.real.rivals import Answer
-from gaponet.nn.backends import FunctionNetwork
 from gaponet.nn.corrector import DeltaCorrector
 from gaponet.nn.loop import DeltaLoop
 from gaponet.nn.paper import PaperNet, released_inputs, released_network
@@ -83,8 +82,7 @@ class Reading:
         return np.asarray(out[:, :, np.argsort(self.order)] / self.angle)
 
     def corrector(self, net: PaperNet, robot: RobotSpec) -> DeltaCorrector:
-        network = FunctionNetwork(lambda x: self.sign * self.outputs(net, x)[:, 0], 15 * JOINTS, JOINTS)
-        return DeltaCorrector(network, net.config, robot)
+        return DeltaCorrector(lambda x: self.sign * self.outputs(net, x)[:, 0], net.config, robot)
 
 
 def predicted_sensors(net: PaperNet, x: torch.Tensor) -> torch.Tensor:

@@ -40,8 +40,6 @@ def widths(layers: tuple[int, ...]) -> str:
         ("algorithm.md", f"Δ_max = {MODEL.delta_max} rad"),
         ("algorithm.md", f"{MODEL.observation_dim(10) - 1} for n = 10, H = {MODEL.history}, and"),
         ("algorithm.md", f"Oracle answers at {TRAIN.warm_start.sensor_states} states"),
-        ("algorithm.md", f"tokens of {MODEL.transformer_width} numbers, {MODEL.transformer_layers} blocks of "
-                         f"{MODEL.transformer_heads} heads"),
         ("algorithm.md", f"{PRIOR} rad per unit of scale"),
         ("experiments.md", f"{START.rounds * START.num_envs * START.steps:,} control steps each"),
     ],

@@ -12,7 +12,6 @@ import numpy as np
 from gaponet.experiments.played.trained import Trained
 from gaponet.experiments.result import Result
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.backends import Bound
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.testing.physics import Physics, neutral
@@ -29,10 +28,6 @@ class Operator:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         return (self.share * (WEAK - 1.0) * (x[:, -2:] - x[:, :2])).astype(np.float32)
-
-    def bind(self, batch: int) -> Bound:
-        x, delta = np.zeros((batch, CONFIG.observation_dim(2) + 2), np.float32), np.zeros((batch, 2), np.float32)
-        return Bound(x, delta, lambda: np.copyto(delta, self(x)))
 
 
 def weak_unit() -> Physics:

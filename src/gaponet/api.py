@@ -308,7 +308,7 @@ def train(
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
         config: Everything else (training.config); default TrainConfig().
-        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, transformer, inverse;
+        model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse;
             default that of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that identify wrote.
         holdout_units: Units never trained on; their test motions stay in the test part.

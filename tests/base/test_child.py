@@ -40,8 +40,6 @@ from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.watchdog import Watchdog
 from gaponet.base.executor import opened
 from gaponet.robot.spec import load_robot
-from gaponet.experiments.speed.latency import in_own_process
-from gaponet.base.errors import GAPONetError
 
 if __name__ == "__main__":
     robot = load_robot(Path("arm"))
@@ -53,10 +51,6 @@ if __name__ == "__main__":
     print("watched")
     with opened("local", 1, 1) as pool:
         print(*pool.map(abs, [-3]), "computed")
-    try:
-        in_own_process(Path("set"), 1, 1)
-    except GAPONetError:
-        print("measured")
 """
 
 
@@ -104,7 +98,7 @@ def test_no_command_runs_what_lies_in_the_folder(poisoned):
 
 def test_no_child_runs_what_lies_in_the_folder(poisoned):
     pytest.importorskip("serial")
-    assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "watched", "3 computed", "measured"]
+    assert python(poisoned, CHILDREN).splitlines() == ["1 imported", "watched", "3 computed"]
     assert ran(poisoned) == []
 
 

@@ -34,13 +34,15 @@ def run(tmp_path):
     return tmp_path / "run"
 
 
-def test_an_artifact_without_numpy_weights_gets_them(run, capsys):
-    before = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
-    (run / "model" / "weights.npz").unlink()
+def test_an_artifact_is_written_again_from_the_checkpoint(run, capsys):
+    before = GapModel.load(run).loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    (run / "model" / "model.onnx").unlink()
+    (run / "model" / "weights.npz").touch()  # of an earlier version
     assert main(["export", str(run), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["parity_rad"] < 1e-5
-    again = GapModel.load(run, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
+    again = GapModel.load(run).loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.1)
     np.testing.assert_allclose(again, before, atol=1e-7)
+    assert not (run / "model" / "weights.npz").exists()
 
 
 def test_an_export_elsewhere_can_be_transferred_without_the_run(run, tmp_path):
@@ -68,9 +70,6 @@ def test_every_runtime_is_measured(run, monkeypatch):
     threads = torch.get_num_threads()
     result = latency.measure(run, calls=100, threads=0)
     torch.set_num_threads(threads)
-    assert set(result["microseconds"]) == {
-        "network, onnxruntime", "network, numpy", "network, torch",
-        "delta(), onnxruntime", "delta(), numpy",
-    }  # fmt: skip
+    assert set(result["microseconds"]) == {"network, onnxruntime", "network, torch", "delta()"}
     assert all(0 < t["p50"] <= t["p99"] <= t["max"] for t in result["microseconds"].values())
-    assert set(result["deltas_per_s"]) == {"onnxruntime", "numpy"}
+    assert result["deltas_per_s"] > 0

@@ -11,7 +11,6 @@ from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.backends import Bound
 from gaponet.nn.calibration import Calibration
 from gaponet.nn.config import ModelConfig
 from gaponet.sim.batch import BatchSim
@@ -26,10 +25,6 @@ class Exact:
 
     def __call__(self, x):
         return ((WEAK - 1.0) * (x[:, -2:] - x[:, :2])).astype(np.float32)
-
-    def bind(self, batch):
-        x, delta = np.zeros((batch, CONFIG.observation_dim(2) + 2), np.float32), np.zeros((batch, 2), np.float32)
-        return Bound(x, delta, lambda: np.copyto(delta, self(x)))
 
 
 class Nothing(Exact):

@@ -360,10 +360,9 @@ def test_the_command_writes_a_folder_that_needs_no_gaponet(place, capsys):
     assert not (place / "run" / "torch").exists()
 
 
-def test_a_network_without_a_fused_form_ships_too(tmp_path):
-    robot = write_arm(tmp_path / "arm")
-    model = random_run(tmp_path / "run", robot, kind="transformer")
-    assert not (tmp_path / "run/model/weights.npz").exists()
+@pytest.mark.parametrize("kind", ["paper", "mlp"])
+def test_every_kind_of_network_ships(tmp_path, kind):
+    model = random_run(tmp_path / "run", write_arm(tmp_path / "arm"), kind=kind)
     assert export_model(model, tmp_path / "run", tmp_path / "torch") <= 1e-5
 
 

@@ -147,15 +147,14 @@ def _evaluation(folder: Path) -> None:
 
 
 def _use_model(source: Path, out: Path) -> None:
-    for backend in ("onnxruntime", "numpy"):
-        model = GapModel.load(source, backend)  # type: ignore[arg-type]
-        n = len(model.card["joint_names"])
-        loop = model.loop()
-        for _ in range(3):
-            delta = loop.delta(np.zeros(n), np.zeros(n), np.full(n, 0.1), 0.2)
-            if not np.isfinite(delta).all() or np.abs(delta).max() > 20:
-                raise AbsurdError(f"{backend}: a correction of {delta}")
-        calibration.Calibration.load(source, model.weights_hash())
+    model = GapModel.load(source)
+    n = len(model.card["joint_names"])
+    loop = model.loop()
+    for _ in range(3):
+        delta = loop.delta(np.zeros(n), np.zeros(n), np.full(n, 0.1), 0.2)
+        if not np.isfinite(delta).all() or np.abs(delta).max() > 20:
+            raise AbsurdError(f"a correction of {delta}")
+    calibration.Calibration.load(source, model.weights_hash())
 
 
 def _use_run(source: Path, out: Path) -> None:
@@ -183,7 +182,7 @@ def _use_fleet(source: Path, out: Path) -> None:
                 raise AbsurdError(f"{name}: {field} is {value}")
 
 
-MODEL = ("card.json", "model.onnx", "weights.npz", "a.json")
+MODEL = ("card.json", "model.onnx", "a.json")
 SAMPLES = (".parquet", "motion.json", "offsets.json", "collect.json")
 RUN = ("metrics.json", "gap.json", "config.json", "delay_offset.json", "split.json", "progress.jsonl", ".npz")
 TARGETS = (

@@ -5,7 +5,6 @@ import pytest
 import torch
 from arm import recordings, write_arm
 
-from gaponet.nn.backends import Bound, FunctionNetwork
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.corrector import DeltaCorrector
 from gaponet.nn.loop import DeltaLoop
@@ -15,10 +14,6 @@ from gaponet.nn.training.env import DeltaEnv
 from gaponet.sim.replay import replay
 
 LIMITS = np.array([[-10.0, 10.0]] * 2)
-
-
-def corrector(infer, config, robot):
-    return DeltaCorrector(FunctionNetwork(infer, config.input_dim(2), 2), config, robot)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +58,7 @@ def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
         free.append(x.copy())
         return np.full((1, 2), 0.01, np.float32)
 
-    replay(sequence, robot, corrector(infer, config, robot), nthread=1)
+    replay(sequence, robot, DeltaCorrector(infer, config, robot), nthread=1)
     env = DeltaEnv(sequence, robot, config, 1, 1000, RewardConfig(), nthread=1)
     env.rng = FirstRow()
     env.reset()
@@ -75,19 +70,12 @@ def test_training_and_free_run_give_the_network_the_same_numbers(tmp_path, how):
     np.testing.assert_allclose(np.concatenate(trained), np.concatenate(free[: len(trained)]), atol=1e-6)
 
 
-class TorchRule:
-    """A rule that looks at all of x, on torch buffers; and the same rule on numpy's."""
-
-    def __init__(self, config):
-        self.dim = config.input_dim(2)
-        self.weights = np.random.default_rng(0).normal(0, 0.1, (self.dim, 2)).astype(np.float32)
-
-    def numpy(self):
-        return FunctionNetwork(lambda x: x @ self.weights, self.dim, 2)
-
-    def bind(self, batch):
-        x, delta, weights = torch.zeros(batch, self.dim), torch.zeros(batch, 2), torch.from_numpy(self.weights)
-        return Bound(x, delta, lambda: delta.copy_(x @ weights))
+def looped(config, limits, num_envs, tensors):
+    """A loop around a rule that looks at all of x, on torch's or numpy's arrays."""
+    weights = np.random.default_rng(0).normal(0, 0.1, (config.input_dim(2), 2)).astype(np.float32)
+    if not tensors:
+        return DeltaLoop(config, limits, num_envs, lambda x: x @ weights)
+    return DeltaLoop(config, limits, num_envs, lambda x: x @ torch.from_numpy(weights), of=torch.zeros(0))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
@@ -95,9 +83,9 @@ class TorchRule:
 @pytest.mark.parametrize("tensors", [False, True])
 def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(bad, when, tensors):
     config, limits = ModelConfig(history=3), np.array([[-0.3, 0.3], [-10.0, 10.0]])
-    rule, rng = TorchRule(config), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     kind = torch.from_numpy if tensors else np.asarray
-    hit, clean = (DeltaLoop(config, limits, 3, rule if tensors else rule.numpy()) for _ in range(2))
+    hit, clean = (looped(config, limits, 3, tensors) for _ in range(2))
     for t in range(10):
         q, v, a = rng.normal(0, 0.3, (3, 3, 2)).astype(np.float32)
         held, payload = a.copy(), np.zeros(3, np.float32)
@@ -112,9 +100,9 @@ def test_one_target_that_is_no_number_touches_one_world_and_no_later_period(bad,
 @pytest.mark.parametrize("change", [{}, {"stride": 3}, {"payload_input": False}])
 def test_torch_and_numpy_arrays_give_the_same_corrections(change):
     config = ModelConfig(**{"history": 3} | change)
-    rule, rng = TorchRule(config), np.random.default_rng(1)
+    rng = np.random.default_rng(1)
     limits = np.array([[-0.3, 0.3], [-10.0, 10.0]])
-    host, tensors = DeltaLoop(config, limits, 4, rule.numpy()), DeltaLoop(config, limits, 4, rule)
+    host, tensors = (looped(config, limits, 4, kind) for kind in (False, True))
     for t in range(25):
         q, v, a = rng.normal(0, 0.3, (3, 4, 2)).astype(np.float32)
         payload = rng.uniform(0, 3, 4).astype(np.float32)

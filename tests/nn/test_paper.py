@@ -13,7 +13,6 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.backends import FunctionNetwork
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network
 from gaponet.nn.loop import DeltaLoop
@@ -129,7 +128,7 @@ def test_the_artifact_answers_as_the_network(tmp_path, how):
 
 def loop(infer, **how):
     config = replace(PAPER, **how)
-    return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, FunctionNetwork(infer, config.input_dim(2), 2))
+    return DeltaLoop(config, np.array([[-9.0, 9.0]] * 2), 2, infer)
 
 
 def test_a_correction_is_held_for_its_duration_and_begins_anew_after_a_reset():

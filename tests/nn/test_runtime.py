@@ -1,6 +1,7 @@
-"""The model at run time: numpy, onnxruntime and TorchScript answer alike; the loop is the corrector's."""
+"""The model at run time: onnxruntime answers as torch does; the loop is the corrector's."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -10,11 +11,10 @@ from arm import recordings, write_arm
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.export.program import export_program
 from gaponet.nn.artifact import GapModel, make_card
+from gaponet.nn.backends import OnnxNetwork
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network
-from gaponet.nn.fuse import FusedNet, fuse
-from gaponet.nn.fused import FusedForward
-from gaponet.nn.onnx_export import drawn_states, export
+from gaponet.nn.onnx_export import drawn_states, export, onnx_content
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
 
@@ -50,31 +50,17 @@ def artifact(robot, tmp_path_factory):
     [
         {}, {"sensors": "predicted"}, {"payload_input": False},
         {"kind": "mlp", "mlp_hidden": (16, 8)}, {"branch_hidden": (), "sensors": "predicted", "sensor_hidden": (16,)},
-        {"branch_hidden": (16, 8), "trunk_hidden": (8,)}, {"kind": "shared_mlp"},
+        {"kind": "mlp", "mlp_match": True}, {"kind": "shared_mlp"}, {"kind": "paper"},
         {"kind": "shared_mlp", "sensors": "predicted", "payload_input": False},
     ],
 )  # fmt: skip
-def test_the_fused_form_is_the_network(how):
+def test_what_ships_answers_as_the_network_does(how):
     net = trained(n=3, **how)
     x = drawn_states(net, 20)
-    weights = fuse(net)
     with torch.inference_mode():
         expected = net(torch.from_numpy(x)).numpy()
-        np.testing.assert_allclose(FusedNet(weights)(torch.from_numpy(x)).numpy(), expected, atol=1e-6)
-    np.testing.assert_allclose(FusedForward(weights, 20)(x), expected, atol=1e-6)
+    np.testing.assert_allclose(OnnxNetwork(onnx_content(net))(x), expected, atol=1e-6)
     assert np.abs(expected).mean() > 1e-3
-
-
-def test_a_large_batch_is_its_rows(artifact):
-    for backend in ("onnxruntime", "numpy"):
-        network = GapModel.load(artifact, backend).infer
-        one, many = network.bind(1), network.bind(150)
-        many.x[:] = np.random.default_rng(0).normal(0, 0.3, many.x.shape)
-        many.run()
-        for row in (0, 63, 64, 149):
-            one.x[:] = many.x[row]
-            one.run()
-            np.testing.assert_allclose(one.delta[0], many.delta[row], atol=1e-6)
 
 
 def test_drawn_states_have_the_statistics_trained_on():
@@ -84,61 +70,10 @@ def test_drawn_states_have_the_statistics_trained_on():
     assert abs(float(z.std()) - 1) < 0.05
 
 
-def test_numpy_answers_as_onnxruntime_step_by_step_and_in_batches(artifact):
-    models = GapModel.load(artifact), GapModel.load(artifact, "numpy")
-    rng = np.random.default_rng(0)
-    for num_envs in (1, 5):
-        a, b = (model.loop(num_envs) for model in models)
-        for _ in range(6):
-            q, v, u = rng.normal(0, 0.5, (3, num_envs, 2))
-            np.testing.assert_allclose(a.delta(q, v, u, 0.1), b.delta(q, v, u, 0.1), atol=1e-6)
-
-
-def test_numpy_needs_neither_the_onnx_file_nor_onnxruntime(artifact, tmp_path, monkeypatch):
-    for name in ("card.json", "weights.npz"):
-        (tmp_path / name).write_bytes((artifact / name).read_bytes())
-    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
-    assert GapModel.load(tmp_path, "numpy").loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0).shape == (2,)
-    with pytest.raises(ModelError, match=r"no model\.onnx"):
-        GapModel.load(tmp_path)
-    with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]', or load with backend='numpy'"):
+def test_without_onnxruntime_a_model_says_what_to_install(artifact, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ModelError, match=r"pip install 'gaponet\[deploy\]'"):
         GapModel.load(artifact)
-
-
-def test_without_weights_numpy_says_how_to_get_them(artifact, tmp_path):
-    (tmp_path / "card.json").write_bytes((artifact / "card.json").read_bytes())
-    with pytest.raises(ModelError, match="gaponet export RUN"):
-        GapModel.load(tmp_path, "numpy")
-    (tmp_path / "weights.npz").write_bytes((artifact / "weights.npz").read_bytes()[:300])
-    with pytest.raises(ModelError, match="not readable"):
-        GapModel.load(tmp_path, "numpy")
-
-
-def test_a_network_without_a_fused_form_is_exported_as_it_is(robot, tmp_path):
-    class Other(type(trained())):
-        """A kind that fuse does not know."""
-
-    net = Other(trained().config, 2).eval()
-    net.load_state_dict(trained().state_dict())
-    assert fuse(net) is None
-    export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), drawn_states(net))
-    assert not (tmp_path / "weights.npz").exists()
-    assert np.isfinite(GapModel.load(tmp_path).loop().delta(np.zeros(2), np.zeros(2), np.ones(2), 0.0)).all()
-
-
-@pytest.mark.parametrize(
-    "how",
-    [
-        {"kind": "transformer"},
-        {"kind": "mlp", "mlp_match": True},
-    ],
-)  # fmt: skip
-def test_every_kind_of_network_ships(robot, tmp_path, how):
-    net = trained(**how)
-    x = torch.randn(20, net.config.input_dim(2)).numpy()
-    assert export(net, tmp_path, make_card(net.config, robot, dt=[0.02]), x) <= 1e-5
-    model = GapModel.load(tmp_path)
-    assert model.loop().delta(np.zeros(2), np.zeros(2), np.zeros(2), 0.1).shape == (2,)
 
 
 def test_a_loop_of_ones_own_gets_what_replay_applies(artifact, robot):
@@ -200,9 +135,11 @@ def test_a_torch_export_of_other_weights_is_refused(artifact, tmp_path):
     folder.mkdir()
     for file in artifact.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
-    np.savez(folder / "weights.npz", **fuse(trained(stride=2, num_basis=4)))
+    torch.save(
+        {"best_state": {k: 0.9 * v for k, v in trained(stride=2).state_dict().items()}}, tmp_path / "checkpoint.pt"
+    )
     with pytest.raises(ModelError, match=r"torch.export and .* differ by"):
-        export_program(GapModel.load(folder), folder, tmp_path)
+        export_program(GapModel.load(folder), tmp_path, tmp_path)
     assert not (tmp_path / "delta.pt2").exists()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as js
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -118,15 +117,14 @@ def _train(robot: str, model: Literal["gaponet", "mlp"], out: Out, num_envs: int
 
 
 def _latency(run: Path, out: Out) -> None:
-    from gaponet.experiments.speed.latency import in_own_process
+    from gaponet.experiments.speed.latency import measure
 
-    result = js.loads(in_own_process(run, CALLS, threads=1))
+    result = measure(run, CALLS, threads=1)
     out.table(
         f"One step of {run}, {result['joints']} joints, one thread", ["", "p50 µs", "p99 µs", "max µs"],
         [[name, *(f"{t[q]:.0f}" for q in ("p50", "p99", "max"))] for name, t in result["microseconds"].items()],
     )  # fmt: skip
-    for name, speed in result["deltas_per_s"].items():
-        out.say(f"{result['batch']} robots at once, {name}: {speed:,.0f} deltas/s")
+    out.say(f"{result['batch']} robots at once: {result['deltas_per_s']:,.0f} deltas/s")
     out.result(result)
 
 

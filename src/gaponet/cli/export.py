@@ -42,7 +42,7 @@ def export(
     Args:
         to: For a robot or a run's simulator: mjcf (plain MuJoCo), mjlab, isaaclab, newton and drake, each with a
             check.py that needs no gaponet; urdf (or SDF: damping, friction, effort limits); json (the numbers). Of a
-            run: onnx (model.onnx, weights.npz and card.json) and torch (delta.pt2 with simulator and action term for
+            run: onnx (model.onnx and card.json) and torch (delta.pt2 with simulator and action term for
             mjlab and Isaac Lab), actuator-net (of each joint a network, past of target − position and speed in, torque
             out: the form of mjlab, Newton and Isaac Lab). Of a robot, randomization: what to randomise in training.
         out: Folder; default one with that name in the robot or run, for onnx the run's model folder.

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 
 from gaponet.base.errors import ModelError
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.fuse import FusedNet
-from gaponet.nn.fused import FILE, FusedForward
 from gaponet.nn.onnx_export import PARITY, trained_network
 
 CHECKED = 12  # control periods
@@ -68,24 +66,16 @@ class DeltaStep(nn.Module):
 
 
 def delta_step(model: GapModel, run: Path) -> DeltaStep:
-    """The step of an artifact, or of the run's checkpoint where the artifact has no weights.npz.
+    """The step of a run's network, from its checkpoint.
 
     Raises:
-        ModelError: The model holds corrections or sensors, or has an input for the recorded state.
+        ModelError: No checkpoint, or the model holds corrections or sensors, or has an input for the recorded state.
     """
     if model.config.holds:
         raise ModelError(f"{model.path}: holds corrections or sensors, which torch exports do not; train without")
     if model.config.real_state:
         raise ModelError(f"{model.path}: real_state is an input that torch exports lack; train without")
-    return DeltaStep(torch_network(model, run), model)
-
-
-def torch_network(model: GapModel, run: Path) -> nn.Module:
-    """The network of an artifact in torch: from its weights.npz, or the run's checkpoint where there is none."""
-    weights = model.path / FILE
-    if weights.is_file():
-        return FusedNet(FusedForward.read_weights(weights)).eval()
-    return trained_network(run, model.config, len(model.card["joint_names"]))
+    return DeltaStep(trained_network(run, model.config, len(model.card["joint_names"])), model)
 
 
 def require_parity(module: Any, model: GapModel, what: str, path: Path) -> float:

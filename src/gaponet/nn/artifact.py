@@ -1,6 +1,6 @@
-"""GapModel: what ships. A folder with model.onnx (normalisers inside), weights.npz (the same for numpy) and card.json.
+"""GapModel: what ships. A folder with model.onnx (normalisers inside) and card.json.
 
-Needs onnxruntime, or numpy alone; never torch.
+Needs onnxruntime, never torch.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from typing_extensions import TypedDict
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read_json, validated
-from gaponet.nn import fused
-from gaponet.nn.backends import Backend, Network, NumpyNetwork, OnnxNetwork
+from gaponet.nn.backends import Network, OnnxNetwork
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.corrector import DeltaCorrector
 from gaponet.nn.loop import DeltaLoop
@@ -33,7 +32,8 @@ RECORDED_TOLERANCE = 0.02  # relative, of gains
 # Switches of earlier versions that cards still name, and the value that they would have today.
 RETIRED = {
     "payload_predictor": True, "context": "none", "branch": "unstacked", "branch_history": True, "fno_width": 32,
-    "fno_layers": 3, "fno_modes": 4, "coupling": "posture",
+    "fno_layers": 3, "fno_modes": 4, "coupling": "posture", "transformer_width": 64, "transformer_layers": 2,
+    "transformer_heads": 4,
 }  # fmt: skip
 DT_TOLERANCE = 0.02  # a clock of 49.85 Hz is the 50 Hz it was meant to be
 
@@ -113,10 +113,8 @@ class _Card(TypedDict):
 def _require_answer(network: Network, width: int, shape: tuple[int, ...], largest: float, file: Path) -> None:
     """Refuse a network that does not answer (k, width) numbers with (k, *shape) finite ones up to `largest` (rad)."""
     try:
-        bound = network.bind(1)
-        bound.run()
-        answers = [bound.delta, network(np.zeros((2, width), np.float32))]
-        fits = bound.x.shape == (1, width) and all(a.shape == (k, *shape) for k, a in enumerate(answers, 1))
+        answers = [network(np.zeros((k, width), np.float32)) for k in (1, 2)]
+        fits = all(a.shape == (k, *shape) for k, a in enumerate(answers, 1))
         fits = fits and all(np.isfinite(a).all() and np.abs(a).max() <= largest + 1e-3 for a in answers)
         reason = f"{width} numbers in do not give {shape} finite ones up to {largest:g} rad out"
     except Exception as error:  # whatever a stranger's network does
@@ -139,12 +137,11 @@ class GapModel:
     infer: Network
 
     @classmethod
-    def load(cls, path: str | Path, backend: Backend = "onnxruntime", threads: int = 1) -> GapModel:
+    def load(cls, path: str | Path, threads: int = 1) -> GapModel:
         """Read an artifact, or the artifact of a run folder.
 
         Args:
             path: Folder.
-            backend: onnxruntime, or numpy, which needs nothing else.
             threads: How many onnxruntime uses; 0 for all cores, which pays for hundreds of robots at once.
 
         Raises:
@@ -152,16 +149,15 @@ class GapModel:
         """
         folder = Path(path)
         folder = folder / "model" if (folder / "model" / CARD).is_file() else folder
-        for name in (CARD, *([WEIGHTS] if backend == "onnxruntime" else [])):
+        for name in (CARD, WEIGHTS):
             if not (folder / name).is_file():
                 raise ModelError(f"{path}: no {name}; give a run folder of gaponet train, or an artifact folder")
         card, config = GapModel.read_card(folder / CARD)
-        numpy = backend == "numpy"
-        file = folder / (fused.FILE if numpy else WEIGHTS)
-        network = NumpyNetwork(file) if numpy else OnnxNetwork(file, threads)
+        file = folder / WEIGHTS
+        network = OnnxNetwork.read(file, threads)
         width, n = config.input_dim(len(card["joint_names"])), len(card["joint_names"])
         _require_answer(network, width, (n,), config.delta_max, file)
-        if card.get("sha256", {}).get(file.name, digest := sha256(file)) != digest:
+        if card.get("sha256", {}).get(WEIGHTS, digest := sha256(file)) != digest:
             raise ModelError(f"{file}: is not of its {CARD}: an export was cut short; run gaponet export RUN again")
         return cls(folder, card, config, network)
 

@@ -9,13 +9,10 @@ from annotated_types import Interval, Len
 
 from gaponet.base.errors import UsageError
 
-Kind = Literal["gaponet", "paper", "shared_mlp", "mlp", "transformer", "inverse"]
+Kind = Literal["gaponet", "paper", "shared_mlp", "mlp", "inverse"]
 Layers = Annotated[tuple[Annotated[int, Interval(ge=1, le=65536)], ...], Len(0, 32)]  # widths
 
-POSITIVE = (
-    "history", "stride", "num_probes", "num_basis", "delta_max", "payload_max",
-    "transformer_width", "transformer_layers", "transformer_heads",
-)  # fmt: skip
+POSITIVE = ("history", "stride", "num_probes", "num_basis", "delta_max", "payload_max")
 PAPER_ONLY = (
     "payload_trunk", "delta_hold", "sensor_source", "sensor_hold", "sensor_target", "branch_observation",
     "relative_action", "real_state",
@@ -30,8 +27,7 @@ class ModelConfig:
     """gaponet: the operator. paper: the network of the paper in its literal form, with the paper's layer widths
     (nn/paper.py). shared_mlp: one plain network with exactly the operator's inputs and as many weights as
     its branch and trunk, shared by the joints. mlp: a plain network on [observation, action], the ASAP form.
-    transformer: attention over the past frames and the present. inverse: the mlp fitted once to the labels on the
-    recorded motions, without roll-outs of its own and without PPO."""
+    inverse: the mlp fitted once to the labels on the recorded motions, without roll-outs of its own and without PPO."""
     history: Annotated[int, Interval(ge=1, le=1000)] = 4
     """H, past frames in the observation. A history shorter than the robot's lag cannot see it."""
     stride: Annotated[int, Interval(ge=1, le=1000)] = 1
@@ -85,12 +81,6 @@ class ModelConfig:
     """Hidden layers of the MLP baseline (ASAP's size)."""
     mlp_match: bool = False
     """Widen or narrow mlp_hidden, in its proportions, until the MLP has as many parameters as the operator would."""
-    transformer_width: Annotated[int, Interval(ge=1, le=4096)] = 64
-    """Numbers per token of the transformer."""
-    transformer_layers: Annotated[int, Interval(ge=1, le=64)] = 2
-    """Blocks of attention and MLP."""
-    transformer_heads: Annotated[int, Interval(ge=1, le=256)] = 4
-    """Attention heads; they share the width."""
 
     def __post_init__(self) -> None:
         for field in POSITIVE:
@@ -102,11 +92,6 @@ class ModelConfig:
             )
         if self.delta_hold > 1 and self.sensor_hold > 1:
             raise UsageError(f"delta_hold {self.delta_hold} and sensor_hold {self.sensor_hold}: hold one of them")
-        if self.transformer_width % self.transformer_heads:
-            raise UsageError(
-                f"transformer_width {self.transformer_width} cannot be shared by {self.transformer_heads} heads; "
-                "make it a multiple of transformer_heads"
-            )
 
     def require_kind(self) -> None:
         """Refuse switches of the paper's network in another. The command line sets the kind after the switches."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
+from gaponet.base.arrays import Array
 from gaponet.nn.baselines.mlp import DeltaMLP
-from gaponet.nn.baselines.transformer import DeltaTransformer
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import DeltaNet, dense, size
+from gaponet.nn.observation import Layout
 from gaponet.nn.paper import PaperNet, SensorPredictor
 
 
@@ -21,32 +24,42 @@ class OperatorNet(DeltaNet):
     and a − q of all joints as well.
     """
 
-    which: Tensor
+    columns: Tensor
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
         if config.sensors == "predicted":
             inputs = config.observation_dim(n)
             self.predictor = SensorPredictor(inputs, config.sensor_hidden, config.sensor_dim(n))
-        self.register_buffer("which", torch.eye(n), persistent=False)
-        sensed, seen, asked = self.input_dims(config, n)
-        self.branch_inputs = sensed * (config.sensors != "off") + seen + n
+        see, ask = self.joint_columns(config, n)
+        self.register_buffer("columns", torch.from_numpy(np.hstack([see, ask]).ravel()), persistent=False)
+        self.branch_inputs, self.trunk_inputs = see.shape[1], ask.shape[1]
         self.branch = dense(self.branch_inputs, config.branch_hidden, config.num_basis)
-        self.trunk = dense(asked + n, config.trunk_hidden, config.num_basis, zero=True)
+        self.trunk = dense(self.trunk_inputs, config.trunk_hidden, config.num_basis, zero=True)
         self.bias = nn.Parameter(torch.zeros(n))
 
     @staticmethod
-    def input_dims(config: ModelConfig, n: int) -> tuple[int, int, int]:
-        """Numbers of sensors, observation and query that one pass of branch and trunk sees, joint names aside."""
-        payload = int(config.payload_input)
-        return 2 * config.num_probes, 2 + 3 * config.history + payload + 3 * n, 1 + payload
+    def joint_columns(config: ModelConfig, n: int) -> tuple[Array, Array]:
+        """Columns of [features | sensors | 0 | 1] that branch and trunk see of each joint, (n, inputs) each."""
+        at, sensors = Layout(config, n), config.sensor_dim(n) * (config.sensors != "off")
+        x = np.arange(at.query.stop + sensors)
+        onehot = len(x) + np.eye(n, dtype=int)
 
-    def prepare(self, x: Tensor) -> Tensor:
-        """x = [o_t | a_t], (B, input_dim) → [what the branch sees | what the trunk is asked], (B, …, both)."""
-        z = self.features(x)
-        sensors = self.sensors(z) if self.config.sensors != "off" else None
-        see, ask = self._joint_inputs(z, sensors)
-        return torch.cat([see, ask], dim=-1)
+        def own(part: slice) -> Array:
+            return x[part].reshape(-1, n).T
+
+        def shared(part: slice) -> Array:
+            return np.tile(x[part], (n, 1))
+
+        see = own(slice(at.query.stop, None)), own(slice(at.past.stop)), *map(shared, (at.payload, at.state, at.action))
+        return np.hstack([onehot, *see]), np.hstack([onehot, own(at.action), shared(at.payload)])
+
+    def arrange(self, z: Tensor) -> Tensor:
+        """Features of [o_t | a_t] → [what the branch sees | what the trunk is asked], (B, n, both)."""
+        if self.config.sensors != "off":
+            z = torch.cat([z, self.sensors(z)], dim=1)
+        z = pad(pad(z, (0, 1)), (0, 1), value=1.0)
+        return z.index_select(1, self.columns).reshape(-1, self.n, self.branch_inputs + self.trunk_inputs)
 
     def correct(self, prepared: Tensor) -> Tensor:
         """⟨branch, trunk⟩ + c → Δa, (B, n) rad."""
@@ -60,18 +73,6 @@ class OperatorNet(DeltaNet):
         """Sensor values, standardised, (B, 2nm): all probes, each n positions and n velocities; z = features(x)."""
         return self.predictor.mean(z[:, self.features.layout.observation])
 
-    def _joint_inputs(self, z: Tensor, sensors: Tensor | None) -> tuple[Tensor, Tensor]:
-        n, at = self.n, self.features.layout
-        which = self.which.expand(z.shape[0], n, n)
-        payload = [z[:, at.payload].unsqueeze(1).expand(-1, n, 1)] if self.config.payload_input else []
-        see = [which]
-        if sensors is not None:
-            see.append(sensors.reshape(-1, 2 * self.config.num_probes, n).transpose(1, 2))
-        all_joints = torch.cat([z[:, at.state], z[:, at.action]], dim=1)
-        see += [self.features.joint_wise(z), *payload, all_joints.unsqueeze(1).expand(-1, n, 3 * n)]
-        ask = [which, z[:, at.action].unsqueeze(2), *payload]
-        return torch.cat(see, dim=2), torch.cat(ask, dim=2)
-
 
 class SharedMLP(OperatorNet):
     """Baseline: what branch and trunk are given, side by side into one plain network, shared by the joints.
@@ -81,12 +82,12 @@ class SharedMLP(OperatorNet):
 
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__(config, n)
-        asked = self.input_dims(config, n)[2] + n
+        inputs = self.branch_inputs + self.trunk_inputs
         weights = size(self.branch) + size(self.trunk) + n
         del self.branch, self.trunk, self.bias
-        width = lambda widths: dense(self.branch_inputs + asked, widths, 1)  # noqa: E731
+        width = lambda widths: dense(inputs, widths, 1)  # noqa: E731
         hidden = DeltaMLP.matched_hidden(config.mlp_hidden, weights, width)
-        self.net = dense(self.branch_inputs + asked, hidden, 1, zero=True)
+        self.net = dense(inputs, hidden, 1, zero=True)
 
     def correct(self, prepared: Tensor) -> Tensor:
         """What `prepare` made of each joint → Δa, (B, n) rad."""
@@ -102,8 +103,6 @@ def build_network(config: ModelConfig, n: int) -> DeltaNet:
         return PaperNet(config, n)
     if config.kind == "shared_mlp":
         return SharedMLP(config, n)
-    if config.kind == "transformer":
-        return DeltaTransformer(config, n)
     if not config.mlp_match:
         return DeltaMLP(config, n)
     weights = _operator_size(config, n)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -66,29 +67,28 @@ class Features(nn.Module):
     """σ of what is added while a network is fitted to labels, in standard deviations of each feature. Without it a
     network reads the label off what the label did: off targets applied before, or off how far a joint is behind."""
 
+    joint: Tensor
+    moves: Tensor
+
     def __init__(self, config: ModelConfig, n: int) -> None:
         super().__init__()
         self.n, self.history = n, config.history
         self.layout = Layout(config, n)
         self.dim = self.layout.query.stop
         self.standardise = Standardise(self.dim)
+        moved = self.layout.shifted(np.eye(n))[:, self.layout.query]  # by each joint's position
+        moved[:, self.layout.q] = 0.0
+        self.register_buffer("joint", torch.from_numpy(moved.argmax(0)), persistent=False)
+        self.register_buffer("moves", torch.from_numpy(moved.max(0)).float(), persistent=False)
 
     def relative(self, x: Tensor) -> Tensor:
         """(B, dim of x) → (B, dim): positions and targets of the past, and a_t, minus q_t."""
-        n, at = self.n, self.layout
-        o, q = x[:, at.observation], x[:, at.q]
-        frames = o[:, at.past].reshape(-1, self.history, 3, n)
-        shift = torch.stack([q, torch.zeros_like(q), q], dim=1).unsqueeze(1)  # (B, 1, 3, n)
-        return torch.cat([o[:, at.state], (frames - shift).flatten(1), o[:, at.payload], x[:, at.action] - q], dim=1)
+        return x[:, self.layout.query] - x.index_select(1, self.joint) * self.moves
 
     def forward(self, x: Tensor) -> Tensor:
         """Standardised and kept within ±5: a pose or speed never seen in training must not reach a network as 50 σ."""
         z = self.standardise(self.relative(x)).clamp(-CLAMP, CLAMP)
         return z + self.noise * torch.randn_like(z) if self.noise else z
-
-    def joint_wise(self, z: Tensor) -> Tensor:
-        """State and past of each joint, (B, dim) → (B, n, 2 + 3H)."""
-        return z[:, : self.layout.past.stop].reshape(-1, 2 + 3 * self.history, self.n).transpose(1, 2)
 
 
 class _Bounded(nn.Module):
@@ -117,7 +117,7 @@ class _Bounded(nn.Module):
         if self.hard:
             delta = self.gain * self.unit * y
             return delta if self.training else delta.clamp(-self.delta_max, self.delta_max)
-        return self.delta_max * torch.tanh(self.gain * self.unit * y / self.delta_max)
+        return self.delta_max * torch.tanh(self.gain * self.unit / self.delta_max * y)
 
 
 class DeltaNet(nn.Module):
@@ -147,7 +147,11 @@ class DeltaNet(nn.Module):
 
     def prepare(self, x: Tensor) -> Tensor:
         """x → what `correct` is given, (B, …)."""
-        return self.features(x)
+        return self.arrange(self.features(x))
+
+    def arrange(self, z: Tensor) -> Tensor:
+        """Features → what `correct` is given: columns of z, and constants, in another order."""
+        return z
 
     def correct(self, prepared: Tensor) -> Tensor:
         """What `prepare` made → Δa, (B, n) rad."""

@@ -1,22 +1,21 @@
 """The loop around a network: past frames, limits. The one state machine of training, free runs, simulators and robots.
 
-It takes numpy arrays or, where the network's buffers are torch tensors, those; all of operated joints, (num_envs, n).
+It takes numpy arrays or, where its buffers are torch tensors, those; all of operated joints, (num_envs, n).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from gaponet.base.arrays import Array, copy_of, library, zeros_like
 from gaponet.base.errors import UsageError
-from gaponet.nn.backends import Bound, Network
+from gaponet.nn.backends import Network, OnnxNetwork
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.observation import History, Layout
-
-Infer = Callable[[Array], Array]  # x (B, dim) float32 → Δa (B, n) rad
 
 
 class DeltaLoop:
@@ -41,15 +40,16 @@ class DeltaLoop:
         Args:
             qpos_range: Limits of the operated joints, (n, 2) rad.
             network: The model; None where the correction is found elsewhere, as in training: observe and push.
-            of: A float32 array of the kind and device of all buffers, where there is no network; default numpy.
+            of: A float32 array of the kind and device of all buffers; default numpy.
         """
         n = len(qpos_range)
         self.config, self.n, self.num_envs = config, n, num_envs
         self.layout = at = Layout(config, n)
         of = np.empty(0, np.float32) if of is None else of
-        nothing = Bound(zeros_like(of, num_envs, at.dim), zeros_like(of, num_envs, n), lambda: None)
-        self.bound = network.bind(num_envs) if network else nothing
-        x = self.x = self.bound.x
+        x = self.x = zeros_like(of, num_envs, at.dim)
+        if network is not None:
+            bound = network.bind(x) if isinstance(network, OnnxNetwork) else partial(network, x)
+            self.answer: Callable[[], Any] = bound  # x as it is now → Δa
         self.history = History(config, n, x)
         self._q, self._v, self._action = (x[:, part] for part in (at.q, at.v, at.action))
         self._mass, self._most = x[:, at.payload.start], config.payload_max if config.payload_input else None
@@ -136,8 +136,7 @@ class DeltaLoop:
         if not (self._host and np.vdot(a, a) < np.inf):  # the cheapest test of finite numbers
             a = self._finite(q, a)
         self.observe(q, v, a, payload_mass)
-        self.bound.run()
-        delta = self.bound.delta
+        delta = self.answer()
         if self.config.delta_hold > 1:
             delta = self.held = self._xp.where(self._due(self.config.delta_hold)[:, None], delta, self.held)
         self.applied = self._xp.minimum(self._xp.maximum(a + delta, self.low), self.high)
@@ -162,8 +161,7 @@ class DeltaLoop:
         x = self.observe(qpos, qvel, wanted, payload_mass)
         for _ in range(iterations):
             x[:, self.layout.action] = wanted + offset
-            self.bound.run()
-            offset -= gain * (offset + self.bound.delta)
+            offset -= gain * (offset + self.answer())
         self.push(qpos, qvel, wanted)
         return wanted + offset
 

@@ -20,7 +20,6 @@ METHODS = {  # name, colour
     "inverse": ("labels alone", "#12465b"),
     "shared_mlp": ("MLP", "#3b7dd8"),
     "mlp": ("MLP, full coupling", "#7a8fe0"),
-    "transformer": ("Transformer", "#56c1e8"),
     "gaponet": ("GAPONet", "#c8102e"),
     "paper": ("GAPONet, the paper's form", "#8e1b3a"),
     "calibrated": ("calibrated to the unit", "#6a1b9a"),

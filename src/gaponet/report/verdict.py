@@ -12,7 +12,7 @@ from gaponet.report.methods import IDENTIFIED, title
 from gaponet.robot.folder import KEPT
 from gaponet.sim.metrics import standard_error
 
-LEARNED = ("inverse", "mlp", "shared_mlp", "transformer", "paper", "gaponet")  # kinds of model
+LEARNED = ("inverse", "mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
 ALONE = ("nominal", "delay_offset", "identified")  # methods without a network
 WORTH = 0.02  # share of what is left that a network must remove, besides its standard error
 

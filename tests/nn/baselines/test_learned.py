@@ -10,7 +10,7 @@ from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import size
 
-KINDS = ("mlp", "shared_mlp", "transformer")
+KINDS = ("mlp", "shared_mlp")
 
 
 def x(config, n, batch=7):
@@ -28,8 +28,7 @@ def test_an_untrained_baseline_corrects_nothing(kind):
 def test_every_number_of_the_observation_and_the_action_is_seen(kind):
     config, n = ModelConfig(kind=kind, history=3), 2
     net = build_network(config, n)
-    head = (net.net if kind in ("mlp", "shared_mlp") else net.head)[-1]
-    torch.nn.init.normal_(head.weight, std=0.01)
+    torch.nn.init.normal_(net.net[-1].weight, std=0.01)
     data = x(config, n, batch=1).requires_grad_(True)
     net(data).sum().backward()
     assert (data.grad != 0).all()
@@ -65,8 +64,3 @@ def test_building_a_matched_mlp_leaves_the_seed_alone():
 def test_proportions_are_needed_to_match():
     with pytest.raises(UsageError, match="give the proportions"):
         ModelConfig(kind="mlp", mlp_match=True, mlp_hidden=())
-
-
-def test_heads_share_the_width():
-    with pytest.raises(UsageError, match="multiple of transformer_heads"):
-        ModelConfig(transformer_width=30)
