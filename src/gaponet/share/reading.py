@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import cast
 
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import keeps_robot, kept_robot
@@ -19,9 +18,9 @@ def opened(place: str | Path) -> Dataset:
     """
     if "://" not in str(place):
         return Dataset(place)
-    from gaponet.share.stream import Streamed
+    from gaponet.share.stream import open_pushed
 
-    return cast("Dataset", Streamed(str(place)))
+    return open_pushed(str(place))
 
 
 def open_dataset(
@@ -30,8 +29,8 @@ def open_dataset(
     """A dataset, to be read, and its robot: the one asked for, else the one that the dataset keeps.
 
     Args:
-        dataset: Folder; or the address (s3://, gs://, file://) of one that was pushed, which is read where it lies.
-        robot: Another robot than the one that the dataset keeps.
+        dataset: Folder; or the address (s3://, gs://, file://, hf://) of one that was pushed, which is read where it
+        lies. robot: Another robot than the one that the dataset keeps.
         run: The run whose robot is taken where the dataset keeps none.
 
     Raises:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import ModelError
-from gaponet.base.files import write_text
+from gaponet.base.files import write_text, writing
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.report.run_files import read_config, read_metrics
 from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, require_bare
@@ -23,36 +24,42 @@ FILES = re.compile(
 )
 
 
-def lay_out(run: Path, folder: Path, address: str) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """The files of a run by their paths, the README written into a folder; and the hash of its network."""
+def lay_out(run: Path, folder: Path, address: str) -> tuple[str, ...]:
+    """Copy the files of a run, with a README, into an empty folder; returns the hash of its network."""
     if not (run / "model" / CARD).is_file():
         raise ModelError(f"{run}: no model yet; train it first")
-    facts = facts_of(run)
-    write_text(folder / README, run_readme(facts, address))
-    there = (file for file in sorted(run.rglob("*")) if file.is_file())
-    files = {place: file for file in there if FILES.fullmatch(place := file.relative_to(run).as_posix())}
-    return files | {README: folder / README}, (sha256(run / "model" / WEIGHTS),)
+    write_text(folder / README, run_readme(_facts(run), address))
+    for file in sorted(run.rglob("*")):
+        if file.is_file() and FILES.fullmatch(place := file.relative_to(run).as_posix()):
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / place)
+    return (sha256(run / "model" / WEIGHTS),)
 
 
-def take_in(folder: Path, index: Index, out: Path) -> dict[str, Any]:
-    """Move what was downloaded to a new run, and look whether it loads.
-
-    Raises:
-        RemoteError: A file is no file of a run, or the network is not the one that was pushed.
-        GAPONetError: A file is not what it should be.
-    """
+def require_run(index: Index) -> None:
+    """Refuse an index that names a file which no run has."""
     for place in index.files.keys() - {README}:
         if not FILES.fullmatch(place):
-            raise RemoteError(f"{place}: a run has no such file; nothing was kept")
-    for place in index.files.keys() - {README}:
-        (out / place).parent.mkdir(parents=True, exist_ok=True)
-        (folder / place).replace(out / place)
-    if sha256(out / "model" / WEIGHTS) not in index.contents:
-        raise RemoteError("model/model.onnx is not the network that was pushed, by its hash; push it again")
-    return facts_of(out)
+            raise RemoteError(f"{place}: a run has no such file")
 
 
-def facts_of(run: Path) -> dict[str, Any]:
+def take_in(folder: Path, index: Index, out: Path) -> None:
+    """Check that what was downloaded is the run that was pushed, and rename the folder.
+
+    Raises:
+        GAPONetError: It is another network, or a file is not what it should be.
+    """
+    with writing(folder, "run"):
+        if sha256(folder / "model" / WEIGHTS) not in index.contents:
+            raise RemoteError("model/model.onnx is not the network that was pushed, by its hash; push it again")
+        _facts(folder)
+    shutil.rmtree(folder / ".cache", ignore_errors=True)  # of huggingface_hub
+    if out.exists():
+        out.rmdir()
+    folder.rename(out)
+
+
+def _facts(run: Path) -> dict[str, Any]:
     """What the card of the model and the newest evaluation say, all of it read and checked."""
     if keeps_robot(run):
         require_bare(run / KEPT)

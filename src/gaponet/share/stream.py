@@ -1,13 +1,10 @@
-"""A dataset that was pushed, read from its files, here or where it lies: a recording when it is asked for.
+"""A dataset that was pushed, read where it lies: a file is downloaded when one of its recordings is read.
 
-A recording is a row group of a file of some megabytes, and its rows alone are read or fetched: memory holds one,
-however many there are. Twins are made in a folder that goes with the object; nothing is written to the place.
+A recording is a row group, so that memory holds one recording. Nothing is written to the place.
 """
 
 from __future__ import annotations
 
-import hashlib
-import re
 import shutil
 import weakref
 from collections.abc import Iterator
@@ -20,48 +17,45 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.errors import DatasetError, GAPONetError
+from gaponet.base.errors import DatasetError
 from gaponet.base.sandbox import inside
 from gaponet.base.structure import LARGEST_ARRAYS
 from gaponet.data.formats.lerobot import read_episode
 from gaponet.data.formats.lerobot_set import FEATURES, Set, Stated, sets_under
-from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta, to_sequence
+from gaponet.data.sequence import ARRAYS, SequenceMeta, to_sequence
 from gaponet.data.store import Dataset, Entry, entry_id
 from gaponet.share import dataset as datasets
-from gaponet.share.bucket import Bucket
 from gaponet.share.errors import RemoteError
-from gaponet.share.target import INDEX, Index, download, reaching, read_index, written
+from gaponet.share.places import open_target
+from gaponet.share.target import INDEX, Index, Target, download, naming, read_index
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-LARGE = re.compile(r"(?:.*/)?data/.*")  # files of a LeRobot set that hold recordings
 AGAIN = "push it again"
 
 
 class Pushed(Dataset):
-    """A dataset only to be read; whatever is read is compared with the content hash that was pushed."""
+    """A dataset that is only read; every recording is compared with the content hash that was pushed."""
 
-    def __init__(self, place: str, index: Index, folder: Path) -> None:
-        """Read the list of recordings, the robot and the splits.
+    def __init__(self, target: Target, index: Index, folder: Path) -> None:
+        """Download and read the list of recordings, the robot and the splits.
 
         Args:
-            place: Its address, for errors.
-            folder: The files of the index lie in its folder `files`, those that are LARGE where they are needed.
+            folder: Working folder; the files of the index go into its folder `files`.
 
         Raises:
-            RemoteError: It does not hold what it says.
+            RemoteError: The place cannot be reached, or does not hold what it says.
         """
-        self._place, self._index, self._files = place, index, folder / "files"
+        if index.kind != "dataset":
+            raise RemoteError(f"{target.address}: holds a run, not a dataset")
+        self._target, self._index, self.files, self.address = target, index, folder / "files", target.address
         self._where: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
-        with self._told():
-            self.robot, self._sets = datasets.pushed_robot(self._files), sets_under(self._files)
-            state = hashlib.sha256(written(index)).hexdigest()[
-                :16
-            ]  # what a pull of another one left is not gone on with
-            (folder / state).mkdir(exist_ok=True)
-            made = Dataset.create(folder / state / index.name, self.robot)
+        self._there = {place for place in index.files if "data" not in place.split("/")[:-1]}
+        download(target, index, sorted(self._there), self.files)
+        with naming(self.address, self.files):
+            self.robot, self._sets = datasets.pushed_robot(self.files), sets_under(self.files)
+            made = Dataset.create(Path(mkdtemp(dir=folder)) / index.name, self.robot)
             for part in self._sets:
                 if part.ours is None:
                     raise RemoteError(f"{part.path}: gaponet did not write this set")
@@ -69,43 +63,45 @@ class Pushed(Dataset):
             super().__init__(made.path)
             if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
                 raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
-            datasets.bring(self._files / datasets.BESIDE, self.path, self)
+            datasets.bring(self.files / datasets.BESIDE, self.path, self)
 
-    def places(self, entries: list[Entry]) -> set[str]:
-        """The files that hold these recordings."""
-        with self._told():
-            return {self._file_of(entry).relative_to(self._files).as_posix() for entry in entries}
+    def fetch(self, entries: list[Entry]) -> list[str]:
+        """Download the files that hold these recordings and are not here yet; returns all that are here."""
+        with naming(self.address, self.files):
+            files = {part.data_file(episode) for part, episode, _ in (self._where[entry.hash] for entry in entries)}
+            wanted = {file.relative_to(self.files).as_posix() for file in files} - self._there
+            if strange := wanted - self._index.files.keys():
+                raise RemoteError(f"{min(strange)} is not in {INDEX}; {AGAIN}")
+        if wanted:
+            download(self._target, self._index, sorted(wanted), self.files)
+            self._there |= wanted
+        return sorted(self._there)
 
-    def read(self, entry: Entry, optional: bool = True) -> Sequence:
-        """Fetch one sequence; all of it is fetched and checked.
+    def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
+        """Some channels of one sequence, (T, n) float32 each; all of it is downloaded and checked.
 
         Raises:
             RemoteError: It cannot be reached, or is not the one that was pushed.
         """
+        self.fetch([entry])
         part, episode, first = self._where[entry.hash]
-        with self._told():
-            table = self._fetch(self._file_of(entry), first, entry.rows)
+        with naming(self.address, self.files):
+            table = _rows_of(part.data_file(episode), first, entry.rows)
             sequence = to_sequence(read_episode(part, episode, self.robot, table), self.robot, entry.meta)
-            sequence = replace(sequence, meta=entry.meta)  # how it was first recorded, not how it was read here
-            if sequence.content_hash() != entry.hash:
+            if replace(sequence, meta=entry.meta).content_hash() != entry.hash:  # as it was first recorded
                 raise RemoteError(f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}")
-        none: dict[str, Any] = {} if optional else dict.fromkeys(OPTIONAL)
-        return replace(sequence, **none)
-
-    def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
-        """Some channels of one sequence, (T, n) float32 each."""
-        sequence = self.read(entry)
         return {name: getattr(sequence, name) for name in names}
 
-    def _append(self, sequence: Sequence, findings: dict[str, Any], digest: str) -> Entry:
-        raise self._read_only()
+    @property
+    def read_only(self) -> bool:
+        """Always."""
+        return True
 
-    def state(self, **fields: str) -> None:
+    @contextmanager
+    def writing(self) -> Iterator[None]:
         """Refused."""
-        raise self._read_only()
-
-    def _read_only(self) -> DatasetError:
-        return DatasetError(f"{self._place}: is only read; to change it, gaponet pull it and push it again")
+        raise DatasetError(f"{self.address}: is only read; to change it, gaponet pull it and push it again")
+        yield
 
     def _journal(self) -> Iterator[Entry]:
         for part in self._sets:
@@ -120,69 +116,31 @@ class Pushed(Dataset):
                 self._where[digest], rows[file] = (part, episode, first), first + entry.rows
                 yield entry
 
-    def _file_of(self, entry: Entry) -> Path:
-        part, episode, _ = self._where[entry.hash]
-        file = part.data_file(episode)
-        if file.relative_to(self._files).as_posix() not in self._index.files:
-            raise RemoteError(f"{file} is not among the files of {INDEX}; {AGAIN}")
-        return file
 
-    def _fetch(self, file: Path, first: int, rows: int) -> pa.Table:
-        """Rows of a data file."""
-        return _rows_of(file, first, rows)
+def open_pushed(address: str) -> Pushed:
+    """Open a dataset that was pushed; what is downloaded of it is deleted with the object.
 
-    @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Errors name the address, and not where files are read from."""
-        from pyarrow import ArrowException
-
-        try:
-            with reaching(self._place, ArrowException):
-                yield
-        except GAPONetError as error:
-            text = str(error).replace(f"{self._files}/", "").removeprefix(f"{self._place}: ")
-            raise RemoteError(f"{self._place}: {text}") from None
-
-
-class Streamed(Pushed):
-    """A dataset in a bucket."""
-
-    def __init__(self, address: str) -> None:
-        """Fetch the list of recordings, the robot and the splits.
-
-        Raises:
-            RemoteError: The place cannot be reached, or does not hold what it says.
-        """
-        self.bucket = Bucket(address)
-        index = read_index(self.bucket, "dataset")
-        if index is None or index.kind != "dataset":
-            raise RemoteError(f"{self.bucket.address}: holds {'a run' if index else 'nothing'}, not a dataset")
-        folder = Path(mkdtemp(prefix="gaponet-"))
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._opened: tuple[Path, Any] = Path(), None  # the data file that was read last
-        small = {place: part for place, part in index.files.items() if not LARGE.fullmatch(place)}
-        download(self.bucket, small, folder / "files")
-        super().__init__(self.bucket.address, index, folder)
-        self.address = re.sub("//[^/@:]*:[^/@]*@", "//", address)  # without keys: those are in the environment
-
-    def _fetch(self, file: Path, first: int, rows: int) -> pa.Table:
-        import pyarrow.parquet as pq
-
-        if file != self._opened[0]:
-            place = file.relative_to(self._files).as_posix()
-            self._opened = file, pq.ParquetFile(self.bucket.open(place, self._index.files[place]))
-        return rows_of(self._opened[1], file, first, rows)
+    Raises:
+        RemoteError: The place cannot be reached, or does not hold what it says.
+    """
+    target = open_target(address)
+    index = read_index(target, target.index())
+    folder = Path(mkdtemp(prefix="gaponet-"))
+    try:
+        pushed = Pushed(target, index, folder)
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
+    weakref.finalize(pushed, shutil.rmtree, folder, ignore_errors=True)
+    return pushed
 
 
 @inside(RemoteError, "pyarrow.parquet")
 def _rows_of(file: Path, first: int, rows: int) -> pa.Table:
+    """Rows of a data file; they fill whole row groups, and no others are read."""
     import pyarrow.parquet as pq
 
-    return rows_of(pq.ParquetFile(file), file, first, rows)
-
-
-def rows_of(parquet: pq.ParquetFile, file: Path, first: int, rows: int) -> pa.Table:
-    """Rows of a data file; they fill whole row groups, and no others are read."""
+    parquet = pq.ParquetFile(file)
     ends = np.cumsum([parquet.metadata.row_group(i).num_rows for i in range(parquet.num_row_groups)])
     groups = np.flatnonzero((ends > first) & (ends <= first + rows)).tolist()
     parts = [parquet.metadata.row_group(i) for i in groups]

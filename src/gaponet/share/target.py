@@ -1,12 +1,12 @@
-"""Places that datasets and runs are pushed to, and what all of them can do."""
+"""Places that datasets and runs are pushed to, and the index that says what lies there."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,20 +14,17 @@ from typing import Annotated, Literal, Protocol
 
 from annotated_types import Interval, Len
 
-from gaponet.base.progress import bar, noted
+from gaponet.base.errors import GAPONetError
 from gaponet.base.structure import Name, Sha256, parse_json
-from gaponet.base.text import without_credentials
 from gaponet.share.errors import RemoteError
 
 Kind = Literal["dataset", "run"]
-Anew = Literal["", "damaged", "all"]
 FORMAT = 1
-INDEX = "gaponet.json"  # names every file with its size and hash; a place without one holds nothing of ours
-LARGEST_INDEX = 96 << 20  # bytes; 67 of each sequence
-BLOCK = 1 << 20  # bytes read at once
-DEEPEST = 8  # folders below each other
-AT_ONCE = 8  # downloads
-SPARE = 1 << 28  # bytes of a disk that stay free
+INDEX = "gaponet.json"
+MAX_INDEX_BYTES = 96 << 20  # 67 bytes per sequence
+MAX_DEPTH = 8  # folders below each other
+MIN_FREE_BYTES = 1 << 28  # of a disk, after a download
+BUGS = (AssertionError, AttributeError, ModuleNotFoundError, NameError, TypeError)
 
 
 @dataclass(frozen=True)
@@ -37,13 +34,19 @@ class Part:
     size: Annotated[int, Interval(ge=0, le=1 << 40)]
     sha256: Sha256
 
+    @classmethod
+    def of(cls, file: Path) -> Part:
+        """Size and hash of a file."""
+        with file.open("rb") as content:
+            return cls(file.stat().st_size, hashlib.file_digest(content, "sha256").hexdigest())
+
 
 @dataclass(frozen=True)
 class Index:
     """gaponet.json: what was pushed.
 
     Attributes:
-        contents: Hashes of what it is about: of each sequence of a dataset; of a run's network.
+        contents: Hashes of the sequences of a dataset, or of a run's network.
         files: The files by their path below the place, with slashes.
     """
 
@@ -57,173 +60,103 @@ class Index:
         for path in self.files:
             parts = path.split("/")
             strange = any(p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable() for p in parts)
-            if strange or ":" in path or len(parts) > DEEPEST or len(path) > 400 or path == INDEX:
+            if strange or ":" in path or len(parts) > MAX_DEPTH or len(path) > 400 or path == INDEX:
                 raise RemoteError(f"files: '{path}' is not the name of a file inside a folder")
         if len({path.casefold() for path in self.files}) < len(self.files):
             raise RemoteError("files: two names differ in capitals alone")
-        if {parent for path in self.files for parent in _parents(path)} & self.files.keys():
-            raise RemoteError("files: a file stands where a folder does")
 
-    @property
-    def size(self) -> int:
-        """Bytes in all."""
-        return sum(part.size for part in self.files.values())
+    def text(self) -> str:
+        """Content of gaponet.json."""
+        return json.dumps(asdict(self), indent=1) + "\n"
 
-
-def _parents(path: str) -> Iterator[str]:
-    while "/" in path:
-        path = path.rpartition("/")[0]
-        yield path
-
-
-@dataclass(frozen=True)
-class Pruned:
-    """Files in a bucket that no index names, and their bytes; how many others may still be in use."""
-
-    files: list[str]
-    size: int
-    young: int
-
-
-class ChangedError(RemoteError):
-    """Somebody else pushed to the place since its index was read."""
+    def size(self, places: list[str]) -> int:
+        """Bytes of some files."""
+        return sum(self.files[place].size for place in places)
 
 
 class Target(Protocol):
-    """A place for one dataset or run. What is stored is whole and replaces what was there at once, or not at all.
-
-    Errors of the network and of the place become RemoteError.
-    """
+    """A place for one dataset or run. Errors of the network and of the place become RemoteError."""
 
     address: str
-    at_once: bool
 
     def index(self, kind: Kind | None = None) -> bytes | None:
-        """Content of gaponet.json, at most LARGEST_INDEX bytes; None where nothing is there yet.
+        """Content of gaponet.json, None if nothing was pushed; the Hub looks for this kind alone, if given."""
+
+    def sizes(self, places: list[str], index: Index) -> list[int | None]:
+        """Bytes of files of the index as the place has them; None for a missing one."""
+
+    def fetch(self, places: list[str], index: Index, folder: Path) -> None:
+        """Download files of the index into a folder, except those that an earlier download left there."""
+
+    def store(self, folder: Path, index: Index, private: bool, replace: bool, prune: bool) -> int:
+        """Upload what the place lacks, then make the index its content at once; returns the number of pruned files.
 
         Args:
-            kind: Where datasets and runs live apart: look for this kind alone.
+            folder: Holds the files of the index, and the index.
+            private: A new repository is readable by its owner alone.
+            replace: Upload every file.
+            prune: Delete files of earlier pushes.
 
         Raises:
-            RemoteError: The place cannot be reached, or holds something else.
+            RemoteError: Somebody else pushed since `index` was called.
         """
 
-    def holds(self, path: str, part: Part, anew: Anew) -> bool:
-        """Whether a file is there already, and need not be made or sent.
 
-        Args:
-            anew: What is not believed: nothing, what is read back with another content, or anything.
-        """
+def read_index(target: Target, content: bytes | None) -> Index:
+    """Parse and check the content of gaponet.json.
 
-    def send(self, path: str, file: Path, part: Part) -> None:
-        """Bring a file; it must stay until `store` returns, unless the place takes files `at_once`."""
-
-    def store(self, kind: Kind, index: Index, private: bool, there: bytes | None) -> None:
-        """Make what was sent, and what is held, be there under the names of the index, instead of what was.
-
-        Args:
-            private: Where the place is made anew and knows of it: readable by its owner alone.
-            there: The index that was read, which this one takes the place of.
-
-        Raises:
-            ChangedError: Another index is there now; it stays.
-        """
-
-    def prune(self, named: set[str], hours: float, delete: bool) -> Pruned:
-        """Look for files without a name that no push or pull of the last hours can need, and delete them if asked to.
-
-        Args:
-            named: SHA-256 of those that have one.
-        """
-
-    def fetch(self, path: str, part: Part, folder: Path) -> None:
-        """Copy one file of the index into a folder, under its path; its hash is the caller's to look at."""
-
-
-def written(index: Index) -> bytes:
-    """gaponet.json."""
-    return (json.dumps(asdict(index), indent=1) + "\n").encode()
-
-
-def send(target: Target, files: Mapping[str, Path], anew: Anew) -> dict[str, Part]:
-    """Send those files that a place does not hold; returns what they are."""
-    parts = {place: part_of(file) for place, file in files.items()}
-    for place, part in parts.items():
-        if not target.holds(place, part, anew):
-            target.send(place, files[place], part)
-    return parts
-
-
-def read_index(target: Target, kind: Kind | None) -> Index | None:
-    """What is there, checked; None where nothing is."""
-    return read_content(target, target.index(kind))
-
-
-def read_content(target: Target, content: bytes | None) -> Index | None:
-    """What an index that was read says, checked."""
+    Raises:
+        RemoteError: It is missing, damaged or of a newer format.
+    """
     if content is None:
-        return None
+        raise RemoteError(f"{target.address}: nothing was pushed there")
     where = f"{target.address}: {INDEX}"
-    index = parse_json(Index, content[:LARGEST_INDEX], where, RemoteError, "push it again, with --replace")
+    index = parse_json(Index, content, where, RemoteError, "push it again, with --replace")
     if index.format > FORMAT:
-        raise RemoteError(
-            f"{where}: format {index.format} is newer than this gaponet reads ({FORMAT}); upgrade gaponet"
-        )
+        raise RemoteError(f"{where}: format {index.format} is newer than this gaponet reads; upgrade gaponet")
     return index
 
 
-def download(target: Target, files: Mapping[str, Part], folder: Path) -> None:
-    """Files of an index, below the folder; those that are there with the right hash stay."""
+def download(target: Target, index: Index, places: list[str], folder: Path) -> None:
+    """Download files of an index into a folder, and compare their sizes and hashes.
+
+    Raises:
+        RemoteError: A file is missing or differs, or the disk is too small.
+    """
     folder.mkdir(exist_ok=True)
-    missing = [(place, part) for place, part in files.items() if not _is(folder / place, part)]
-    needed, free = sum(part.size for _, part in missing), shutil.disk_usage(folder).free
-    if needed + SPARE > free:
-        raise RemoteError(
-            f"{target.address}: {needed / 1e9:.2f} GB are to come, {free / 1e9:.2f} GB of the disk are free"
-        )
-
-    def fetch(place: str, part: Part) -> str:
-        (folder / place).unlink(missing_ok=True)
-        target.fetch(place, part, folder)
-        if not _is(folder / place, part):
-            (folder / place).unlink(missing_ok=True)
-            raise RemoteError(
-                f"{target.address}: {place} came with another size or hash than {INDEX} says; push it again"
-            )
-        return place
-
-    with bar("downloading") as update, ThreadPoolExecutor(AT_ONCE) as pool:
-        told, jobs = noted(update, ""), [pool.submit(fetch, *one) for one in missing]
-        try:
-            for done, job in enumerate(as_completed(jobs), 1):
-                job.result()
-                told(done, len(jobs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-
-
-def _is(file: Path, part: Part) -> bool:
-    return file.is_file() and not file.is_symlink() and part_of(file) == part
-
-
-def part_of(file: Path) -> Part:
-    """Size and hash of a file."""
-    digest = hashlib.sha256()
-    with file.open("rb") as content:
-        while block := content.read(BLOCK):
-            digest.update(block)
-    return Part(file.stat().st_size, digest.hexdigest())
+    wrong = "{}: {} is not the file that was pushed, by its size or hash; push it again, with --replace"
+    for place, size in zip(places, target.sizes(places, index), strict=True):
+        if size != index.files[place].size:
+            raise RemoteError(wrong.format(target.address, place))
+    needed, free = index.size(places), shutil.disk_usage(folder).free
+    if needed + MIN_FREE_BYTES > free:
+        raise RemoteError(f"{target.address}: has {needed / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free")
+    target.fetch(places, index, folder)
+    for place in places:
+        if Part.of(folder / place) != index.files[place]:
+            (folder / place).unlink()
+            raise RemoteError(wrong.format(target.address, place))
 
 
 @contextmanager
-def reaching(address: str, *errors: type[Exception], but: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Errors of these types, and of the operating system's network, become a RemoteError with the address."""
+def reaching(address: str, *but: type[Exception]) -> Iterator[None]:
+    """Turn errors of the network libraries into a RemoteError with the address and without secrets."""
     try:
         yield
     except Exception as error:
-        if isinstance(error, (RemoteError, *but)) or not isinstance(error, (*errors, OSError)):
+        if isinstance(error, (GAPONetError, *BUGS, *but)):
             raise
-        cause = error.__cause__ or error
-        text = without_credentials(" ".join(str(cause).split())) or type(cause).__name__
-        raise RemoteError(f"{address}: {text[:300]}") from None
+        text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
+        kinds: dict[type[Exception], str] = {FileNotFoundError: "not found: ", PermissionError: "no permission: "}
+        why = kinds.get(type(error), "")
+        raise RemoteError(f"{address}: {why}{text[:300] or type(error).__name__}") from None
+
+
+@contextmanager
+def naming(address: str, folder: Path) -> Iterator[None]:
+    """Turn errors about downloaded files into a RemoteError that names the address instead of the folder."""
+    try:
+        yield
+    except GAPONetError as error:
+        text = str(error).replace(f"{folder}/", "").removeprefix(f"{address}: ")
+        raise RemoteError(f"{address}: {text}") from None

@@ -2,9 +2,9 @@
 
 A LeRobot set has one rate and the same features in every frame; a dataset with several rates or choices of channels
 becomes several sets, in folders of their own. One Parquet row group per episode. Where a file ends, the content hash
-of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Files
-are laid out in blocks, each with its own file of meta/episodes, and nothing in a block depends on what comes after it:
-a dataset that grew has its earlier blocks again, byte by byte, and a push need not make them (share/dataset.py).
+of its last episode says: files of 2 MB in the mean, of a 2,000th of what lies before them where that is more. Some
+data files share a file of meta/episodes. No file depends on episodes that come after it, so that a dataset that grew
+has its earlier files again, byte by byte, and a push sends the others only (share/move.py).
 
     beyond the standard     features observation.velocity, .acceleration, .torque, .equivalent_torque, .temperature
                             features.<name>.info.unit: SI
@@ -16,9 +16,8 @@ A reader that knows none of these finds an ordinary set. Not in it: twins, which
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.arrays import Array
+from gaponet.base.errors import DatasetError
 from gaponet.data.formats.lerobot_set import FEATURES, GAINS, OURS, STATED, VERSION
 from gaponet.data.log import UNITS
 from gaponet.data.sequence import Sequence
@@ -36,11 +36,9 @@ from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
 Group = tuple[float, tuple[str, ...]]  # dt, channels
 
-LAYOUT = 1  # rises where the same recordings become other bytes
 FILE_MB, CHUNK_FILES = 100, 1000  # LeRobot's own defaults, at most
 USUAL_MB, SHARE = 2.0, 1 / 2000  # of a file, and of all bytes before it
 BLOCK_MB, BLOCK_EPISODES = 32.0, 64  # a block ends with a file, once it holds as much of both together
@@ -60,35 +58,22 @@ class _Placed:
     file: int
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Whole data files and the file of meta/episodes that lists what is in them, one of this number.
-
-    The key stands for all that decides their bytes: what is in them, and all that lies before.
-    """
-
-    key: str
-    number: int
-    episodes: list[_Placed]
-    places: list[str]
-
-
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
-    """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate."""
-    written = []
-    for part in sets_of(dataset):
-        part.write_meta(folder, pool([part.write_block(block, folder, dataset.read, tell) for block in part.blocks]))
-        written.append(Written(Path(part.name), len(part.entries), part.frames, _fps(part.dt)))
-    return written
+    """Write LeRobot sets: into the folder itself where one will do, else into folders named after rate.
 
-
-def sets_of(dataset: Dataset) -> list[LeRobotSet]:
-    """The sets that a dataset becomes; nothing is read or written yet."""
+    Raises:
+        DatasetError: A recording is damaged.
+    """
     groups: dict[Group, list[Entry]] = {}
     for entry in dataset.entries:
         groups.setdefault((entry.dt, entry.channels), []).append(entry)
-    names = {group: _folder(*group, list(groups)) if len(groups) > 1 else "" for group in groups}
-    return [LeRobotSet(dataset, names[group], *group, entries) for group, entries in groups.items()]
+    written = []
+    for group, entries in groups.items():
+        name = _folder(*group, list(groups)) if len(groups) > 1 else ""
+        part = _Set(dataset, folder / name, *group, entries)
+        part.write(tell)
+        written.append(Written(Path(name), len(entries), part.frames, _fps(part.dt)))
+    return written
 
 
 def _folder(dt: float, channels: tuple[str, ...], groups: list[Group]) -> str:
@@ -102,81 +87,81 @@ def _fps(dt: float) -> float:
     return round(1 / dt) if abs(round(1 / dt) * dt - 1) < 1e-9 else 1 / dt
 
 
-class LeRobotSet:
-    """One LeRobot set: which episodes go where, decided from the journal alone, and the writing of it."""
+class _Set:
+    """One LeRobot set, and the writing of it."""
 
-    def __init__(self, dataset: Dataset, name: str, dt: float, channels: tuple[str, ...], entries: list[Entry]) -> None:
-        self.dataset, self.name, self.dt, self.channels, self.entries = dataset, name, dt, channels, entries
+    def __init__(
+        self, dataset: Dataset, folder: Path, dt: float, channels: tuple[str, ...], entries: list[Entry]
+    ) -> None:
+        self.dataset, self.folder, self.dt, self.channels, self.entries = dataset, folder, dt, channels, entries
         self.n = len(dataset.joint_names)
         self.tasks: dict[str, int] = {}
         self.frames = 0
-        self.blocks = list(self._blocks())
 
-    def _blocks(self) -> Iterator[_Block]:
+    def write(self, tell: Tell) -> None:
+        """Write all files."""
+        self._write_meta(pool([self._write_block(*block, tell) for block in enumerate(self._blocks())]))
+
+    def _blocks(self) -> Iterator[list[_Placed]]:
+        """Episodes of whole data files that one file of meta/episodes lists; the journal alone decides the ends."""
         row = 4 * self.n * len(self.channels) + sum(np.dtype(kind).itemsize for kind in INDEX.values())
-        said = [LAYOUT, self.name, self.dataset.robot_name, self.dataset.joint_names, self.dt, self.channels]
-        digest = hashlib.sha256(json.dumps(said).encode())
         block: list[_Placed] = []
-        file = size = total = number = 0
+        file = size = total = 0
         fill, ended = 0.0, False  # of the block; whether a file ended with the last episode
         for index, entry in enumerate(self.entries):
             more = entry.rows * row
             if ended or (size and size + more > FILE_MB * 1e6):
                 file, size = file + 1, 0
                 if fill >= 1:
-                    yield self._block(digest.hexdigest(), number, block)
-                    block, number, fill = [], number + 1, 0.0
-            digest.update(entry.line + b"\n")
+                    yield block
+                    block, fill = [], 0.0
             task = self.tasks.setdefault(entry.meta.motion, len(self.tasks))
             block.append(_Placed(entry, index, self.frames, task, file))
             size, total, fill = size + more, total + more, fill + more / (BLOCK_MB * 1e6) + 1 / BLOCK_EPISODES
             self.frames += entry.rows
             ended = int(entry.hash[:8], 16) / 2**32 < more / max(USUAL_MB * 1e6, SHARE * total)
-        yield self._block(digest.hexdigest(), number, block)
+        yield block
 
-    def _block(self, key: str, number: int, episodes: list[_Placed]) -> _Block:
-        files = dict.fromkeys(episode.file for episode in episodes)
-        places = [*(self._place("data", file) for file in files), self._place("meta/episodes", number)]
-        return _Block(key, number, episodes, places)
+    def _place(self, what: str, number: int) -> Path:
+        place = self.folder / what / PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        return place
 
-    def _place(self, what: str, number: int) -> str:
-        file = PLACE.format(chunk_index=number // CHUNK_FILES, file_index=number % CHUNK_FILES)
-        return f"{self.name}/{what}/{file}".lstrip("/")
-
-    def write_block(
-        self, block: _Block, folder: Path, read: Callable[[Entry], Sequence], tell: Tell = lambda motion: None
-    ) -> EpisodeStats:
-        """Write the files of a block; returns the statistics of its frames."""
+    def _write_block(self, number: int, episodes: list[_Placed], tell: Tell) -> EpisodeStats:
+        """Write data files and the file of meta/episodes; returns the statistics of their frames."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         rows: list[dict[str, Any]] = []
         stats, writer, file = [], None, -1
         try:
-            for episode in block.episodes:
-                columns = self._columns(read(episode.entry), episode)
+            for episode in episodes:
+                columns = self._columns(self._read(episode.entry), episode)
                 if episode.file != file:
                     if writer is not None:
                         writer.close()
-                    writer, file = self._open(folder / self._place("data", episode.file)), episode.file
+                    file = episode.file
+                    writer = pq.ParquetWriter(
+                        self._place("data", file), self._schema(), compression="snappy", use_dictionary=False
+                    )
                 assert writer is not None
                 writer.write_table(self._table(columns))
                 stats.append(episode_stats(columns))
-                rows.append(_row(episode, block.number, stats[-1]))
+                rows.append(_row(episode, number, stats[-1]))
                 tell(episode.entry.meta.motion)
         finally:
             if writer is not None:
                 writer.close()
-        place = folder / block.places[-1]
-        place.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.Table.from_pylist(rows), place, compression="snappy")
+        pq.write_table(pa.Table.from_pylist(rows), self._place("meta/episodes", number), compression="snappy")
         return pool(stats)
 
-    def _open(self, path: Path) -> pq.ParquetWriter:
-        import pyarrow.parquet as pq
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return pq.ParquetWriter(path, self._schema(), compression="snappy", use_dictionary=False)
+    def _read(self, entry: Entry) -> Sequence:
+        sequence = self.dataset.read(entry)
+        if sequence.content_hash() != entry.hash:
+            raise DatasetError(
+                f"{self.dataset.path}: '{entry.id}' is not what was recorded, by its hash; restore it first"
+            )
+        return sequence
 
     def _schema(self) -> pa.Schema:
         import pyarrow as pa
@@ -206,12 +191,11 @@ class LeRobotSet:
         ]  # fmt: skip
         return pa.table(arrays, schema=schema)
 
-    def write_meta(self, folder: Path, stats: EpisodeStats) -> None:
+    def _write_meta(self, stats: EpisodeStats) -> None:
         """Write what is of the whole set, with the statistics of all frames."""
         import pyarrow.parquet as pq
 
-        meta = folder / self.name / "meta"
-        meta.mkdir(parents=True, exist_ok=True)
+        meta = self.folder / "meta"
         pq.write_table(_task_table(self.tasks), meta / "tasks.parquet")
         _write_json(meta / "info.json", self._info())
         _write_json(meta / "stats.json", plain(stats))

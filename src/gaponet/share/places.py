@@ -1,4 +1,4 @@
-"""Places by their address; a place's module is imported when one is opened."""
+"""The place at an address: the Hub, or a bucket."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from gaponet.share.target import Target
 
 
 def open_target(address: str) -> Target:
-    """The place that an address names: USER/NAME of the Hugging Face Hub, or s3://, gs:// or file:// and a folder.
+    """The place at an address: USER/NAME or hf://USER/NAME of the Hub, or s3://, gs:// or file:// and a folder.
 
     Raises:
-        RemoteError: It is no address.
+        RemoteError: The address is not valid.
     """
-    if "://" in address:
+    if "://" in address and not address.startswith("hf://"):
         from gaponet.share.bucket import Bucket
 
         return Bucket(address)
