@@ -30,7 +30,8 @@ def open_dataset(
 
     Args:
         dataset: Folder; or the address (s3://, gs://, file://, hf://) of one that was pushed, which is read where it
-        lies. robot: Another robot than the one that the dataset keeps.
+            lies.
+        robot: Another robot than the one that the dataset keeps.
         run: The run whose robot is taken where the dataset keeps none.
 
     Raises:
