@@ -122,9 +122,8 @@ def test_no_folder_is_more_than_a_newcomer_can_hold():
 
 
 def test_torch_is_imported_only_where_networks_live():
-    allowed = {f"nn/{name}.py" for name in ("deeponet", "fuse", "layers", "onnx_export", "paper")}
+    allowed = {f"nn/{name}.py" for name in ("baselines/mlp", "deeponet", "layers", "onnx_export", "paper")}
     allowed |= {"sim/warp.py"}  # steps on a GPU
-    allowed |= {f"nn/baselines/{name}.py" for name in ("mlp", "transformer")}
     free = ("nn/training/", "export/", "experiments/speed/", "experiments/pool.py")
     for file in MODULES.values():
         place = file.relative_to(PACKAGE).as_posix()

@@ -59,19 +59,19 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
 
 
 class _Linear(nn.Module):
-    """A network whose features are one linear layer. onnxruntime takes two thirds of the time for it."""
+    """A network whose features are one linear layer: onnxruntime needs a quarter less time."""
 
     weight: Tensor
     bias: Tensor
 
     def __init__(self, net: DeltaNet) -> None:
         super().__init__()
-        self.net, of = net, net.features.standardise
-        relative, zero = net.features.relative(torch.eye(net.features.dim)), torch.zeros(1, net.features.dim)
-        weight, bias = net.arrange(relative / of.std) - net.arrange(zero), net.arrange(zero - of.mean / of.std)
+        mean, std = net.features.standardise.mean, net.features.standardise.std
+        relative, zero = net.features.relative(torch.eye(len(mean))), torch.zeros(1, len(mean))
+        weight, bias = net.arrange(relative / std) - net.arrange(zero), net.arrange(zero - mean / std)
+        self.net, self.shape = net, bias.shape[1:]
         self.register_buffer("weight", weight.flatten(1).T)
         self.register_buffer("bias", bias.flatten())
-        self.shape = bias.shape[1:]
 
     def forward(self, x: Tensor) -> Tensor:
         z = nn.functional.linear(x, self.weight, self.bias).clamp(-CLAMP, CLAMP)
