@@ -150,18 +150,7 @@ def test_a_card_with_switches_of_an_earlier_version_is_read_where_they_had_the_v
         (artifact / "card.json").write_text(json.dumps(card))
         return GapModel.load(artifact)
 
-    assert (
-        written(
-            sensor_hold=1,
-            context="none",
-            branch="unstacked",
-            payload_trunk=True,
-            coupling="posture",
-            transformer_width=64,
-        )
-        .loop()
-        .n
-        == 2
-    )
+    known = {"context": "none", "branch": "unstacked", "coupling": "posture", "transformer_width": 64}
+    assert written(**known).loop().n == 2
     with pytest.raises(ModelError, match="trained with branch stacked, which is no more; train again"):
         written(branch="stacked")
