@@ -6,9 +6,11 @@ PLACE/gaponet.json    the names of those that belong together; written last
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,7 @@ class Bucket:
         if scheme == "gs":
             from aiohttp import ClientTimeout
 
+            logging.getLogger(MODULES[scheme]).addHandler(logging.NullHandler())  # it logs what it raises, too
             options["requests_timeout"] = ClientTimeout(sock_connect=SILENT_S, sock_read=SILENT_S)  # gcsfs has none
         with reaching(self.address):
             self.fs, self.root = fsspec.url_to_fs(address.rstrip("/"), use_listings_cache=False, **options)
@@ -56,7 +59,7 @@ class Bucket:
     def index(self, kind: Kind | None = None) -> bytes | None:
         place, bucket, self._found = f"{self.root}/{INDEX}", self.root.partition("/")[0], None
         with reaching(self.address):
-            if (info := self._info(place)) and info["type"] == "file":
+            if (info := self._info(place)).get("type") == "file":
                 if info["size"] > MAX_INDEX_BYTES:
                     raise RemoteError(f"{self.address}: {INDEX} has more than {MAX_INDEX_BYTES >> 20} MiB")
                 self._found = self.fs.cat_file(place)
@@ -64,17 +67,15 @@ class Bucket:
                 raise RemoteError(f"{self.address}: no bucket '{bucket}'; make it with the provider's tools")
             elif self._info(self.root):
                 names = {path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)} - {"", OBJECTS}
-                for name in sorted(names):
-                    if not name.startswith(MARK):
-                        raise RemoteError(f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it")
+                if name := min((name for name in names if not name.startswith(MARK)), default=""):
+                    raise RemoteError(f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it")
         return self._found
 
-    def _info(self, path: str) -> dict[str, Any] | None:
-        """None for a missing path; `isfile` and `exists` would say so of a path that cannot be read, too."""
-        try:
+    def _info(self, path: str) -> dict[str, Any]:
+        """Empty for a missing path; `isfile` and `exists` would say so of a path that cannot be read, too."""
+        with suppress(FileNotFoundError):
             return dict(self.fs.info(path))
-        except FileNotFoundError:
-            return None
+        return {}
 
     def sizes(self, places: list[str], index: Index) -> list[int | None]:
         with reaching(self.address):

@@ -89,10 +89,9 @@ class Target(Protocol):
         """Download files of the index into a folder, except those that an earlier download left there."""
 
     def store(self, folder: Path, index: Index, private: bool, replace: bool, prune: bool) -> int:
-        """Upload what the place lacks, then make the index its content at once; returns the number of pruned files.
+        """Upload from a folder what the place lacks, then the index at once; returns the number of pruned files.
 
         Args:
-            folder: Holds the files of the index, and the index.
             private: A new repository is readable by its owner alone.
             replace: Upload every file.
             prune: Delete files of earlier pushes.
@@ -147,8 +146,8 @@ def reaching(address: str, *but: type[Exception]) -> Iterator[None]:
         if isinstance(error, (GAPONetError, *BUGS, *but)):
             raise
         text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
-        kinds: dict[type[Exception], str] = {FileNotFoundError: "not found: ", PermissionError: "no permission: "}
-        why = kinds.get(type(error), "")
+        missing, refused = (isinstance(error, kind) for kind in (FileNotFoundError, PermissionError))
+        why = "not found: " * missing + "no permission: " * refused
         raise RemoteError(f"{address}: {why}{text[:300] or type(error).__name__}") from None
 
 
