@@ -52,8 +52,6 @@ def permuted(data: Dataset, unit: str, folder: Path) -> Dataset:
     """The dataset with the payloads of its training and validation recordings permuted."""
     parts, draw = split_entries(data, (unit,)), np.random.default_rng(0)
     robot = load_robot(str(data.path / "robot"))
-    if folder.is_dir():
-        return Dataset(folder)
     found = Dataset.create(folder, robot)
     with found.appending():
         for part, entries in parts.items():
@@ -61,7 +59,9 @@ def permuted(data: Dataset, unit: str, folder: Path) -> Dataset:
             if part != "test":
                 draw.shuffle(masses)
             for sequence, mass in zip(data.sequences(entries), masses, strict=True):
-                found.append(replace(sequence, meta=replace(sequence.meta, payload_mass=float(mass))))
+                one = replace(sequence, meta=replace(sequence.meta, payload_mass=float(mass)))
+                if found.find(one.content_hash()) is None:
+                    found.append(one)
     return found
 
 

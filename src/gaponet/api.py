@@ -140,7 +140,7 @@ def gap(
     Returns:
         methods → nominal (and identified, and the model's) → metrics (mpjae rad, …), and by_joint, by_payload, by_unit,
         by_motion, by_horizon the same; dataset, sequences, hours, virtual, robot, simulator_hash. Of an identified
-        robot or a run also what eval.gap.gap_by_step says.
+        robot or a run also what report.gap.gap_by_step says.
     """
     from gaponet.sim.metrics import Run, summary
     from gaponet.sim.model import model_hash
@@ -307,7 +307,7 @@ def train(
         dataset: Recordings: a folder, or the address of one that was pushed to a bucket.
         out: Run folder.
         budget: Time such as 90s, 10m or 2h, or control steps such as 2000000.
-        config: Everything else (training.config); default TrainConfig().
+        config: Everything else (nn.training.config); default TrainConfig().
         model: gaponet, paper (the paper's literal network), or a baseline: shared_mlp, mlp, inverse;
             default that of the config.
         robot: Another robot than the one that the dataset keeps, e.g. the folder that identify wrote.
