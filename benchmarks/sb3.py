@@ -2,7 +2,7 @@
 
     python benchmarks/sb3.py [--robot so101] [--model gaponet] [--num-envs 1024] [--rounds 3]
 
-All take turns with `gaponet bench train` in one run. stable-baselines3 and gymnasium are the `bench` extra.
+All take turns with the parts of `speed.py train` in one run. stable-baselines3 and gymnasium are the `bench` extra.
 """
 
 from __future__ import annotations
@@ -19,14 +19,13 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+from speed import Turn, bench_train, recordings
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
 from gaponet.data.sequence import Sequence
-from gaponet.experiments.speed.training import bench_train, recordings
-from gaponet.experiments.speed.turns import Turn
 from gaponet.nn.baselines.mlp import DeltaMLP
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network

@@ -1,4 +1,4 @@
-"""gaponet export and what gaponet bench latency measures, on a small artifact."""
+"""gaponet export on a small artifact."""
 
 import json
 import shutil
@@ -11,7 +11,6 @@ from arm import write_arm
 
 from gaponet.cli.main import main
 from gaponet.deploy.aligned_sim import AlignedSim
-from gaponet.experiments.speed import latency
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network
@@ -63,13 +62,3 @@ def test_without_a_checkpoint_onnx_cannot_be_written_again(run, capsys):
     (run / "checkpoint.pt").unlink()
     assert main(["export", str(run)]) == 2
     assert "no checkpoint.pt" in capsys.readouterr().err
-
-
-def test_every_runtime_is_measured(run, monkeypatch):
-    monkeypatch.setattr(latency, "BATCH", 16)
-    threads = torch.get_num_threads()
-    result = latency.measure(run, calls=100, threads=0)
-    torch.set_num_threads(threads)
-    assert set(result["microseconds"]) == {"network, onnxruntime", "network, torch", "delta()"}
-    assert all(0 < t["p50"] <= t["p99"] <= t["max"] for t in result["microseconds"].values())
-    assert result["deltas_per_s"] > 0

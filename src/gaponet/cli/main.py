@@ -26,7 +26,7 @@ TASKS = {
     "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
     "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
-    "Share it, time it": ("push", "pull", "bench"),
+    "Share it, compare it": ("push", "pull", "bench"),
 }
 # Command → module:function. A module is imported when its command is run; help reads what it says of itself.
 COMMANDS = {
@@ -43,7 +43,11 @@ COMMANDS = {
     "import": "gaponet.cli.logs:import_logs",
     "eval": "gaponet.cli.train:evaluate",
 }  # fmt: skip
-REMOVED = {"prune": "gaponet push --prune"}  # command → what replaces it
+# Command, or command with its first argument → what replaces it.
+REMOVED = {
+    "prune": "gaponet push --prune",
+    **{f"bench {part}": f"python benchmarks/speed.py {part}" for part in ("sim", "train", "latency", "aligned")},
+}
 ABOUT = "Close the gap between simulated and real motors from joint logs."
 
 
@@ -85,8 +89,9 @@ def _run(argv: list[str], begin: Callable[[], object]) -> None:
         print(_overview())
         return
     name, completing = argv[0], argv[0].startswith("--tyro-")
-    if name in REMOVED:
-        raise UsageError(f"gaponet {name} was removed; use {REMOVED[name]}")
+    for removed in (name, " ".join(argv[:2])):
+        if removed in REMOVED:
+            raise UsageError(f"gaponet {removed} was removed; use {REMOVED[removed]}")
     if name not in COMMANDS and not completing:
         close = get_close_matches(name, COMMANDS, 1)
         guess = f"do you mean {close[0]}? " if close else ""

@@ -1,1 +1,0 @@
-"""How fast it is: simulation, training, one correction of a trained model, the aligned simulator."""
