@@ -8,7 +8,7 @@ every fifth arm (friction, zero, delay, in turn). --kill: the second night is ki
 Prints seconds of processor, bytes, and who was named.
 
 --day: the second night alone, from raw logs (two minutes, which stand for a day) over import, doctor and gap to check
-and calibration, a robot a job on the executor. The robots are copies of DRAWN arms, each with a day of its own. --kill:
+and adaptation, a robot a job on the executor. The robots are copies of DRAWN arms, each with a day of its own. --kill:
 a worker is killed with -9 once a third is done. Prints seconds of processor by step, docs/results/speed.md.
 """
 
@@ -123,7 +123,7 @@ def day(work: Path, robots: int, executor: str, kill: bool) -> None:
     print(f"{len(took)} robots on {executor}: {wall:.0f} s after {ready - began:.0f} s of start; killed: {killed}")
     right, of = sum(bool(named[r]) for r in odd), sum(map(bool, named.values()))
     print(f"not the same {len(odd)}, changed indeed {right} of {of}")
-    for step in ("import", "doctor", "gap", "check", "calibrate"):
+    for step in ("import", "doctor", "gap", "check", "adapt"):
         each = np.array([t[step] for t in took.values() if step in t])
         print(f"{step}: {len(each)} robots, {np.median(each):.2f} s of processor each, {each.sum():.0f} in all")
 
@@ -161,8 +161,8 @@ def _night(work: Path, name: str) -> dict[str, float]:
     took["drifted"] = float(found["verdict"] != "same")
     if found["verdict"] == "drifted":
         began = spent()
-        gp.calibrate_robot(job.robot, data, work / "calibrated" / name)
-        took["calibrate"] = spent() - began
+        gp.adapt_robot(job.robot, data, work / "adapted" / name)
+        took["adapt"] = spent() - began
     return took
 
 
@@ -196,14 +196,14 @@ def main() -> None:
         said = json.loads(done.stdout)["robots"]
         if night == "night2" and args.kill:
             print(f"asked again of those: {sum(f.stat().st_mtime_ns != then for f, then in kept.items())}")
-        took, calibrated = np.array([n["took"] for n in said.values()]), [n["calibrated"] for n in said.values()]
+        took, adapted = np.array([n["took"] for n in said.values()]), [n["adapted"] for n in said.values()]
         moved = {r: n["moved"] for r, n in said.items() if n["verdict"] != "same"}
         right = [r for r in moved if night == "night2" and named[r]]
         size = sum(f.stat().st_size for f in (work / night).rglob("*") if f.is_file()) / len(named)
-        again = sum(c is not None for c in calibrated)
+        again = sum(c is not None for c in adapted)
         print(
             f"{night}: {len(said)} robots, {time.monotonic() - began:.0f} s, of processor {took.sum():.0f} s: "
-            f"{np.median(took):.2f} each, {max(took):.1f} the longest; {again} calibrated; "
+            f"{np.median(took):.2f} each, {max(took):.1f} the longest; {again} adapted; "
             f"{size / 1e6:.2f} MB of logs each; not the same {len(moved)}, changed indeed {len(right)}"
         )
         for robot in sorted({*moved, *(r for r, what in named.items() if what and night == "night2")}):

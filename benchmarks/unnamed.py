@@ -29,7 +29,7 @@ from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.nn import calibration
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.training.labels import trajectory_labels
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -98,12 +98,12 @@ class Rows:
                 *(["--resume"] if (folder / "checkpoint.pt").is_file() else []))  # fmt: skip
         return folder
 
-    def calibrated(self, robot: RobotSpec, kinds: ListOf[str]) -> dict[str, Errors]:
+    def adapted(self, robot: RobotSpec, kinds: ListOf[str]) -> dict[str, Errors]:
         """With 30 s of the unit, motions trained on: the robot folder, and under the first network."""
-        out, motions = self.bench.work / "calibrated", sorted({s.meta.motion for s in self.bench.train})
+        out, motions = self.bench.work / "adapted", sorted({s.meta.motion for s in self.bench.train})
         if not (out / "robot.toml").is_file():
             words = (
-                "calibrate",
+                "adapt",
                 robot.folder,
                 self.bench.data.path,
                 "--unit",
@@ -115,14 +115,14 @@ class Rows:
             )
             gaponet([*map(str, words)])  # may refuse: then the robot stays as it was identified
         own = load_robot(out) if (out / "robot.toml").is_file() else robot
-        found = {"calibrated": [self.errors("calibrated", own)]}
+        found = {"adapted": [self.errors("adapted", own)]}
         for kind in kinds:
             folder = self.trained(kind, robot, 0)
             model = GapModel.load(folder)
-            if UNIT not in calibration.Calibration.load(folder, model.weights_hash()):
-                run("calibrate", folder, self.bench.data.path, "--unit", UNIT)
-            own = calibration.Calibration.load(folder, model.weights_hash())[UNIT].robot(robot)
-            name = f"{kind}, calibrated"
+            if UNIT not in Adaptation.load(folder, model.weights_hash()):
+                run("adapt", folder, self.bench.data.path, "--unit", UNIT)
+            own = Adaptation.load(folder, model.weights_hash())[UNIT].robot(robot)
+            name = f"{kind}, adapted"
             found[name] = [self.errors(name, own, partial(model.corrector, robot))]
         return found
 
@@ -178,13 +178,13 @@ def main() -> None:
     parser.add_argument("--recipe", type=Path, default=RECIPE)
     parser.add_argument("--data", type=Path, help="learn from these recordings, not from the fleet's")
     parser.add_argument("--rows", nargs="*", default=["gaponet", "shared_mlp", "trees", SHUFFLED])
-    parser.add_argument("--calibrate", action="store_true", help="also with 30 s of the unit, seed 0")
+    parser.add_argument("--adapt", action="store_true", help="also with 30 s of the unit, seed 0")
     args = parser.parse_args()
     bench = Bench.of(args.fleet, args.recipe, args.work)
     bench = learning_from(bench, Dataset(args.data)) if args.data else bench
     rows = Rows(bench, args.budget)
     found = rows.all(args.rows, args.seeds)
-    found |= rows.calibrated(rows.identified(), [k for k in args.rows if k == "gaponet"]) if args.calibrate else {}
+    found |= rows.adapted(rows.identified(), [k for k in args.rows if k == "gaponet"]) if args.adapt else {}
     ends = len(bench.val)
     for name, part, own in (("validation", bench.val, slice(0, ends)), ("test", bench.test, slice(ends, None))):
         print(table({k: [e[own] for e in v] for k, v in found.items()}, part, name).markdown(), "\n")

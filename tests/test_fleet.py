@@ -1,4 +1,4 @@
-"""gaponet fleet: a night of many robots, those that drifted calibrated, and who since when."""
+"""gaponet fleet: a night of many robots, those that drifted adapted, and who since when."""
 
 import json
 from dataclasses import replace
@@ -62,10 +62,10 @@ def test_two_nights_of_three_arms(site, capsys):
     assert code == 1
     assert {r: n["verdict"] for r, n in second.items()} == {"a1": "same", "a2": "drifted", "a3": "not asked"}
     assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
-    before, after = second["a2"]["calibrated"]
+    before, after = second["a2"]["adapted"]
     assert after < 0.5 * before
-    today = Knowledge.load(load_robot(site / "out" / "calibrated" / "a2"))
-    assert [s["made_by"] for s in today.sources][-1] == "calibrate"
+    today = Knowledge.load(load_robot(site / "out" / "adapted" / "a2"))
+    assert [s["made_by"] for s in today.sources][-1] == "adapt"
     assert since(history(site / "out" / "a2.json")) == "night2"
     page = (site / "out" / "fleet.html").read_text(encoding="utf-8")
     assert "3 robots: 1 same, 1 drifted, 1 not asked" in page

@@ -24,7 +24,7 @@ __version__ = "0.1.0"
 
 _HOMES = {  # name → module
     **dict.fromkeys(
-        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "calibrate", "calibrate_robot"),
+        ("import_logs", "doctor", "pair", "gap", "identify", "train", "evaluate", "adapt_model", "adapt_robot"),
         "gaponet.api",
     ),
     "Dataset": "gaponet.data.store",

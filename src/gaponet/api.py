@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from gaponet.data.doctor import Diagnosis
     from gaponet.data.importer import ImportReport
     from gaponet.data.sequence import Sequence
+    from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.calibration import Calibration
     from gaponet.nn.training.config import TrainConfig
     from gaponet.report.evaluate import Evaluation
     from gaponet.sysid.fit import Covariance, Identified
@@ -382,7 +382,7 @@ def evaluate(
     return found
 
 
-def calibrate(
+def adapt_model(
     run: GapModel | Place,
     dataset: Dataset | Place,
     unit: str = "",
@@ -391,10 +391,10 @@ def calibrate(
     unknown_payload: bool = False,
     robot: RobotSpec | Place | None = None,
     mixed_gains: bool = False,
-) -> Calibration:
+) -> Adaptation:
     """Fit what is particular to one unit from a short log: gain, damping, friction, zero offset, delay of each joint.
 
-    The trained model stays as it is; the run keeps the calibration beside it, and evaluate shows the unit with it too.
+    The trained model stays as it is; the run keeps the adaptation beside it, and evaluate shows the unit with it too.
 
     Args:
         run: Run folder, or what train returned.
@@ -411,7 +411,7 @@ def calibrate(
         UsageError, ModelError: The unit is not named, or the model fits another robot.
     """
     from gaponet.data.sequence import require_same_gains
-    from gaponet.nn import calibration
+    from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
     from gaponet.report.candidate import corrected_robot
 
@@ -419,11 +419,11 @@ def calibrate(
     data, spec = _opened(dataset, robot, folder)
     data.require_robot(spec)
     model, simulator = GapModel.load(folder), corrected_robot(folder, spec)
-    entries = calibration.Calibration.recordings(data, model, unit, motions)
+    entries = Adaptation.recordings(data, model, unit, motions)
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    with bar("calibrating") as update:
-        found = calibration.Calibration.fit(
+    with bar("adapting") as update:
+        found = Adaptation.fit(
             model, simulator, data.sequences(entries), seconds, unknown_payload,
             lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
         )  # fmt: skip
@@ -432,7 +432,7 @@ def calibrate(
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class AdaptedRobot:
     """A robot folder that was fitted to one unit.
 
     Attributes:
@@ -449,7 +449,7 @@ class Calibrated:
     payload_std: float | None
 
 
-def calibrate_robot(
+def adapt_robot(
     robot: RobotSpec | Place,
     source: Dataset | Place,
     out: Place,
@@ -458,10 +458,10 @@ def calibrate_robot(
     seconds: float = 30.0,
     unknown_payload: bool = False,
     payload_mass: float | None = None,
-) -> Calibrated:
+) -> AdaptedRobot:
     """Fit what is particular to one unit to a short log: a robot folder in, a robot folder out, no model.
 
-    The same fit as `calibrate`: what the log does not show stays as it was known.
+    The same fit as `adapt`: what the log does not show stays as it was known.
 
     Args:
         robot: What is known: the folder that identify wrote, or a nominal one.
@@ -489,7 +489,7 @@ def calibrate_robot(
     before_known = Knowledge.load(spec)
     with writing(Path(out), "robot"), unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences):
         believed = all(s.meta.known_gains[1] is not None for s in sequences)
-        with bar("calibrating") as update:
+        with bar("adapting") as update:
             found = refit(
                 sequences, spec, seconds, unknown_payload, None,
                 lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"), believed,
@@ -516,7 +516,7 @@ def calibrate_robot(
         if (spec.folder / ORIGIN).is_file():  # which motions identification saw is still to be known
             write_text(Path(out) / ORIGIN, (spec.folder / ORIGIN).read_text(encoding="utf-8"))
         _keep_known(Path(out), sequences, [], {}, before_known)
-    return Calibrated(found.robot, unit, errors, found.payload_mass, found.payload_std)
+    return AdaptedRobot(found.robot, unit, errors, found.payload_mass, found.payload_std)
 
 
 @contextmanager

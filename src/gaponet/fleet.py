@@ -1,4 +1,4 @@
-"""A fleet's night: is each robot still the one that is known? Those that moved are calibrated; and one page: who
+"""A fleet's night: is each robot still the one that is known? Those that moved are adapted; and one page: who
 drifted, by what, since when.
 
 OUT/ROBOT.json keeps every night of a robot; a night that is there is not asked again, so what was interrupted goes on.
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from typing_extensions import TypedDict
 
-from gaponet.api import calibrate_robot, unit_recordings
+from gaponet.api import adapt_robot, unit_recordings
 from gaponet.base.errors import GAPONetError, NoGainError, RobotError, UsageError
 from gaponet.base.executor import opened
 from gaponet.base.files import write_text, writing
@@ -35,7 +35,7 @@ SHOWN = 14  # nights
 
 class Night(TypedDict):
     """What came of a robot's logs: verdict of gaponet check, or why there is none; what moved, in words, and of which
-    joint and number; mrad before and after a calibration; processor seconds."""
+    joint and number; mrad before and after an adaptation; processor seconds."""
 
     night: str
     verdict: str
@@ -44,13 +44,13 @@ class Night(TypedDict):
     numbers: list[tuple[str, str]]
     recordings: int
     seconds: float
-    calibrated: tuple[float, float] | None
+    adapted: tuple[float, float] | None
     took: float
 
 
 @dataclass(frozen=True)
 class Job:
-    """A robot of the fleet: its folder, its logs, where its calibration goes (None: it is not calibrated)."""
+    """A robot of the fleet: its folder, its logs, where its adaptation goes (None: it is not adapted)."""
 
     name: str
     robot: Path
@@ -66,29 +66,29 @@ def ask(job: Job) -> Night:
     began, spec = time.process_time(), load_robot(job.robot)
     known = Knowledge.load(spec)
     if known is None:
-        raise RobotError(f"{job.robot}: keeps only values (no known.json); identify or calibrate it again")
+        raise RobotError(f"{job.robot}: keeps only values (no known.json); identify or adapt it again")
     with unit_recordings(job.logs, spec, job.unit, (), job.payload_mass) as (_, sequences):
         found = drift(spec, known, sequences, 1)
-    calibrated, advice = None, found.advice
+    adapted, advice = None, found.advice
     if found.verdict == "drifted" and job.out is not None:
         try:
-            made = calibrate_robot(spec, job.logs, job.out, job.unit, (), payload_mass=job.payload_mass)
+            made = adapt_robot(spec, job.logs, job.out, job.unit, (), payload_mass=job.payload_mass)
             before, after = (1e3 * float(made.errors[when].mean()) for when in ("before", "after"))
-            calibrated = before, after
+            adapted = before, after
         except NoGainError:
-            advice += "; a calibration does not follow these logs better"
+            advice += "; an adaptation does not follow these logs better"
     return {
         "night": job.night, "verdict": found.verdict, "advice": advice, "recordings": len(sequences),
         "moved": [
             f"{m.joint} {m.field} {change(m.field, m.by, known, m.joint)} ({m.sigmas:+.0f} σ)" for m in found.moved
         ],
         "numbers": [(m.joint, m.field) for m in found.moved], "seconds": found.seconds,
-        "calibrated": calibrated, "took": time.process_time() - began,
+        "adapted": adapted, "took": time.process_time() - began,
     }  # fmt: skip
 
 
 def night(
-    robots: Path, logs: Path, out: Path, name: str, calibrate: bool = True, payload_mass: float | None = None,
+    robots: Path, logs: Path, out: Path, name: str, adapt: bool = True, payload_mass: float | None = None,
     executor: str | Executor = "local", workers: int = 0,
 ) -> Iterator[tuple[str, Night, int]]:  # fmt: skip
     """Ask every robot that was not asked that night yet, and write the page.
@@ -98,7 +98,7 @@ def night(
         logs: Folder with a folder of logs, or a dataset, of each robot's name; or one dataset with units so called.
         out: Folder of what is found.
         name: What the night is called, such as 2026-11-23.
-        calibrate: Whether robots that drifted get OUT/calibrated/ROBOT.
+        adapt: Whether robots that drifted get OUT/adapted/ROBOT.
 
     Yields:
         Robot, its night, and how many robots there are; of those that were asked before at once.
@@ -118,7 +118,7 @@ def night(
             if last and last["night"] == name and last["verdict"] != FAILED:
                 yield f.name, last, len(folders)
                 continue
-            place = out / "calibrated" / f.name if calibrate else None
+            place = out / "adapted" / f.name if adapt else None
             jobs.append(
                 Job(f.name, f, logs if one else logs / f.name, f.name if one else "", name, place, payload_mass)
             )
@@ -151,7 +151,7 @@ def since(nights: list[Night]) -> str:
 
 def _failed(name: str, error: Exception | None) -> Night:
     return {"night": name, "verdict": FAILED, "advice": str(error), "moved": [], "numbers": [], "recordings": 0,
-            "seconds": 0.0, "calibrated": None, "took": 0.0}  # fmt: skip
+            "seconds": 0.0, "adapted": None, "took": 0.0}  # fmt: skip
 
 
 def fleet_page(kept: dict[str, list[Night]], name: str) -> str:
@@ -162,14 +162,14 @@ def fleet_page(kept: dict[str, list[Night]], name: str) -> str:
     strip = lambda robot: "".join(MARKS[n["verdict"]] for n in kept[robot][-SHOWN:])  # noqa: E731
     lines = [
         [robot, since(kept[robot]), strip(robot), "; ".join(n["moved"]) or n["verdict"],
-         "{:.1f} → {:.1f}".format(*n["calibrated"]) if n["calibrated"] else "", n["advice"]]
+         "{:.1f} → {:.1f}".format(*n["adapted"]) if n["adapted"] else "", n["advice"]]
         for robot, n in sorted(odd.items(), key=lambda item: (since(kept[item[0]]), item[0]))
     ]  # fmt: skip
     moved = Counter(number for n in odd.values() for number in n["numbers"])
     said = ", ".join(f"{k} {verdict}" for verdict, k in count.items())
     body = element("h1", f"Fleet, {name}") + element("p", f"{len(last)} robots: {said}", css="lead")
     if lines:
-        heads = ["robot", "since", "nights", "what moved", "calibrated, mrad", "what to do"]
+        heads = ["robot", "since", "nights", "what moved", "adapted, mrad", "what to do"]
         body += element("h2", "Not as they were") + element("div", table(heads, lines), css="scroll facts")
         body += element("p", f"nights: {', '.join(f'{mark} {what}' for what, mark in MARKS.items())}", css="small")
     if moved:

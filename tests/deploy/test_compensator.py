@@ -10,8 +10,8 @@ from arm import TOML, XML, commands, write_arm
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.deploy.compensator import Compensator, CompensatorConfig
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.calibration import Calibration
 from gaponet.nn.config import ModelConfig
 from gaponet.sim.batch import BatchSim
 
@@ -369,15 +369,15 @@ def test_a_start_that_is_not_a_number_is_refused(robot, model):
         Compensator(robot, model).reset(np.array([0.0, np.nan]), 0.0)
 
 
-def test_a_calibrated_unit_follows_where_the_model_alone_does_not(robot):
+def test_a_adapted_unit_follows_where_the_model_alone_does_not(robot):
     ignorant = GapModel(Path("exact"), make_card(CONFIG, robot, dt=[0.02]), CONFIG, Nothing())
     targets = np.tile([0.4, 0.8], (200, 1))
     still = replace(NOW, feedback=0.0)
     servos = {j: {"kp": WEAK * float(k), "delay": 0.0} for j, k in zip(robot.joint_names, robot.kp, strict=True)}
-    unit = Calibration("a", "weights", servos, (), 30.0, 0.0, 0.0)
+    unit = Adaptation("a", "weights", servos, (), 30.0, 0.0, 0.0)
     error = {}
-    for name, calibration in (("common", None), ("unit", unit)):
-        q, _ = play(WeakArm(robot, 0.4), targets, Compensator(robot, ignorant, still, calibration=calibration), 0.4)
+    for name, adaptation in (("common", None), ("unit", unit)):
+        q, _ = play(WeakArm(robot, 0.4), targets, Compensator(robot, ignorant, still, adaptation=adaptation), 0.4)
         error[name] = np.abs(q[1:] - targets[:-1])[100:].mean()
     assert error["unit"] < 0.2 * error["common"]
 

@@ -82,7 +82,7 @@ def test_any_day_needs_two_days_and_any_robot_three(arm, tmp_path, capsys):
     one, two = written(arm, tmp_path / "one"), written(arm, tmp_path / "two", sources=2)
     code, said = exported(capsys, one, "--scope", "any-day")
     assert code == 2
-    assert "known from one day; calibrate it with logs of another one" in said
+    assert "known from one day; adapt it with logs of another one" in said
     assert exported(capsys, one, "--scope", "any-robot", "--units", two)[0] == 2
     wide = exported(capsys, two, "--scope", "any-day")[1]["ranges"]["elbow"]["frictionloss"]
     close = exported(capsys, two)[1]["ranges"]["elbow"]["frictionloss"]

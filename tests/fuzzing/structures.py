@@ -21,7 +21,7 @@ from gaponet.data.offsets import read_offsets
 from gaponet.data.pair import Twin
 from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
-from gaponet.nn import calibration
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.baselines.delay_offset import DelayOffset
 from gaponet.report import run_files
@@ -100,7 +100,7 @@ def _use_robot(source: Path, out: Path) -> None:
 
 @functools.cache
 def _fitted() -> Files:
-    """A run folder with its model, calibration and evaluation."""
+    """A run folder with its model, adaptation and evaluation."""
     import torch
 
     from gaponet.nn.artifact import make_card
@@ -121,9 +121,9 @@ def _fitted() -> Files:
         )  # fmt: skip
         export(net, folder / "model", card, np.zeros((4, net.features.dim), np.float32))
         weights = GapModel.load(folder).weights_hash()
-        found = calibration.Calibration("a", weights, {"elbow": {"kp": 1.0}}, ("0123456789",), 8.0, 0.1, 0.05)
-        (folder / "calibration").mkdir()
-        (folder / "calibration" / "a.json").write_text(json.dumps(asdict(found)))
+        found = Adaptation("a", weights, {"elbow": {"kp": 1.0}}, ("0123456789",), 8.0, 0.1, 0.05)
+        (folder / "adaptation").mkdir()
+        (folder / "adaptation" / "a.json").write_text(json.dumps(asdict(found)))
         _evaluation(folder)
 
     return written(write)()
@@ -154,7 +154,7 @@ def _use_model(source: Path, out: Path) -> None:
         delta = loop.delta(np.zeros(n), np.zeros(n), np.full(n, 0.1), 0.2)
         if not np.isfinite(delta).all() or np.abs(delta).max() > 20:
             raise AbsurdError(f"a correction of {delta}")
-    calibration.Calibration.load(source, model.weights_hash())
+    Adaptation.load(source, model.weights_hash())
 
 
 def _use_run(source: Path, out: Path) -> None:

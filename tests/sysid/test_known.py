@@ -120,7 +120,7 @@ def test_more_seconds_make_it_surer_and_are_told(arm, folder):
         assert (after < before).all()
 
 
-def test_what_a_calibration_moves_is_unsure_of_the_old_value(arm, folder):
+def test_what_a_adaptation_moves_is_unsure_of_the_old_value(arm, folder):
     robot = load_robot(folder)
     mine, found = Knowledge.load(robot), []
     for by in (0.0, -0.05):
@@ -134,7 +134,7 @@ def test_what_a_calibration_moves_is_unsure_of_the_old_value(arm, folder):
 def test_a_folder_that_was_edited_is_not_believed(folder, tmp_path):
     robot = load_robot(folder)
     save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
-    with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or calibrate again"):
+    with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or adapt again"):
         Knowledge.load(load_robot(tmp_path / "edited"))
 
 
@@ -144,11 +144,11 @@ def test_a_folder_without_it_loads_and_show_says_what_to_do(arm, capsys):
     assert "keeps only values" in capsys.readouterr().err
 
 
-def test_a_calibration_keeps_what_it_learned(arm, folder, tmp_path):
+def test_a_adaptation_keeps_what_it_learned(arm, folder, tmp_path):
     data = dataset(arm, tmp_path / "data", played(arm, 60, 3, kp=0.7))
-    api.calibrate_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
+    api.adapt_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
     mine = Knowledge.load(load_robot(tmp_path / "today"))
-    assert [s["made_by"] for s in mine.sources] == ["identify", "calibrate"]
+    assert [s["made_by"] for s in mine.sources] == ["identify", "adapt"]
     assert mine.sources[1]["logs"].keys() == {"m60", "m61", "m62"}
 
 
@@ -179,7 +179,7 @@ def test_a_zero_that_moved_is_named_at_its_joint(arm, folder, tmp_path, capsys):
     code, said = checked(capsys, folder, dataset(arm, tmp_path / "data", shifted))
     assert (code, [(m["joint"], m["field"]) for m in said["moved"]]) == (1, [("elbow", "offset")])
     assert said["moved"][0]["by"] == pytest.approx(0.005, rel=0.2)
-    assert "calibrate" in said["advice"]
+    assert "adapt" in said["advice"]
 
 
 def test_a_recording_that_says_something_else_is_set_aside_and_half_of_them_contradict(arm, folder, tmp_path, capsys):

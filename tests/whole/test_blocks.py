@@ -205,7 +205,7 @@ def test_the_python_blocks_of_a_page_run(page, place, quick, tmp_path, monkeypat
 
 
 QUICK = {  # Page → commands of it that take seconds; the others are parsed
-    "README.md": ("import", "doctor", "gap", "show", "export my_so101 --to randomization", "replay", "calibrate"),
+    "README.md": ("import", "doctor", "gap", "show", "export my_so101 --to randomization", "replay", "adapt"),
     "logs.md": ("formats",),
     "ten-minutes.md": ("robot", "import", "doctor", "gap"),
     "install.md": ("--version", "--tyro-print-completion"),

@@ -100,28 +100,28 @@ def test_the_gap_with_a_run_says_what_each_step_removes(place, capsys):
     assert (place / "gaponet" / "gap.png").stat().st_size > 10_000
 
 
-def test_a_calibrated_unit_is_shown_without_and_with(place, capsys):
-    shutil.copytree(place / "gaponet", place / "calibrated")
-    found, err = run(place, capsys, "calibrate", str(place / "calibrated"), str(place / "data"), "--seconds", "8")
+def test_a_adapted_unit_is_shown_without_and_with(place, capsys):
+    shutil.copytree(place / "gaponet", place / "adapted")
+    found, err = run(place, capsys, "adapt", str(place / "adapted"), str(place / "data"), "--seconds", "8")
     assert found["after"] <= found["before"]
     assert "N·m/rad" in err
-    result, _ = run(place, capsys, "eval", str(place / "calibrated"), str(place / "data"))
-    assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet", "calibrated"]
-    assert result["calibrated_units"] == [found["unit_id"]]
+    result, _ = run(place, capsys, "eval", str(place / "adapted"), str(place / "data"))
+    assert list(result["methods"]) == ["nominal", "delay_offset", "gaponet", "adapted"]
+    assert result["adapted_units"] == [found["unit_id"]]
     assert result["unseen"] is True
 
 
-def test_a_run_uses_the_units_calibration_and_refuses_a_payload_never_trained_on(place, capsys):
+def test_a_run_uses_the_units_adaptation_and_refuses_a_payload_never_trained_on(place, capsys):
     shutil.copytree(place / "gaponet", place / "mine")
-    found, _ = run(place, capsys, "calibrate", str(place / "mine"), str(place / "data"), "--seconds", "8")
+    found, _ = run(place, capsys, "adapt", str(place / "mine"), str(place / "data"), "--seconds", "8")
     motion = place / "sway.npz"
     np.savez(motion, joint_names=["shoulder", "elbow"], ctrl=np.linspace([0.0, 0.0], [0.2, 0.3], 40), dt=0.02)
     words = ["run", "--motion", str(motion), "--model", str(place / "mine"), "--fast", "--yes", "--blend", "0.2"]
     played, err = run(place, capsys, *words, "--payload-mass", "0")
-    assert played["calibrated"] is None
-    assert f"calibrations of {found['unit_id']}, none of which is used: --unit-id says which" in err
+    assert played["adapted"] is None
+    assert f"adaptations of {found['unit_id']}, none of which is used: --unit-id says which" in err
     played, err = run(place, capsys, *words, "--payload-mass", "0", "--unit-id", found["unit_id"])
-    assert played["calibrated"] == found["unit_id"]
+    assert played["adapted"] == found["unit_id"]
     assert main([*words, "--robot", str(place / "arm"), "--payload-mass", "0.3"]) == 2
     assert "asked for 0.3 kg, where it only guesses" in capsys.readouterr().err
 
@@ -150,7 +150,7 @@ def test_the_report_is_one_offline_page(place, capsys):
         (["report", "{}/data"], "give a run folder"),
         (["experiment", "compare", "{}/data", "--out", "{}/new", "--models", "lstm"], "no model 'lstm'; there are"),
         (["experiment", "compare", "{}/data", "--out", "{}/new", "--models", "identified+mlp"], "add --identify"),
-        (["calibrate", "{}/gaponet", "{}/data", "--unit", "nobody"], "holds units"),
+        (["adapt", "{}/gaponet", "{}/data", "--unit", "nobody"], "holds units"),
         (["gap", "{}/data", "--robot", "h1_2"], "holds robot 'arm'"),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],

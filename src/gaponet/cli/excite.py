@@ -39,7 +39,7 @@ def excite(
 
     Args:
         robot: Robot name or folder; its range, torque and payload limits bound the motions.
-        known: Robot folder of gaponet identify or calibrate.
+        known: Robot folder of gaponet identify or adapt.
         out: Folder for the motion files and sheet.md.
         minutes: How long all motions are together. 10 (the default) identify gains, friction and delay, 40 make a good
             model. With --for half a minute.
@@ -84,7 +84,7 @@ def _next(
 
     mine = Knowledge.load(spec)
     if mine is None:
-        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or calibrate it again")
+        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or adapt it again")
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
         raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
     with bar("looking for motions") as update:

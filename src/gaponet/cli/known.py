@@ -18,13 +18,13 @@ from gaponet.sysid.knowledge import Knowledge
 if TYPE_CHECKING:
     from gaponet.sysid.drift import Moved
 
-Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet calibrate.", metavar="ROBOT")]
+Known = Annotated[Folder, tyro.conf.arg(help="Robot folder of gaponet identify or gaponet adapt.", metavar="ROBOT")]
 Logs = Annotated[
     tyro.conf.Positional[str],
     tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.", metavar="LOGS"),
 ]
 WIDE = 4  # columns of a table
-MEND = "identify or calibrate it again with this gaponet, which keeps it"
+MEND = "identify or adapt it again with this gaponet, which keeps it"
 
 
 def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
@@ -128,26 +128,26 @@ def check(
 
 
 def fleet(
-    robots: Annotated[Folder, tyro.conf.arg(help="Folder of robot folders, each of gaponet identify or calibrate.")],
+    robots: Annotated[Folder, tyro.conf.arg(help="Folder of robot folders, each of gaponet identify or adapt.")],
     logs: Annotated[Folder, tyro.conf.arg(help="Folder of each robot's logs or dataset; or one dataset of all units.")],
     out: Path,
     night: str = "",
-    calibrate: bool = True,
+    adapt: bool = True,
     payload_mass: float | None = None,
     executor: str = "local",
     workers: int = 0,
     json: Json = False,
 ) -> None:
-    """Check many robots, calibrate those that drifted, one page of them.
+    """Check many robots, adapt those that drifted, one page of them.
 
     A fleet's nightly job: who drifted, by what, since when.
 
     The same command again goes on where it was. The exit code is 0 where all are the same, else 1.
 
     Args:
-        out: Folder of what is found: fleet.html, calibrated/ROBOT, ROBOT.json with its nights.
+        out: Folder of what is found: fleet.html, adapted/ROBOT, ROBOT.json with its nights.
         night: Its name; default today.
-        calibrate: Whether those that drifted are calibrated.
+        adapt: Whether those that drifted are adapted.
         payload_mass: kg in each hand, of logs whose format does not state it.
         executor: Where: local, ray or ray:ADDRESS (docs/scale.md); folders are on a disk that all machines see.
         workers: Robots at a time; 0 for as many as there are cores.
@@ -157,7 +157,7 @@ def fleet(
 
     screen, when, found = Out(json), night or date.today().isoformat(), dict[str, known.Night]()
     with bar("checking") as update:
-        for name, mine, count in known.night(robots, logs, out, when, calibrate, payload_mass, executor, workers):
+        for name, mine, count in known.night(robots, logs, out, when, adapt, payload_mass, executor, workers):
             found[name] = mine
             update(len(found), count, f"{name}: {mine['verdict']}")
     odd = {name: mine for name, mine in sorted(found.items()) if mine["verdict"] != known.SAME}

@@ -23,7 +23,7 @@ TASKS = {
     "Start here": ("start", "demo"),
     "Logs": ("import", "formats", "doctor", "data", "excite", "collect", "robot"),
     "The gap": ("gap", "view"),
-    "Closing it": ("identify", "show", "torque", "calibrate", "train", "export"),
+    "Closing it": ("identify", "show", "torque", "adapt", "train", "export"),
     "Is it closed?": ("eval", "check", "fleet", "replay", "report", "runs", "experiment"),
     "On a robot, real or virtual": ("run", "record", "virtual", "attach"),
     "Share it, compare it": ("push", "pull", "bench"),
@@ -33,7 +33,7 @@ COMMANDS = {
     **{
         name: f"gaponet.cli.{name}:{name}"
         for name in (
-            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "torque", "calibrate",
+            "start", "demo", "data", "excite", "collect", "robot", "gap", "view", "identify", "torque", "adapt",
             "train", "export", "replay", "report", "runs", "experiment", "run", "record", "virtual", "attach", "bench",
         )
     },
@@ -46,6 +46,7 @@ COMMANDS = {
 # Command, or command with its first argument → what replaces it.
 REMOVED = {
     "prune": "gaponet push --prune",
+    "calibrate": "gaponet adapt",
     **{f"bench {part}": f"python benchmarks/speed.py {part}" for part in ("sim", "train", "latency", "aligned")},
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."

@@ -121,7 +121,7 @@ class Request(Asked):
     compensation: CompensatorConfig = CompensatorConfig()  # noqa: RUF009
     """How commands are found, with compensation."""
     unit_id: str = ""
-    """Which unit this is, with a model; what gaponet calibrate found out about it is used."""
+    """Which unit this is, with a model; what gaponet adapt found out about it is used."""
     extrapolate: Flag = False
     """Take payloads, with a model, and servo gains other than those that the data were recorded with."""
     dry_run: Flag = False
@@ -186,7 +186,7 @@ def perform(
     planner = Planner(spec, driver.commanded, asked.control, asked.safety, limits)
     if asked.dry_run:
         driver = DryRun(driver)
-    compensator, calibrated = _compensator(screen, asked, identified, asked.unit_id or facts.get("unit_id", ""))
+    compensator, adapted = _compensator(screen, asked, identified, asked.unit_id or facts.get("unit_id", ""))
     if compensator and asked.driver != "virtual":
         require_plausible(compensator.robot)
     live = None if motion else listen(screen, asked, spec, driver, clock)
@@ -214,7 +214,7 @@ def perform(
         metadata={
             "motion": motion.name if motion else "live", "payload_side": asked.payload_side,
             "model": str(asked.model) if asked.model else None,
-            "compensated_by": str(compensator.robot.folder) if compensator else None, "calibrated": calibrated,
+            "compensated_by": str(compensator.robot.folder) if compensator else None, "adapted": adapted,
             "limits_from": str(spec.folder), "robot_hash": robot_hash(spec),
         } | facts | ({"targets": live.counts} if live else {}),
     )  # fmt: skip
@@ -353,7 +353,7 @@ def tracking(recording: Recording) -> dict[str, Any]:
 
 
 def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
-    """The compensator, or None; and the unit whose calibration it uses."""
+    """The compensator, or None; and the unit whose adaptation it uses."""
     if asked.model is None and not asked.compensate:
         return None, None
     from gaponet.deploy.compensator import Compensator
@@ -367,20 +367,20 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
         if robot.nominal is None:
             screen.say(f"{robot.folder} is not identified: the feed-forward is the nominal robot's")
         return made, None
-    from gaponet.nn import calibration
+    from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
 
     model = GapModel.load(asked.model)
     folder = model.path.parent if model.path.name == "model" else model.path
-    known = calibration.Calibration.load(folder, model.weights_hash())
+    known = Adaptation.load(folder, model.weights_hash())
     if unit in known:
-        screen.say(f"commands are found with the calibration of unit {unit}")
+        screen.say(f"commands are found with the adaptation of unit {unit}")
     elif known:
         units = ", ".join(known)
-        screen.say(f"the run holds calibrations of {units}, none of which is used: --unit-id says which unit this is")
+        screen.say(f"the run holds adaptations of {units}, none of which is used: --unit-id says which unit this is")
     compensator = Compensator(
         robot, model, config, dt, payload_side=asked.payload_side,
-        extrapolate=asked.extrapolate, calibration=known.get(unit),
+        extrapolate=asked.extrapolate, adaptation=known.get(unit),
     )  # fmt: skip
     if asked.payload_mass is not None:
         compensator.require_payload(asked.payload_mass)

@@ -1,6 +1,6 @@
 """The inverse use: commands u that make the robot do what it was asked.
 
-A shadow, the simulator of the robot as it is known (nominal, identified or calibrated), is given a′ and shows how the
+A shadow, the simulator of the robot as it is known (nominal, identified or adapted), is given a′ and shows how the
 robot should move. Without a model u = a′: the feed-forward of what is known. With one, the robot that is given u moves
 like the shadow that is given u + G(u); so u + G(u) = a′ is solved, by u ← u + γ (a′ − u − G(u)).
 
@@ -28,8 +28,8 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, RobotError, UsageError
 from gaponet.deploy.feedforward import Feedforward
 from gaponet.deploy.payload import PayloadEstimate
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import RECORDED_TOLERANCE, GapModel
-from gaponet.nn.calibration import Calibration
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
@@ -100,11 +100,11 @@ class Compensator:
         payload_step: float = 0.25,
         nthread: int = 1,
         extrapolate: bool = False,
-        calibration: Calibration | None = None,
+        adaptation: Adaptation | None = None,
     ) -> None:
         """
         Args:
-            robot: The robot as it is known: nominal, identified or calibrated. With a model, how it should move is
+            robot: The robot as it is known: nominal, identified or adapted. With a model, how it should move is
                 known from the simulator that the model was trained in, whichever other one is given here; with aim
                 simulator no other one is taken.
             model: What training made; None for the feed-forward of the robot alone.
@@ -117,14 +117,14 @@ class Compensator:
             nthread: Threads of the shadow simulators.
             extrapolate: Take payloads beyond those trained on, up to the model's payload_max, and servos of other
                 gains.
-            calibration: What `calibrate` found for the unit that is commanded; the shadow is then that unit.
+            adaptation: What `adapt` found for the unit that is commanded; the shadow is then that unit.
         """
         self.dt = robot.dt if dt is None else dt
         heaviest = config.payload_max
         if model is not None:
             robot = _corrected(model, robot, self.dt, config)
             heaviest = model.config.payload_max if extrapolate else model.heaviest
-        robot = robot if calibration is None else calibration.robot(robot)
+        robot = robot if adaptation is None else adaptation.robot(robot)
         self.robot, self.model, self.config, self.single = robot, model, config, num_envs is None
         self.extrapolate = extrapolate
         self.num_envs = num = 1 if num_envs is None else num_envs

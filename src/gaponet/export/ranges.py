@@ -53,7 +53,7 @@ def ranges(
     """Draw units.
 
     Args:
-        robot: Robot folder that gaponet identify or gaponet calibrate wrote.
+        robot: Robot folder that gaponet identify or gaponet adapt wrote.
         scope: today: this robot as it was last fitted. any-day: as sessions on different days found it. any-robot: as
             robots of its type differ.
         others: Robot folders of the type, each identified from its own logs.
@@ -103,7 +103,7 @@ def ranges(
 def _known(spec: RobotSpec) -> Knowledge:
     known = Knowledge.load(spec)
     if known is None:
-        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or calibrate it again")
+        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or adapt it again")
     return known
 
 
@@ -118,7 +118,7 @@ def _days(known: Knowledge, joints: tuple[str, ...]) -> Array:
     days = {s["days"] or (f"session {i}",): s for i, s in enumerate(known.sources)}
     if len(days) < 2:
         raise UsageError(
-            "any-day: this robot is known from one day; calibrate it with logs of another one (gaponet calibrate ROBOT "
+            "any-day: this robot is known from one day; adapt it with logs of another one (gaponet adapt ROBOT "
             "LOGS --out ROBOT_2) and export that"
         )
     return np.array([[s["values"][j] for j in joints] for s in days.values()])

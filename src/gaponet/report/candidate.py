@@ -13,7 +13,7 @@ from gaponet.base.errors import DatasetError, ModelError, RobotError, UsageError
 from gaponet.base.structure import read_json
 from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
-from gaponet.nn import calibration
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.corrector import DeltaCorrector
 from gaponet.report.methods import method
@@ -82,9 +82,9 @@ class Candidate:
         """What alters targets on the way, in sim.replay."""
         return None if self.model is None else self.model.corrector(self.robot)
 
-    def calibrations(self) -> Mapping[str, calibration.Calibration]:
-        """Units that the model was calibrated to."""
-        return {} if self.model is None else calibration.Calibration.load(self.folder, self.model.weights_hash())
+    def adaptations(self) -> Mapping[str, Adaptation]:
+        """Units that the model was adapted to."""
+        return {} if self.model is None else Adaptation.load(self.folder, self.model.weights_hash())
 
 
 def is_robot(folder: Path) -> bool:
@@ -130,7 +130,7 @@ def choose(
 
 @dataclass(frozen=True)
 class Seen:
-    """What was trained, identified, chosen or calibrated on: recordings, and their motions, whoever played them.
+    """What was trained, identified, chosen or adapted on: recordings, and their motions, whoever played them.
 
     The own test part is unseen, whatever it was held out by: a split by unit or payload tests motions trained on.
     """
@@ -146,7 +146,7 @@ class Seen:
             origin = read_origin(folder)
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
         model = GapModel.load(folder)
-        logs = {h for c in calibration.Calibration.load(folder, model.weights_hash()).values() for h in c.logs}
+        logs = {h for c in Adaptation.load(folder, model.weights_hash()).values() for h in c.logs}
         origin = read_origin(folder / KEPT)  # of the robot under the model
         logs |= set() if origin is None else {h for part in ("train", "val") for h in origin["parts"][part].values()}
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)

@@ -23,7 +23,7 @@ from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
-from gaponet.nn import calibration
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.baselines.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, choose, is_robot
 from gaponet.report.methods import IDENTIFIED, title
@@ -40,7 +40,7 @@ ORDER = (
     "delay_offset",
     "identified",
     *LEARNED,
-    "calibrated",
+    "adapted",
     "uncorrected",
     "transfer",
 )  # of tables and figures
@@ -135,11 +135,11 @@ def evaluate(
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
-    calibrated = first.calibrations()
-    if any(s.meta.unit_id in calibrated for s in sequences):
-        twins = _by_unit(sequences, first, calibrated, noted(progress, "calibrated"))
-        done_runs["calibrated"] = runs(sequences, [t.qpos for t in twins], robot)
-        simulators["calibrated"] = simulators[first.method]
+    adapted = first.adaptations()
+    if any(s.meta.unit_id in adapted for s in sequences):
+        twins = _by_unit(sequences, first, adapted, noted(progress, "adapted"))
+        done_runs["adapted"] = runs(sequences, [t.qpos for t in twins], robot)
+        simulators["adapted"] = simulators[first.method]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}
     result = {
         "methods": methods,
@@ -156,7 +156,7 @@ def evaluate(
         "delta": {
             name: _delta_summary(parts, sequences, models[name].config.delta_max) for name, parts in deltas.items()
         },
-        "calibrated_units": sorted(set(calibrated) & {s.meta.unit_id for s in sequences}),
+        "adapted_units": sorted(set(adapted) & {s.meta.unit_id for s in sequences}),
         "artifacts": {name: {"weights": m.weights_hash(), "seed": m.card.get("seed")} for name, m in models.items()},
         "command": _command(folders, dataset.address or dataset.path, motions),
     }
@@ -208,14 +208,14 @@ def _transferred(
 def _by_unit(
     sequences: list[Sequence],
     one: Candidate,
-    calibrated: Mapping[str, calibration.Calibration],
+    adapted: Mapping[str, Adaptation],
     progress: Callable[[int, int], None],
 ) -> list[Twin]:
-    """The model in each unit's own simulator; in the common one where a unit is not calibrated."""
+    """The model in each unit's own simulator; in the common one where a unit is not adapted."""
     twins: dict[int, Twin] = {}
     for unit in dict.fromkeys(s.meta.unit_id for s in sequences):
         rows = [i for i, s in enumerate(sequences) if s.meta.unit_id == unit]
-        physics = calibrated[unit].robot(one.robot) if unit in calibrated else one.robot
+        physics = adapted[unit].robot(one.robot) if unit in adapted else one.robot
         part = replay([sequences[i] for i in rows], physics, one.corrector(), lock_idle=True)
         twins |= dict(zip(rows, part, strict=True))
         progress(len(twins), len(sequences))

@@ -22,7 +22,7 @@ METHODS = {  # name, colour
     "mlp": ("MLP, full coupling", "#7a8fe0"),
     "gaponet": ("GAPONet", "#c8102e"),
     "paper": ("GAPONet, the paper's form", "#8e1b3a"),
-    "calibrated": ("calibrated to the unit", "#6a1b9a"),
+    "adapted": ("adapted to the unit", "#6a1b9a"),
     "uncorrected": ("the other simulator, uncorrected", "#b0a18c"),
     "transfer": ("transferred into the other simulator", "#e07a1f"),
     "delay": ("delay", "#d99000"),

@@ -238,7 +238,7 @@ def warnings(card: dict[str, Any] | None, own: str, metrics: dict[str, Any]) -> 
 
 def _warnings_of_model(card: dict[str, Any], own: str, methods: dict[str, Any]) -> list[str]:
     out = []
-    better = [n for n, m in methods.items() if n not in (own, "calibrated") and m["mpjae"] <= methods[own]["mpjae"]]
+    better = [n for n, m in methods.items() if n not in (own, "adapted") and m["mpjae"] <= methods[own]["mpjae"]]
     if better:
         out.append(f"The model does not beat {', '.join(map(title, better))}: do not use it.")
     seen, asked = card["payload_seen"], [float(p) for p in methods["nominal"]["by_payload"]]
@@ -288,8 +288,8 @@ def _explained(methods: dict[str, Any]) -> Markup:
         "≥ 0.05 rad": "share of steps with an error of 2.9° or more (0.1 rad: 5.7°).",
         "correlation": "Pearson's r between simulated and recorded angle of joints that moved.",
     }  # fmt: skip
-    if "calibrated" in methods:
-        text[title("calibrated")] = "the model in the simulator calibrated to the unit (gaponet calibrate)."
+    if "adapted" in methods:
+        text[title("adapted")] = "the model in the simulator adapted to the unit (gaponet adapt)."
     return element("div", facts_table([[k, v] for k, v in text.items()]), css="small")
 
 

@@ -94,6 +94,9 @@ class _PPO(TypedDict):
     std: float
 
 
+FORMER_METHODS = {"calibrated": "adapted"}  # former name in metrics.json → name
+
+
 class _Model(TypedDict):
     """What a list of runs says of the model."""
 
@@ -133,6 +136,8 @@ def read_metrics(run: Path) -> dict[str, Any]:
     """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
     metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, more=True)}
+    for key in ("methods", "ratio_to_nominal"):
+        metrics[key] = {FORMER_METHODS.get(name, name): value for name, value in metrics[key].items()}
     methods = metrics["methods"]
     if "nominal" not in methods or not set(methods) <= set(metrics["ratio_to_nominal"]):
         raise ModelError(f"{file}: methods: nominal is missing, or a method has no ratio to it; {MEND}")

@@ -19,7 +19,8 @@ from gaponet.share.target import Index
 README = "README.md"
 FILES = re.compile(
     r"config\.json|split\.json|delay_offset\.json|metrics\.json|progress\.jsonl|trajectories\.npz|gap\.json|"
-    r"checkpoint\.pt|calibration/[A-Za-z0-9._-]+\.json|robot/(robot\.toml|robot\.xml|collision\.toml|look\.toml|identified\.json)|"
+    r"checkpoint\.pt|(adaptation|calibration)/[A-Za-z0-9._-]+\.json|"
+    r"robot/(robot\.toml|robot\.xml|collision\.toml|look\.toml|identified\.json)|"
     r"model/(inverse/)?(card\.json|model\.onnx|weights\.npz)"
 )
 

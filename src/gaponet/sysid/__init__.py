@@ -1,1 +1,1 @@
-"""System identification: fit, calibration, torque, uncertainty, drift, and motions worth recording."""
+"""System identification: fit, adaptation, torque, uncertainty, drift, and motions worth recording."""

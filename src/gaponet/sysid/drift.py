@@ -270,7 +270,7 @@ def _advice(
         names = ", ".join(dict.fromkeys(a.recording for a in against))
         return (
             f"these recordings contradict each other ({names}): another robot's are among them, or something changed "
-            "on the way; check them apart, calibrate with none of this"
+            "on the way; check them apart, adapt with none of this"
         )
     if not moved:
         told = ", ".join(f"{j} {by:.1f} times" for j, by in far.items())
@@ -283,7 +283,7 @@ def _advice(
     if len(odd) > ELSE * len(joints) and len(odd) > 1:
         return (
             f"{len(odd)} of {len(joints)} joints have another stiffness or several other numbers: is this the same "
-            "robot, with the same gains and payload? If so, identify again; a calibration is not enough"
+            "robot, with the same gains and payload? If so, identify again; an adaptation is not enough"
         )
     play = sorted({m.joint for m in moved if m.field == PLAY and m.by > 0})
     if play:
@@ -292,5 +292,5 @@ def _advice(
     ways = {np.sign(m.by) for m in eased}
     if len({m.joint for m in eased}) > len(joints) / 2 and len(ways) == 1:
         how = "more easily: warmer" if ways == {-1.0} else "harder: colder, or dry"
-        return f"most joints turn {how}? Check again as warm as when it was identified, or calibrate for now"
-    return "calibrate with these logs: gaponet calibrate ROBOT LOGS --out ROBOT_TODAY"
+        return f"most joints turn {how}? Check again as warm as when it was identified, or adapt for now"
+    return "adapt with these logs: gaponet adapt ROBOT LOGS --out ROBOT_TODAY"

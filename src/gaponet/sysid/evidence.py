@@ -187,7 +187,7 @@ def known(
             max(_band(left[joint]), rest.band if rest else 0.0),
         )  # fmt: skip
     source: Source = {
-        "made_by": "identify" if judges or covariances else "calibrate",
+        "made_by": "identify" if judges or covariances else "adapt",
         "days": tuple(sorted({s.meta.recorded_at[:10] for s in sequences} - {""})),
         "unit": ", ".join(sorted({s.meta.unit_id for s in sequences})),
         "logs": {f"{s.meta.motion} {s.meta.repetition}".removesuffix(" 0"): s.content_hash() for s in sequences},

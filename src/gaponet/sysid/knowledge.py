@@ -80,7 +80,7 @@ class Knowledge:
         file = robot.folder / KNOWN
         if not file.is_file():
             return None
-        hint = "identify or calibrate again, or remove it: nothing is known then beside the values"
+        hint = "identify or adapt again, or remove it: nothing is known then beside the values"
         found = read_json(cls, file, RobotError, hint)
         for joint, values in seen(robot, found.fields).items():
             kept = found.joints.get(joint)

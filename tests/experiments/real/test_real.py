@@ -45,7 +45,7 @@ def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
         assert card.elsewhere in {"", *(c.name for c in cards.set)}
 
 
-def test_a_unit_left_out_is_learned_from_by_calibration_alone_and_never_asked_what_it_saw(arm, played):
+def test_a_unit_left_out_is_learned_from_by_adaptation_alone_and_never_asked_what_it_saw(arm, played):
     for question in questions("a unit left out", played, arm, None):
         (unit,) = {s.meta.unit_id for s in question.test}
         assert unit not in {s.meta.unit_id for s in question.train}

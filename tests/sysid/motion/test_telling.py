@@ -113,7 +113,7 @@ def test_the_command_writes_motions_says_what_they_would_tell_and_how_much_more_
         assert all(said["errors_then"][joint][f] <= e for f, e in before.items())
     for file in said["motions"]:
         assert read_motion(out / file, robot).duration > 1
-    assert f"gaponet calibrate {robot.folder} data --out ROBOT_2" in (out / "sheet.md").read_text()
+    assert f"gaponet adapt {robot.folder} data --out ROBOT_2" in (out / "sheet.md").read_text()
 
 
 def test_a_robot_without_knowledge_or_two_robots_are_refused(robot, tmp_path, capsys):

@@ -209,7 +209,7 @@ def _nothing_to_go_on(method: str, folds: list[Question]) -> bool:
     first = folds[0]
     if method == "constant":
         return len({(s.meta.payload_mass, s.meta.unit_id) for s in first.train}) < 2
-    return (method == "elsewhere" and first.before is None) or (method == "calibrated" and not first.few)
+    return (method == "elsewhere" and first.before is None) or (method == "adapted" and not first.few)
 
 
 def load_method(where: str) -> tuple[str, Method]:

@@ -21,7 +21,7 @@ LOOKS = {  # method's title → colour, marker
     "delay + offset": (colour("delay_offset"), "s"),
     "identified elsewhere": (shade(colour("identified"), 0.5), "o"),
     "identification": (colour("identified"), "o"),
-    "identified elsewhere, calibrated": (colour("calibrated"), "D"),
+    "identified elsewhere, adapted": (colour("adapted"), "D"),
     "shared MLP": (colour("shared_mlp"), "^"),
     "GAPONet": (colour("gaponet"), "^"),
     "identification + GAPONet": (colour("identified+gaponet"), "v"),

@@ -20,7 +20,7 @@ from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.robot.spec import RobotSpec
 
 FOLDS = 3
-FEW = 6  # recordings of a unit, of each joint, to calibrate with
+FEW = 6  # recordings of a unit, of each joint, to adapt with
 ALIKE = 0.02  # rad that repetitions' commands differ by in the mean: one may begin a part of a period later
 VAL = 8  # one in so many pairs of motion and payload judges, where motions are too few for a part of their own
 Made = TypeVar("Made")
@@ -28,7 +28,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Question:
-    """One question: name; recordings for training, validation and testing; `few` of the test's own, to calibrate with.
+    """One question: name; recordings for training, validation and testing; `few` of the test's own, to adapt with.
 
     `motion` says of each test recording which independent motion it is of; `split` is the hash of both sides; `before`
     makes the robot as it was identified elsewhere; `made` is what methods share, `work` a folder of the question's own

@@ -20,7 +20,7 @@ from gaponet.sysid.identify import identify
 from gaponet.sysid.refit import refit
 
 LEFT_OUT = "left out"  # by validation: begins a note
-SECONDS = 30.0  # of the test's own session that calibration may use
+SECONDS = 30.0  # of the test's own session that adaptation may use
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def fitted(question: Question) -> DelayOffset:
 
 def constant(question: Question) -> Answer:
     """An adversary: what the nominal simulator is off by in the mean, for each joint, payload and unit; it sees what
-    calibration sees."""
+    adaptation sees."""
     robot, n, seen = question.robot, len(question.robot.joint_names), question.known + question.few
     off: dict[tuple[object, ...], list[Array]] = {}
     for s, q in zip(seen, Answer(robot).positions(seen), strict=True):
@@ -95,10 +95,10 @@ def identified(question: Question) -> Answer:
     return Answer(question.once("identified", lambda: _identify(question)))
 
 
-def calibrated(question: Question) -> Answer:
+def adapted(question: Question) -> Answer:
     """The robot identified elsewhere (or on the others), fitted to a little of what is tested."""
     if not question.few:
-        raise UsageError(f"{question.name}: there is nothing of the test's own to calibrate with")
+        raise UsageError(f"{question.name}: there is nothing of the test's own to adapt with")
     start, few = identified(question).robot if question.before is None else question.before(), question.few
     seconds = len(few) * WINDOW if few[0].duration < WINDOW else SECONDS  # all windows that are shorter than one
     found = refit(few, start, seconds, judge=True)
@@ -118,7 +118,7 @@ METHODS: dict[str, tuple[str, Method]] = {
     "delay_offset": ("delay + offset", delay_offset),
     "elsewhere": ("identified elsewhere", elsewhere),
     "identified": ("identification", identified),
-    "calibrated": ("identified elsewhere, calibrated", calibrated),
+    "adapted": ("identified elsewhere, adapted", adapted),
 }
 
 

@@ -132,5 +132,5 @@ def sheet(robot: RobotSpec, plan: Plan, files: dict[str, str], rate: float, know
         f"    gaponet import LOGS/{p:g}kg --robot ROBOT --unit-id UNIT --payload-mass {p:g} --out data"
         for p in plan.payloads
     ]
-    then = [f"    gaponet check {known} data", f"    gaponet calibrate {known} data --out ROBOT_2"] if known else []
+    then = [f"    gaponet check {known} data", f"    gaponet adapt {known} data --out ROBOT_2"] if known else []
     return "\n".join([*lines, "    gaponet doctor data", *then, ""])

@@ -1,4 +1,4 @@
-"""gaponet calibrate."""
+"""gaponet adapt."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ Logs = Annotated[
 ]
 
 
-@like(api.calibrate)
-def calibrate(
+@like(api.adapt_model)
+def adapt(
     run: Known,
     dataset: Logs,
     out: Path | None = None,
@@ -42,11 +42,11 @@ def calibrate(
 ) -> None:
     """Bring an identified robot to another unit or day: short logs.
 
-    A robot folder in, a robot folder out: gaponet calibrate ./my_robot LOGS --out ./my_robot_today. Of a run the
-    trained model stays as it is; gaponet eval then shows the unit without and with its calibration.
+    A robot folder in, a robot folder out: gaponet adapt ./my_robot LOGS --out ./my_robot_today. Of a run the
+    trained model stays as it is; gaponet eval then shows the unit without and with its adaptation.
 
     Args:
-        out: Robot folder to write, where a robot folder is calibrated.
+        out: Robot folder to write, where a robot folder is adapted.
         payload_mass: unknown: do not believe the recordings' payload, estimate it too; all must carry the same. A
             number: kg in each hand, of logs whose format does not state it.
     """
@@ -54,11 +54,11 @@ def calibrate(
     unknown = payload_mass == "unknown"
     if (run / "robot.toml").is_file():
         if out is None:
-            raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the calibrated one")
+            raise UsageError(f"{run}: is a robot folder; give --out FOLDER for the adapted one")
         if robot is not None or mixed_gains:
-            raise UsageError("--robot and --mixed-gains are for the calibration of a run")
+            raise UsageError("--robot and --mixed-gains are for the adaptation of a run")
         told = None if unknown or payload_mass == "recorded" else _mass(payload_mass)
-        made = api.calibrate_robot(run, dataset, out, unit, motions, seconds, unknown, told)
+        made = api.adapt_robot(run, dataset, out, unit, motions, seconds, unknown, told)
         before, after = (float(e.mean()) for e in made.errors.values())
         screen.say(
             f"{mrad(before)} → {mrad(after)} mrad over {len(made.errors['after'])} recording(s) of unit {made.unit} "
@@ -73,10 +73,10 @@ def calibrate(
         })  # fmt: skip
         return
     if out is not None:
-        raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its calibrations")
+        raise UsageError(f"{run}: is no robot folder (no robot.toml); --out is for those, a run keeps its adaptations")
     if not unknown and payload_mass != "recorded":
         raise UsageError(f"--payload-mass {payload_mass}: a run takes recorded or unknown")
-    found = api.calibrate(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
+    found = api.adapt_model(run, dataset, unit, motions, seconds, unknown, robot, mixed_gains)
     _show(screen, found.unit_id, found.servos, found.payload_mass, found.payload_std)
     screen.say(f"window RMS {mrad(found.before)} → {mrad(found.after)} mrad on what was fitted; kept in {run}")
     screen.say(f"next: gaponet eval {run} {dataset}")

@@ -1,4 +1,4 @@
-"""What is particular to one unit, beside a model: a small file per unit in RUN/calibration/.
+"""What is particular to one unit, beside a model: a small file per unit in RUN/adaptation/.
 
 No model can know a unit's gain, damping, friction, zero offsets and delay before it has seen the unit. They are fitted
 to half a minute of its log, as servo parameters of the simulator under the trained correction (sysid/refit.py); the
@@ -26,9 +26,11 @@ from gaponet.nn.artifact import GapModel
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.refit import FIELDS, Field, refit
 
+FOLDERS = ("calibration", "adaptation")  # the former name, and the one that is written
+
 
 @dataclass(frozen=True)
-class Calibration:
+class Adaptation:
     """One unit's servo parameters.
 
     Attributes:
@@ -55,8 +57,8 @@ class Calibration:
         return simulator.with_servos({j: {str(f): x for f, x in servo.items()} for j, servo in self.servos.items()})
 
     def save(self, run: Path) -> Path:
-        """RUN/calibration/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
-        path = run / "calibration" / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
+        """RUN/adaptation/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
+        path = run / FOLDERS[-1] / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
         with writing(run, "run"):
             path.parent.mkdir(exist_ok=True)
             write_json(path, asdict(self))
@@ -71,7 +73,7 @@ class Calibration:
         seconds: float = 30.0,
         unknown_payload: bool = False,
         progress: Callable[[int, int, float], None] = lambda done, total, rms: None,
-    ) -> Calibration:
+    ) -> Adaptation:
         """Fit a unit's parameters under a trained model.
 
         Args:
@@ -87,20 +89,20 @@ class Calibration:
             for j in simulator.operated
         }
         logs = tuple(s.content_hash() for s in sequences)
-        return Calibration(
+        return Adaptation(
             unit, model.weights_hash(), servos, logs, seconds, found.before, found.after, found.payload_mass,
             found.payload_std,
         )  # fmt: skip
 
     @classmethod
-    def load(cls, run: Path, weights: str) -> dict[str, Calibration]:
-        """Unit → calibration of this model; those of an earlier model in the same folder are refused."""
+    def load(cls, run: Path, weights: str) -> dict[str, Adaptation]:
+        """Unit → adaptation of this model; those of an earlier model in the same folder are refused."""
         found = {}
-        for path in sorted((run / "calibration").glob("*.json")):
-            one = read_json(Calibration, path, ModelError, "run gaponet calibrate again")
+        for path in sorted(path for name in FOLDERS for path in (run / name).glob("*.json")):
+            one = read_json(Adaptation, path, ModelError, "run gaponet adapt again")
             if one.weights != weights:
                 raise ModelError(
-                    f"{path}: made for another model ({one.weights}); delete it or run gaponet calibrate again"
+                    f"{path}: made for another model ({one.weights}); delete it or run gaponet adapt again"
                 )
             found[one.unit_id] = one
         return found

@@ -10,9 +10,8 @@ from arm import commands, record, write_arm
 from gaponet import api
 from gaponet.base.errors import ModelError, NoGainError, UsageError
 from gaponet.data.store import Dataset
-from gaponet.nn import calibration
+from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.calibration import Calibration
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.deeponet import build_network
 from gaponet.nn.onnx_export import export
@@ -41,7 +40,7 @@ def logs(robot):
 
 @pytest.fixture(scope="module")
 def found(model, robot, logs):
-    return Calibration.fit(model, robot, logs[:2], seconds=16.0)
+    return Adaptation.fit(model, robot, logs[:2], seconds=16.0)
 
 
 def test_gain_and_delay_of_the_unit_are_found(found, robot):
@@ -60,34 +59,34 @@ def test_a_motion_that_was_not_used_is_followed_better(found, model, robot, logs
     assert error(found.robot(robot)) < 0.2 * error(robot)
 
 
-def test_a_calibration_is_read_as_it_was_written(found, tmp_path):
+def test_a_adaptation_is_read_as_it_was_written(found, tmp_path):
     odd = replace(found, unit_id="lab/arm 2")
     assert odd.save(tmp_path).name == "lab_arm_2.json"
-    assert calibration.Calibration.load(tmp_path, found.weights) == {"lab/arm 2": odd}
+    assert Adaptation.load(tmp_path, found.weights) == {"lab/arm 2": odd}
     with pytest.raises(ModelError, match="made for another model"):
-        calibration.Calibration.load(tmp_path, "0123456789ab")
+        Adaptation.load(tmp_path, "0123456789ab")
 
 
-def test_a_calibration_for_an_earlier_model_is_replaced(found, tmp_path):
+def test_a_adaptation_for_an_earlier_model_is_replaced(found, tmp_path):
     replace(found, weights="0123456789ab").save(tmp_path)
     found.save(tmp_path)
-    assert calibration.Calibration.load(tmp_path, found.weights) == {found.unit_id: found}
+    assert Adaptation.load(tmp_path, found.weights) == {found.unit_id: found}
 
 
 def test_a_payload_that_nobody_weighed_is_found(model, robot):
     logs = [record(robot, commands(450, seed), f"m{seed}", payload=0.2) for seed in range(2)]
     untold = [replace(s, meta=replace(s.meta, payload_mass=0.0)) for s in logs]
-    found = Calibration.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
+    found = Adaptation.fit(model, robot, untold, seconds=16.0, unknown_payload=True)
     assert found.payload_mass == pytest.approx(0.2, abs=0.02)
     assert found.payload_std < 0.02
     with pytest.raises(UsageError, match="one and the same"):
-        Calibration.fit(model, robot, [untold[0], logs[1]], unknown_payload=True)
+        Adaptation.fit(model, robot, [untold[0], logs[1]], unknown_payload=True)
 
 
 def test_recordings_of_two_units_are_refused(model, robot, logs):
     other = replace(logs[0], meta=replace(logs[0].meta, unit_id="other"))
     with pytest.raises(UsageError, match="give those of one unit"):
-        Calibration.fit(model, robot, [logs[1], other])
+        Adaptation.fit(model, robot, [logs[1], other])
 
 
 @pytest.mark.parametrize(
@@ -100,18 +99,18 @@ def test_recordings_of_two_units_are_refused(model, robot, logs):
         ({"payload_mass": -1}, "payload_mass: "),
     ],
 )
-def test_a_damaged_calibration_is_refused_with_file_and_field(found, tmp_path, changed, said):
+def test_a_damaged_adaptation_is_refused_with_file_and_field(found, tmp_path, changed, said):
     file = found.save(tmp_path)
     file.write_text(json.dumps(json.loads(file.read_text()) | changed))
-    with pytest.raises(ModelError, match=rf"calibration/.*\.json: {said}.*run gaponet calibrate again"):
-        calibration.Calibration.load(tmp_path, found.weights)
+    with pytest.raises(ModelError, match=rf"adaptation/.*\.json: {said}.*run gaponet adapt again"):
+        Adaptation.load(tmp_path, found.weights)
 
 
-def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs, tmp_path):
+def test_a_robot_folder_is_adapted_without_a_model_or_not_at_all(robot, logs, tmp_path):
     data = Dataset.create(tmp_path / "data", robot)
     for log in logs:
         data.append(log)
-    found = api.calibrate_robot(robot, data, tmp_path / "today", seconds=16.0)
+    found = api.adapt_robot(robot, data, tmp_path / "today", seconds=16.0)
     assert found.errors["after"].mean() < 0.2 * found.errors["before"].mean()
     written = load_robot(tmp_path / "today")
     np.testing.assert_allclose(written.kp, 0.6 * robot.kp, rtol=0.2)
@@ -119,16 +118,16 @@ def test_a_robot_folder_is_calibrated_without_a_model_or_not_at_all(robot, logs,
     same = Dataset.create(tmp_path / "same", robot)
     same.append(record(robot, commands(450, 0), "m0"))
     with pytest.raises(NoGainError, match="nothing is written"):
-        api.calibrate_robot(robot, same, tmp_path / "again", seconds=8.0)
+        api.adapt_robot(robot, same, tmp_path / "again", seconds=8.0)
     assert not (tmp_path / "again" / "robot.toml").exists()
 
 
-def test_one_short_command_calibrates_nothing_and_windows_of_several_are_judged_by_motions_left_out(robot, tmp_path):
+def test_one_short_command_adapts_nothing_and_windows_of_several_are_judged_by_motions_left_out(robot, tmp_path):
     data = Dataset.create(tmp_path / "data", robot)
     for payload in (0.0, 0.1):
         data.append(record(robot, commands(60, 0), "m0", payload))
     with pytest.raises(NoGainError, match="is all there is of each joint"):
-        api.calibrate_robot(robot, data, tmp_path / "one")
+        api.adapt_robot(robot, data, tmp_path / "one")
     several = [record(robot, commands(450, seed), f"m{seed}", kp=0.7) for seed in range(3)]
     found = refit(several, robot, judge=True)
     assert (len(found.judged[0]), found.kept) == (3, True)
