@@ -30,8 +30,8 @@ import known as days
 import numpy as np
 from kill_workers import SIGN, busiest
 
-from gaponet.base.executor import opened
-from gaponet.base.progress import silent
+from gaponet.base.executor import open_pool
+from gaponet.base.progress import no_progress
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
@@ -75,7 +75,7 @@ def made(work: Path, robots: int) -> dict[str, str]:
 def _identified(robot: RobotSpec, train: list[Sequence], folder: Path) -> None:
     bounds = Bounds(robot, train)
     fit = Fit(JointRuns(cut(train, 12), robot, nthread=1), robot, bounds)
-    values = fit.search(CLASSIC, bounds.start, Clock(None, 0, silent), "")
+    values = fit.search(CLASSIC, bounds.start, Clock(None, 0, no_progress), "")
     fit.uncertainty(values)
     save_robot(fit.robot(values), folder)
     mine = load_robot(folder)
@@ -110,7 +110,7 @@ def day(work: Path, robots: int, executor: str, kill: bool) -> None:
     shutil.rmtree(work / "data", ignore_errors=True)
     os.environ[SIGN] = sign = str(os.getpid())
     took, killed, began = dict[str, dict[str, float]](), 0, time.monotonic()
-    with opened(executor, 0, 1) as pool:
+    with open_pool(executor, 0, 1) as pool:
         ready = time.monotonic()
         victim = lambda: busiest(sign, os.getpid()) if kill and not killed and len(took) > robots / 3 else None  # noqa: E731
         for outcome in pool.run(partial(_night, work), named):

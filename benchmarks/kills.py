@@ -37,7 +37,7 @@ import numpy as np
 
 import gaponet.nn.onnx_export  # what a child needs is there before it is forked
 import gaponet.nn.training.run  # noqa: F401
-from gaponet.base.files import MARK
+from gaponet.base.files import FOLDER_MARKER
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset
 
@@ -67,7 +67,7 @@ def entries(out: Path) -> Any:
 
 def names(out: Path) -> list[str]:
     """Files of a folder, marks left out: which of its subfolders have one depends on nothing of the user's."""
-    return sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != MARK)
+    return sorted(str(f.relative_to(out)) for f in out.rglob("*") if f.is_file() and f.name != FOLDER_MARKER)
 
 
 def digests(out: Path) -> dict[str, str]:

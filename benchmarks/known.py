@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gaponet.base.progress import silent
+from gaponet.base.progress import no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
@@ -132,7 +132,7 @@ def _asked(robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another:
     train, val, began = days[0], days[1][:3], time.monotonic()
     bounds = Bounds(robot, train)
     fit = Fit(JointRuns(cut(train, 12), robot, nthread=1), robot, bounds)
-    values = fit.search(CLASSIC, bounds.start, Clock(None, 0, silent), "")
+    values = fit.search(CLASSIC, bounds.start, Clock(None, 0, no_progress), "")
     fit.uncertainty(values)
     right = fit.robot(values)
     mine = known(right, train, val, fit.covariance, nthread=1)

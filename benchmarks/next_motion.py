@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.progress import silent
+from gaponet.base.progress import no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
@@ -66,7 +66,7 @@ def fitted(
 ) -> tuple[RobotSpec, Knowledge]:
     """As gaponet identify does without terms: every joint on its own, then together, of all windows; and how sure that
     is. Rows with a tip lower than `below` are passed over."""
-    bounds, own, clock = Bounds(robot, logs), Bounds(start, logs), Clock(None, 0, silent)
+    bounds, own, clock = Bounds(robot, logs), Bounds(start, logs), Clock(None, 0, no_progress)
     fit = Fit(JointRuns(cut(logs, 10**6), robot, below, nthread=1), robot, bounds)
     begin = bounds.start if start is robot else {f: own.first[f] for f in CLASSIC}
     alone = fit.search(CLASSIC, begin, clock, "")

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 from virtual_h1_2 import run
 
-from gaponet.base.spread import Table
+from gaponet.base.result_table import ResultTable
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
@@ -91,8 +91,8 @@ def main(dataset: Path, work: Path, budget: str, unit: str) -> None:
             run("train", learned.path, "--out", folder, "--holdout-units", unit, "--threads", 1, *options, *limit)
         found = errors(GapModel.load(folder).corrector(robot))
         rows.append((name, *found, *(e / n for e, n in zip(found, nominal, strict=True))))
-        print(Table("adversaries", ("training", "units trained on, mrad", f"{unit}, mrad", "of nominal", "of nominal "),
-                    tuple(rows)).markdown(), flush=True)  # fmt: skip
+        columns = ("training", "units trained on, mrad", f"{unit}, mrad", "of nominal", "of nominal ")
+        print(ResultTable("adversaries", columns, tuple(rows)).markdown(), flush=True)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.json_file import write_json
+from gaponet.base.files import write_json
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.experiments.kept import read_kept

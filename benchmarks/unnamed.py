@@ -24,7 +24,7 @@ from trees import LIMIT, Trees
 from virtual_h1_2 import RECIPE, UNIT, Bench, Errors, by_motion, run
 
 from gaponet.base.arrays import Array
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.cli.main import main as gaponet
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import split_entries
@@ -141,7 +141,7 @@ class Rows:
         return found
 
 
-def table(found: dict[str, Errors], sequences: list[Sequence], name: str) -> Table:
+def table(found: dict[str, Errors], sequences: list[Sequence], name: str) -> ResultTable:
     """What each row leaves, by payload in parts of what identification leaves, and paired differences over motions."""
     payloads = sorted({s.meta.payload_mass for s in sequences})
     base = {p: by_motion(found["identified"], sequences, p).mean() for p in (*payloads, None)}
@@ -149,13 +149,17 @@ def table(found: dict[str, Errors], sequences: list[Sequence], name: str) -> Tab
     for row, errors in found.items():
         mean = by_motion(errors, sequences)
         less, apart = by_motion(found["identified"], sequences) - mean, None if best is None else mean - best
-        seeds = Spread.of([float(by_motion([e], sequences).mean()) for e in errors]).std if len(errors) > 1 else None
+        seeds = (
+            MeanStd.from_values([float(by_motion([e], sequences).mean()) for e in errors]).std
+            if len(errors) > 1
+            else None
+        )
         by_payload = (by_motion(errors, sequences, p).mean() / base[p] for p in payloads)
         over = "" if apart is None else f"{apart.mean():+.2f} ± {standard_error(apart):.2f}"
         told = f"{less.mean():+.2f} ± {standard_error(less):.2f}"
         rows.append((row, mean.mean(), seeds, mean.mean() / base[None], *by_payload, told, over))
     heads = ("row", "mrad", "± seeds", "of identified", *(f"{p:g} kg" for p in payloads), "less", "above gaponet")
-    return Table(name, heads, tuple(rows), f"{name}: {len(sequences)} free runs of VIRTUAL robots")
+    return ResultTable(name, heads, tuple(rows), f"{name}: {len(sequences)} free runs of VIRTUAL robots")
 
 
 def learning_from(bench: Bench, data: Dataset) -> Bench:

@@ -25,7 +25,7 @@ from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from gaponet.base import child
+from gaponet.base import child_process
 from gaponet.robot.spec import RobotSpec, load_robot
 
 DEFAULT_RATE = 30.0  # Hz: LeRobot's own
@@ -173,7 +173,7 @@ class GaponetSO101(Robot):
         words += ["--model", str(config.model)] if config.model else []
         calibration = self._calibration()
         words += ["--calibration", str(calibration)] if calibration else []
-        return child.words("gaponet", "run", *words, *shlex.split(config.options))
+        return child_process.module_command("gaponet", "run", *words, *shlex.split(config.options))
 
     def get_observation(self) -> dict[str, Any]:
         state = next(self._states, None) if self._process else None

@@ -5,7 +5,7 @@ import signal
 import sys
 from types import FrameType
 
-from gaponet.base.child import leave_folder
+from gaponet.base.child_process import exclude_current_folder
 
 
 def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
@@ -17,7 +17,7 @@ def _leave(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
 def entry() -> None:
     try:
         signal.signal(signal.SIGINT, _leave)
-        leave_folder()
+        exclude_current_folder()
         from gaponet.cli.main import main
 
         code = main(begin=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))

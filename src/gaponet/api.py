@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.errors import DatasetError, NoGainError, UsageError
-from gaponet.base.files import MARK
-from gaponet.base.progress import bar, noted
+from gaponet.base.files import FOLDER_MARKER
+from gaponet.base.progress import progress_bar, with_note
 from gaponet.data.store import Dataset
 from gaponet.robot.folder import MOVE_KEPT
 from gaponet.robot.spec import RobotSpec, load_robot
@@ -70,7 +70,7 @@ def import_logs(
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if Dataset.peek(out, spec) is not None:
         require_kept(Path(out), spec, DatasetError, MOVE_KEPT)
-    with bar("importing") as update:
+    with progress_bar("importing") as update:
         return run(
             src, spec, unit_id, payload_mass, out,
             gravity=gravity_of(spec), simulator=model_hash(spec), progress=update, **options,
@@ -98,7 +98,7 @@ def doctor(
     from gaponet.sim.model import model_hash
 
     data, spec = _opened(dataset, robot)
-    with bar("examining") as update:
+    with progress_bar("examining") as update:
         return Diagnosis.of(data, spec, update, gravity_of(spec), tips_of(spec), model_hash(spec), executor)
 
 
@@ -118,8 +118,8 @@ def pair(dataset: Dataset | Place, robot: RobotSpec | Place | None = None, execu
     """
     from gaponet.sim.replay import pair_dataset
 
-    with bar("replaying") as update:
-        return pair_dataset(*_opened(dataset, robot), noted(update, "control steps"), executor=executor)
+    with progress_bar("replaying") as update:
+        return pair_dataset(*_opened(dataset, robot), with_note(update, "control steps"), executor=executor)
 
 
 def gap(
@@ -153,9 +153,9 @@ def gap(
         folder = None if run is None else _run(run)
         data, spec = _opened(dataset, spec, folder)
         one = Candidate(spec.folder, spec, None) if folder is None else Candidate.load(folder, spec)
-        with bar("gap") as update:
+        with progress_bar("gap") as update:
             found = gap_by_step(one, data, motions, update)
-        if folder is not None or (one.folder / MARK).is_file():  # a user's own folder is left as it is
+        if folder is not None or (one.folder / FOLDER_MARKER).is_file():  # a user's own folder is left as it is
             from gaponet.report.figures.gap_figure import write_gap
 
             write_gap(found, one.folder, one.kind)
@@ -235,8 +235,7 @@ def identify(
         DatasetError, UsageError: A unit is not there.
         NoGainError: Nothing that was fitted does better; it names the joints and what to record.
     """
-    from gaponet.base.files import writing
-    from gaponet.base.json_file import write_json
+    from gaponet.base.files import lock_folder, write_json
     from gaponet.data.split import split_entries
     from gaponet.nn.training.budget import Budget
     from gaponet.robot.folder import ORIGIN, save_robot
@@ -255,7 +254,7 @@ def identify(
     seconds = None if budget is None else Budget.parse(budget).seconds
     if budget is not None and seconds is None:
         raise UsageError(f"--budget {budget}: give a time such as 60s or 4m")
-    with writing(Path(out), "robot"), bar("identifying") as update:
+    with lock_folder(Path(out), "robot"), progress_bar("identifying") as update:
         found = fit(
             data.sequences(parts["train"]), spec, val, windows, terms, table, shared, threads, update, seconds, stops
         )
@@ -322,7 +321,7 @@ def train(
         ModelError: The budget bought no training step.
         DatasetError, UsageError: The recordings, the config or the folder do not fit; the message says what.
     """
-    from gaponet.base.files import writing
+    from gaponet.base.files import lock_folder
     from gaponet.nn.training import ranks
     from gaponet.nn.training.budget import Budget
     from gaponet.nn.training.config import TrainConfig
@@ -332,8 +331,8 @@ def train(
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]
     with (
         ranks.joined(config.device),
-        ranks.on_first(writing(Path(out), "run")),
-        ranks.on_first(bar(f"training {config.model.kind}")) as update,
+        ranks.on_first(lock_folder(Path(out), "run")),
+        ranks.on_first(progress_bar(f"training {config.model.kind}")) as update,
     ):
         data, spec = _opened(dataset, robot)
         _require_commands(data)
@@ -376,7 +375,7 @@ def evaluate(
         kept = load_robot(folder) if is_robot(folder) else kept_robot(folder, spec.name)
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
-    with bar("evaluating") as update:
+    with progress_bar("evaluating") as update:
         found = measuring.evaluate([folder, *map(Path, also)], data, spec, motions, update, target, units)
     found.save(folder)
     return found
@@ -422,7 +421,7 @@ def adapt_model(
     entries = Adaptation.recordings(data, model, unit, motions)
     if not mixed_gains:
         require_same_gains((e.meta for e in entries), data.joint_names, spec.operated)
-    with bar("adapting") as update:
+    with progress_bar("adapting") as update:
         found = Adaptation.fit(
             model, simulator, data.sequences(entries), seconds, unknown_payload,
             lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"),
@@ -478,7 +477,7 @@ def adapt_robot(
         NoGainError: The fit does not follow the recordings, or motions that it was not given, better than the robot as
             it was known; nothing is written.
     """
-    from gaponet.base.files import write_text, writing
+    from gaponet.base.files import lock_folder, write_text
     from gaponet.robot.folder import ORIGIN, save_robot
     from gaponet.sim.replay import whole_errors
     from gaponet.sysid.fit import BETTER
@@ -487,9 +486,12 @@ def adapt_robot(
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
     before_known = Knowledge.load(spec)
-    with writing(Path(out), "robot"), unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences):
+    with (
+        lock_folder(Path(out), "robot"),
+        unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),
+    ):
         believed = all(s.meta.known_gains[1] is not None for s in sequences)
-        with bar("adapting") as update:
+        with progress_bar("adapting") as update:
             found = refit(
                 sequences, spec, seconds, unknown_payload, None,
                 lambda done, total, rms: update(done, total, f"window RMS {rms * 1e3:.2f} mrad"), believed,

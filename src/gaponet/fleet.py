@@ -17,9 +17,8 @@ from typing_extensions import TypedDict
 
 from gaponet.api import adapt_robot, unit_recordings
 from gaponet.base.errors import GAPONetError, NoGainError, RobotError, UsageError
-from gaponet.base.executor import opened
-from gaponet.base.files import write_text, writing
-from gaponet.base.json_file import write_json
+from gaponet.base.executor import open_pool
+from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
 from gaponet.report.page import element, page, table
 from gaponet.robot.spec import load_robot
@@ -110,7 +109,7 @@ def night(
     if not folders:
         raise UsageError(f"{robots}: holds no robot folders; give a folder with one of gaponet identify for each robot")
     one = (logs / "dataset.json").is_file()
-    with writing(out, KIND):
+    with lock_folder(out, KIND):
         kept = {f.name: history(out / f"{f.name}.json") for f in folders}
         jobs = []
         for f in folders:
@@ -122,7 +121,7 @@ def night(
             jobs.append(
                 Job(f.name, f, logs if one else logs / f.name, f.name if one else "", name, place, payload_mass)
             )
-        with opened(executor, workers, 1) as pool:
+        with open_pool(executor, workers, 1) as pool:
             for outcome in pool.run(ask, jobs):
                 if outcome.error is not None and not isinstance(outcome.error, GAPONetError | OSError):
                     raise outcome.error

@@ -20,7 +20,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar
 
 from gaponet.base.errors import UsageError
-from gaponet.base.text import plain
+from gaponet.base.text import escape
 
 GROUPS = FORMATS, DRIVERS, METHODS = "gaponet.formats", "gaponet.drivers", "gaponet.methods"
 Result = TypeVar("Result")
@@ -83,5 +83,5 @@ def _warn(what: str, text: str) -> None:
     from multiprocessing import parent_process
 
     if what not in _WARNED and parent_process() is None:
-        logging.getLogger("gaponet").warning("%s", plain(f"Warning: {what} {text}"))
+        logging.getLogger("gaponet").warning("%s", escape(f"Warning: {what} {text}"))
     _WARNED.add(what)

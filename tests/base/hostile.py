@@ -31,7 +31,7 @@ from logs import arm_sequence, late, wave
 
 from gaponet.base import sandbox
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 
 SECONDS, MEMORY = 10.0, 1 << 30
 CUT = 60.0, 12 << 30  # where a command is ended
@@ -152,8 +152,8 @@ def loop(weights: list[object]) -> list[object]:
     often, go, number = value("i", TensorProto.INT64, []), value("c", TensorProto.BOOL, []), TensorProto.FLOAT
     nodes = [helper.make_node("Identity", ["c"], ["c2"]), helper.make_node("Add", ["v", "v"], ["v2"])]
     after = [value("c2", TensorProto.BOOL, []), value("v2", number, [])]
-    inside = helper.make_graph(nodes, "body", [often, go, value("v", number, [])], after)
-    return [helper.make_node("Loop", ["often", "go", "start"], ["odd"], body=inside)]
+    body = helper.make_graph(nodes, "body", [often, go, value("v", number, [])], after)
+    return [helper.make_node("Loop", ["often", "go", "start"], ["odd"], body=body)]
 
 
 def large(count: int) -> Callable[[list[object]], list[object]]:
@@ -196,7 +196,7 @@ def logs(name: str, told: str = "") -> Callable[[Callable[[Path], None]], Callab
     return wrapped
 
 
-@inside(LogError, "numpy")
+@sandboxed(LogError, "numpy")
 def parsed(file: Path, how: str) -> object:
     """What a parser may do."""
     match how:
@@ -217,7 +217,7 @@ def parsed(file: Path, how: str) -> object:
             raise ZeroDivisionError("what nobody thought of")
         case "writes":
             with open(file, "wb") as out:
-                out.truncate(sandbox.MEMORY + 1)
+                out.truncate(sandbox.MEMORY_BYTES + 1)
     return os.getpid()
 
 

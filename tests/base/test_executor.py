@@ -13,7 +13,7 @@ from arm import write_arm
 from jobs import dies_at_first
 
 from gaponet.base.errors import UsageError, WorkerError
-from gaponet.base.executor import opened
+from gaponet.base.executor import open_pool
 from gaponet.cli.main import main
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import model_hash
@@ -27,7 +27,7 @@ def carried_out(pool, folder, numbers):
 
 def test_a_killed_worker_costs_its_own_job_another_attempt_and_no_other_job_anything(tmp_path, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    with opened("local", 2, 1) as pool:
+    with open_pool("local", 2, 1) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, range(8))
         assert list(pool.map(abs, (-3, 2, -1))) == [3, 2, 1]
     assert attempts == {0: 2, 1: 1, 2: 2, 3: 1, 4: 2, 5: 3, 6: 2, 7: 1}
@@ -44,7 +44,7 @@ def test_a_killed_worker_costs_its_own_job_another_attempt_and_no_other_job_anyt
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs gaponet[ray]")
 def test_the_same_on_a_ray_of_this_machine(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))  # jobs.py
-    with opened("ray", 2, 1) as pool:
+    with open_pool("ray", 2, 1) as pool:
         outcomes, attempts = carried_out(pool, tmp_path, (0, 1, 7))
     assert attempts == {0: 2, 1: 1, 7: 1}
     assert [outcomes[n].result() for n in (0, 1)] == [(0, "1"), (1, "1")]
@@ -54,14 +54,14 @@ def test_the_same_on_a_ray_of_this_machine(tmp_path, monkeypatch):
 
 def test_any_executor_of_the_standard_library_will_do():
     for executor in (ThreadPoolExecutor(2), ProcessPoolExecutor(2)):
-        with executor, opened(executor, 0, 1) as pool:
+        with executor, open_pool(executor, 0, 1) as pool:
             assert list(pool.map(abs, range(-9, 0))) == [*range(9, 0, -1)]
 
 
 @pytest.mark.parametrize("where", ["dask", "submitit:cluster=local", "slurm", "local:2", object()])
 def test_what_is_no_executor_is_refused_and_the_answer_names_ray_and_python(where):
     answer = r"--executor .*: choose local, ray or ray:ADDRESS; from Python, give a concurrent\.futures\.Executor"
-    with pytest.raises(UsageError, match=answer), opened(where, 0, 1):
+    with pytest.raises(UsageError, match=answer), open_pool(where, 0, 1):
         pass
 
 

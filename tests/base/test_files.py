@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from gaponet.base.errors import FolderError
-from gaponet.base.files import MARK, require_ours, whole, write_text, writing
+from gaponet.base.files import FOLDER_MARKER, atomic_write, lock_folder, require_own_folder, write_text
 
 
 def names(folder):
@@ -19,7 +19,7 @@ def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path):
     write_text(tmp_path / "a.json", "old")
 
     def full():
-        with whole(tmp_path / "a.json") as temporary:
+        with atomic_write(tmp_path / "a.json") as temporary:
             temporary.write_text("new")
             raise OSError(28, "No space left on device", "somewhere")
 
@@ -30,19 +30,19 @@ def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path):
 
 
 def test_a_new_folder_is_marked_with_what_it_is(tmp_path):
-    with writing(tmp_path / "a" / "b", "run"):
+    with lock_folder(tmp_path / "a" / "b", "run"):
         write_text(tmp_path / "a" / "b" / "x", "")
-    assert (tmp_path / "a" / "b" / MARK).read_text() == "run\n"
-    with writing(tmp_path / "a" / "b", "run"), writing(tmp_path / "a" / "b", "run"):
+    assert (tmp_path / "a" / "b" / FOLDER_MARKER).read_text() == "run\n"
+    with lock_folder(tmp_path / "a" / "b", "run"), lock_folder(tmp_path / "a" / "b", "run"):
         pass
     with pytest.raises(FolderError, match="b: holds gaponet's run, not dataset; choose another folder"):
-        require_ours(tmp_path / "a" / "b", "dataset")
+        require_own_folder(tmp_path / "a" / "b", "dataset")
 
 
 def test_a_block_that_fails_before_it_wrote_leaves_no_folder(tmp_path):
     (tmp_path / "empty").mkdir()
     for folder in (tmp_path / "a" / "b", tmp_path / "empty"):
-        with pytest.raises(ZeroDivisionError), writing(folder, "run"):
+        with pytest.raises(ZeroDivisionError), lock_folder(folder, "run"):
             raise ZeroDivisionError
     assert names(tmp_path) == ["empty"]
     assert names(tmp_path / "empty") == []
@@ -50,37 +50,37 @@ def test_a_block_that_fails_before_it_wrote_leaves_no_folder(tmp_path):
 
 def test_a_block_that_fails_after_it_wrote_removes_nothing(tmp_path):
     def fail():
-        with writing(tmp_path / "a", "run"):
+        with lock_folder(tmp_path / "a", "run"):
             write_text(tmp_path / "a" / "x", "")
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
         fail()
-    assert names(tmp_path / "a") == [MARK, "x"]
+    assert names(tmp_path / "a") == [FOLDER_MARKER, "x"]
 
 
 @pytest.mark.parametrize("name", ["notes.txt", ".env", "dataset"])
 def test_anything_of_somebody_elses_is_refused_and_left_alone(tmp_path, name):
     (tmp_path / name).mkdir()
-    with pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"), writing(tmp_path, "run"):
+    with pytest.raises(FolderError, match=f"holds {name}, so it is no run of gaponet"), lock_folder(tmp_path, "run"):
         pass
     assert names(tmp_path) == [name]
 
 
 def test_a_folder_from_before_there_was_a_mark_is_known_by_what_it_holds(tmp_path):
     (tmp_path / "dataset.json").touch()
-    with writing(tmp_path, "dataset"):
+    with lock_folder(tmp_path, "dataset"):
         pass
-    assert names(tmp_path) == [MARK, "dataset.json"]
+    assert names(tmp_path) == [FOLDER_MARKER, "dataset.json"]
 
 
 def test_a_second_writer_is_refused_with_the_firsts_process_or_waits_for_it(tmp_path):
     def other(wait):
-        with writing(tmp_path / "a", "run", wait):
+        with lock_folder(tmp_path / "a", "run", wait):
             return True
 
     with ThreadPoolExecutor(1) as pool:
-        with writing(tmp_path / "a", "run"):
+        with lock_folder(tmp_path / "a", "run"):
             with pytest.raises(FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"):
                 pool.submit(other, 0.0).result()
             patient = pool.submit(other, 60.0)
@@ -89,25 +89,25 @@ def test_a_second_writer_is_refused_with_the_firsts_process_or_waits_for_it(tmp_
 
 def test_what_a_killed_writer_left_half_written_goes_with_the_next(tmp_path):
     code = (
-        "import os, sys; from pathlib import Path; from gaponet.base.files import whole, writing\n"
-        "with writing(Path(sys.argv[1]), 'run'), whole(Path(sys.argv[1]) / 'sub' / 'x') as file:\n"
+        "import os, sys; from pathlib import Path; from gaponet.base.files import atomic_write, lock_folder\n"
+        "with lock_folder(Path(sys.argv[1]), 'run'), atomic_write(Path(sys.argv[1]) / 'sub' / 'x') as file:\n"
         "    file.parent.mkdir(); file.write_text('half'); os.kill(os.getpid(), 9)\n"
     )
     out = tmp_path / "out"
     subprocess.run([sys.executable, "-c", code, str(out)], check=False)
     left = next((out / "sub").iterdir()).name
-    assert left.startswith(f"{MARK}-")
-    mine = out / "sub" / f"{MARK}-{os.getpid()}-y"  # of a process that lives
+    assert left.startswith(f"{FOLDER_MARKER}-")
+    mine = out / "sub" / f"{FOLDER_MARKER}-{os.getpid()}-y"  # of a process that lives
     mine.touch()
-    (out / "sub" / f"{MARK}rc").touch()
-    with writing(out, "run"):
-        assert names(out / "sub") == [mine.name, f"{MARK}rc"]
+    (out / "sub" / f"{FOLDER_MARKER}rc").touch()
+    with lock_folder(out, "run"):
+        assert names(out / "sub") == [mine.name, f"{FOLDER_MARKER}rc"]
 
 
 @pytest.mark.parametrize("place", ["cells/mlp-0", "rehearsal/cells/mlp-0", "without-b/cells/mlp-0"])
 def test_experiments_that_were_begun_before_there_was_a_mark_go_on(tmp_path, place):
     (tmp_path / place).mkdir(parents=True)
     (tmp_path / place / "setup.json").write_text("{}")
-    require_ours(tmp_path, "experiments")
+    require_own_folder(tmp_path, "experiments")
     with pytest.raises(FolderError, match="no dataset of gaponet"):
-        require_ours(tmp_path, "dataset")
+        require_own_folder(tmp_path, "dataset")

@@ -8,7 +8,7 @@ from gaponet.base import progress
 def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(capfd, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with progress.bar("importing [all]") as update:
+    with progress.progress_bar("importing [all]") as update:
         for k in range(1, 101):
             now[0] += 0.4
             update(k, 100, f"motion-{k}")
@@ -22,10 +22,10 @@ def test_a_pipe_gets_a_line_at_the_start_one_now_and_then_and_one_at_the_end(cap
 def test_what_is_complete_is_said_once_and_nothing_else_is_called_complete(capfd, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with progress.bar("training") as update:
+    with progress.progress_bar("training") as update:
         for stage in ("ppo", "gain", "gain", "export"):
             update(1, 1, stage)
-    with progress.bar("fitting") as update:
+    with progress.progress_bar("fitting") as update:
         update(1, 2, "joints")
         for now[0] in (11.0, 12.0, 30.0):
             update(2, 2, "table")
@@ -36,7 +36,7 @@ def test_what_is_complete_is_said_once_and_nothing_else_is_called_complete(capfd
 
 
 def test_parts_that_run_side_by_side_are_told_together(capfd):
-    with progress.bars("runs", 4) as show:
+    with progress.progress_bars("runs", 4) as show:
         show({"mlp seed 0": (0.5, "round 3"), "gaponet seed 0": (0.25, "")}, 1)
     assert capfd.readouterr().err.startswith(
         "runs: 44 %, 0 s, 1 of 4 done; mlp seed 0 50 % round 3; gaponet seed 0 25 %\n"
@@ -45,6 +45,6 @@ def test_parts_that_run_side_by_side_are_told_together(capfd):
 
 def test_in_a_notebook_progress_is_text_on_stderr(capfd, monkeypatch):
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-    with progress.bar("training") as update:
+    with progress.progress_bar("training") as update:
         update(1, 2, "half")
     assert capfd.readouterr().err.startswith("training: 50 %")

@@ -44,7 +44,7 @@ def test_what_comes_back_is_what_was_returned(tmp_path):
 )
 @limited
 def test_whatever_a_parser_does_is_one_line_and_the_next_file_is_read(tmp_path, monkeypatch, how, said):
-    monkeypatch.setattr(sandbox, "SECONDS", 1.0)
+    monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(LogError) as error:
         parsed(Path("x"), how)
@@ -54,7 +54,7 @@ def test_whatever_a_parser_does_is_one_line_and_the_next_file_is_read(tmp_path, 
 
 def test_a_child_that_nobody_asks_ends_and_the_next_file_has_another(tmp_path, monkeypatch):
     first = parsed(tmp_path, "prints")
-    sandbox._Child.current.process.stdin.close()  # as after REST
+    sandbox._Child.current.process.stdin.close()  # as after IDLE_S
     sandbox._Child.current.process.wait()
     second = parsed(tmp_path, "prints")
     assert first != second == parsed(tmp_path, "prints")
@@ -80,7 +80,7 @@ def test_a_robot_that_wants_a_machine_is_refused(tmp_path, name):
 @limited
 @pytest.mark.parametrize("name", ["onnx Loop"])
 def test_a_network_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
-    monkeypatch.setattr(sandbox, "SECONDS", 1.0)
+    monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     hostile.CASES[name].make(tmp_path)
     with pytest.raises(ModelError, match=r"model\.onnx: is not read"):
         GapModel.load(tmp_path / "run")
@@ -88,7 +88,7 @@ def test_a_network_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
 
 @pytest.mark.parametrize("name", ["pickle bytearray", "pickle repr", "csv sparse"])
 def test_a_log_that_wants_a_machine_is_refused(tmp_path, name, monkeypatch):
-    monkeypatch.setattr(sandbox, "SECONDS", 1.0)
+    monkeypatch.setattr(sandbox, "PROCESSOR_S", 1.0)
     hostile.CASES[name].make(tmp_path)
     robot = load_robot(tmp_path / "arm")
     with pytest.raises(LogError):
@@ -101,7 +101,7 @@ def test_a_plain_robot_and_what_was_tried_before_start_no_child(tmp_path, monkey
     mesh(tmp_path / "meshed")
     meshed = load_robot(tmp_path / "meshed" / "arm")
     assert meshed.qpos_range.shape == (2, 2)
-    monkeypatch.setattr(sandbox, "_called", None)
+    monkeypatch.setattr(sandbox, "_run", None)
     assert robot.qpos_range.shape == (2, 2)
     assert load_robot("so101").qpos_range.shape == (6, 2)
     assert load_robot(tmp_path / "meshed" / "arm").qpos_range.shape == (2, 2)

@@ -1,7 +1,7 @@
 import pytest
 
 from gaponet.base.errors import GAPONetError
-from gaponet.base.text import markdown, measured
+from gaponet.base.text import escape_markdown, format_uncertainty
 
 
 @pytest.mark.parametrize(
@@ -10,7 +10,7 @@ from gaponet.base.text import markdown, measured
      (-0.01234, 0.00071, "-0.01234 ± 0.00071"), (1234.0, 5678.0, "1200 ± 5700"), (2.0, float("nan"), "2.000 ± nan")],
 )  # fmt: skip
 def test_a_measured_number_has_the_digits_that_its_error_allows(value, error, text):
-    assert measured(value, error) == text
+    assert format_uncertainty(value, error) == text
 
 
 @pytest.mark.parametrize(
@@ -30,4 +30,4 @@ def test_no_error_shows_the_keys_of_an_address(text, shown):
 
 
 def test_a_name_in_markdown_fetches_no_picture():
-    assert markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"
+    assert escape_markdown("![x](https:evil.example)") == r"!\[x\](https:evil.example)"

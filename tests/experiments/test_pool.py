@@ -9,7 +9,7 @@ from arm import recordings
 from cells import note_threads, wait_for_the_end
 
 from gaponet.base.errors import UsageError
-from gaponet.base.executor import opened
+from gaponet.base.executor import open_pool
 from gaponet.data.store import Dataset
 from gaponet.experiments.pool import SETUP, plan, run_cells, train_cell
 from gaponet.experiments.variant import parse_variant
@@ -24,7 +24,7 @@ SMALL = TrainConfig(
 
 @pytest.fixture
 def local(tmp_path):
-    with opened("local", 2, 1) as pool:
+    with open_pool("local", 2, 1) as pool:
         yield pool
 
 

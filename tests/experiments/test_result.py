@@ -7,7 +7,7 @@ import pytest
 from arm import recordings
 
 from gaponet.base.errors import DatasetError, FolderError
-from gaponet.base.spread import Spread, Table, text
+from gaponet.base.result_table import MeanStd, ResultTable, format_cell
 from gaponet.data.store import Dataset
 from gaponet.experiments.page import write, write_report
 from gaponet.experiments.result import Result, command_line, facts
@@ -23,26 +23,28 @@ def drawing():
 
 @pytest.fixture
 def result():
-    first = Table(
-        "all", ("method", "MPJAE, mrad", "runs"), (("A|B", Spread.of([0.001, 0.003], 1e3), 1234), ("C", None, 2))
+    first = ResultTable(
+        "all",
+        ("method", "MPJAE, mrad", "runs"),
+        (("A|B", MeanStd.from_values([0.001, 0.003], 1e3), 1234), ("C", None, 2)),
     )
-    second = Table("by_joint", ("joint", "mrad"), (("elbow", 1.23456),), "Of every joint.", digits=1)
+    second = ResultTable("by_joint", ("joint", "mrad"), (("elbow", 1.23456),), "Of every joint.", digits=1)
     figures = {"bars": drawing(), "curve": drawing()}
     return Result("thing", "A thing", "VIRTUAL arm: nothing real.", {"command": "gaponet", "seeds": [0, 1]},
                   (first, second), figures, ("It is < 3.",))  # fmt: skip
 
 
 def test_a_spread_has_the_sample_standard_deviation_and_one_value_has_none():
-    assert text(Spread.of([0.001, 0.003], 1e3)) == "2.00 ± 1.41"
-    assert text(Spread.of([0.5])) == "0.50"
-    assert text(Spread.of([])) == ""
-    assert text(Spread.of([1.0, float("nan"), 3.0])) == "2.00 ± 1.41"
-    assert [text(v) for v in (None, "a", 1234, float("nan"), True)] == ["", "a", "1,234", "", "yes"]
+    assert format_cell(MeanStd.from_values([0.001, 0.003], 1e3)) == "2.00 ± 1.41"
+    assert format_cell(MeanStd.from_values([0.5])) == "0.50"
+    assert format_cell(MeanStd.from_values([])) == ""
+    assert format_cell(MeanStd.from_values([1.0, float("nan"), 3.0])) == "2.00 ± 1.41"
+    assert [format_cell(v) for v in (None, "a", 1234, float("nan"), True)] == ["", "a", "1,234", "", "yes"]
 
 
 def test_a_row_of_the_wrong_length_is_refused():
     with pytest.raises(ValueError, match="3 cells under 2 columns"):
-        Table("t", ("a", "b"), ((1, 2, 3),))
+        ResultTable("t", ("a", "b"), ((1, 2, 3),))
 
 
 def test_every_form_is_written_and_files_are_exact(result, tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import TOML, commands, recordings, write_arm
 
-from gaponet.base.progress import silent
+from gaponet.base.progress import no_progress
 from gaponet.robot.spec import LAW, Table
 from gaponet.sim.replay import replay
 from gaponet.sysid import touching
@@ -39,7 +39,7 @@ def test_a_term_of_the_law_comes_back(tmp_path, law):
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
     fit = Fit(JointRuns(parts, robot), robot, Bounds(robot, parts))
     start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in LAW if f in law}
-    found = fit.search(tuple(law), start, Clock(None, 0, silent), "law")
+    found = fit.search(tuple(law), start, Clock(None, 0, no_progress), "law")
     assert set(CLASSIC) < set(found)
     std, _ = fit.uncertainty(found)
     for field, value in law.items():

@@ -14,7 +14,7 @@ import pytest
 from arm import write_arm
 
 from gaponet.base.errors import DatasetError, FolderError, UsageError
-from gaponet.base.files import writing
+from gaponet.base.files import lock_folder
 from gaponet.data.store import Dataset
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import model_hash
@@ -197,7 +197,7 @@ def test_what_something_else_collected_is_not_mixed(whole, spec):
 
 def test_two_collectors_do_not_share_a_folder(spec, fleet, tmp_path):
     collect(spec, fleet, replace(RECIPE, motions=("creep-elbow",), rates=(50.0,), repetitions=1), tmp_path, nproc=1)
-    with ThreadPoolExecutor(1) as other, writing(tmp_path, "dataset"):
+    with ThreadPoolExecutor(1) as other, lock_folder(tmp_path, "dataset"):
         asked = other.submit(collect, spec, fleet, RECIPE, tmp_path, nproc=1)
         with pytest.raises(FolderError, match=rf"another gaponet \(process {os.getpid()}\) is writing here"):
             asked.result()

@@ -9,7 +9,7 @@ import sys
 import pytest
 from logs import arm_sequence, late, wave
 
-from gaponet.base.files import writing
+from gaponet.base.files import lock_folder
 from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 
@@ -38,7 +38,7 @@ def test_a_folder_with_a_dot_file_in_it_is_refused_before_any_work(command, tmp_
 
 
 def test_another_commands_folder_is_refused(tmp_path, capsys):
-    with writing(tmp_path / "a", "comparison"):
+    with lock_folder(tmp_path / "a", "comparison"):
         (tmp_path / "a" / "compare.json").touch()
     assert main(["train", "nowhere", "--out", str(tmp_path / "a")]) == 2
     assert "holds gaponet's comparison, not run; choose another folder" in capsys.readouterr().err

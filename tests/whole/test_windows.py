@@ -62,8 +62,8 @@ print("all the way")
 LOCK = """
 import subprocess, sys
 from pathlib import Path
-from gaponet.base.files import lock
-descriptor, folder = lock(Path(sys.argv[1])), Path(sys.argv[1]).parent
+from gaponet.base.files import lock_file
+descriptor, folder = lock_file(Path(sys.argv[1])), Path(sys.argv[1]).parent
 assert descriptor is not None
 if len(sys.argv) == 2:
     words = [sys.executable, "-c", sys.stdin.read(), sys.argv[1], "again"]

@@ -1,1 +1,1 @@
-"""What every sub-package uses: errors, files, checked structures, jobs in other processes, a sandbox."""
+"""Shared by all sub-packages: errors, files, validation, text, progress, executors and the sandbox."""

@@ -1,4 +1,4 @@
-"""What annotations call an array, whose docstrings say shape and unit; and what numpy and torch call differently."""
+"""The array type of annotations (docstrings state shapes and units), and operations common to numpy and torch."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ import numpy as np
 Array = np.ndarray
 
 
-def library(x: Any) -> Any:
-    """The module, numpy or torch, that an array is of."""
+def array_module(x: Any) -> Any:
+    """Return the module of an array: numpy or torch."""
     return np if isinstance(x, np.ndarray) else import_module(type(x).__module__.partition(".")[0])
 
 
-def like(x: Any, values: Any) -> Any:
-    """Values as an array of x's kind and device: as they are in numpy, floats in x's type in torch."""
+def array_like(x: Any, values: Any) -> Any:
+    """Convert values to an array of x's module and device; in torch, floats get the type of x."""
     if isinstance(x, np.ndarray):
         return np.asarray(values)
-    new = x.new_tensor if np.asarray(values).dtype.kind == "f" else library(x).tensor
+    new = x.new_tensor if np.asarray(values).dtype.kind == "f" else array_module(x).tensor
     return new(np.asarray(values), device=x.device)
 
 
 def zeros_like(x: Any, *shape: int) -> Any:
-    """Zeros of x's kind, type and device, numpy or torch."""
+    """Return zeros of this shape, with the module, type and device of x."""
     return np.zeros(shape, x.dtype) if isinstance(x, np.ndarray) else x.new_zeros(shape)
 
 
-def copy_of(x: Any) -> Any:
-    """A copy of a numpy or torch array."""
+def copy_array(x: Any) -> Any:
+    """Copy a numpy or torch array."""
     return x.copy() if isinstance(x, np.ndarray) else x.clone()
 
 
-def host(x: Any) -> Array:
-    """The same in numpy; a copy of a tensor on a GPU."""
+def to_numpy(x: Any) -> Array:
+    """Return a numpy or torch array in numpy; a tensor on a GPU is copied to the host."""
     return x if isinstance(x, np.ndarray) else x.cpu().numpy()

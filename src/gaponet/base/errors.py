@@ -1,21 +1,20 @@
-"""Errors that a user can act on: what is wrong, where, and what to do.
+"""Errors that a user can correct: the message says what is wrong, where, and what to do.
 
 Every error raised on bad input derives from `GAPONetError`; the command line prints it in one line and exits with 2.
 """
 
-from gaponet.base.text import without_credentials
+from gaponet.base.text import remove_credentials
 
-LONGEST = 1000  # characters of an error; the middle of a longer one is left out: where and what to do stand at its ends
+MAX_CHARACTERS = 1000  # of a message; the middle of a longer one is omitted, as its ends say where and what to do
 
 
 class GAPONetError(Exception):
-    """Base of all errors caused by input, never by a bug in gaponet. Its text is one line of printable characters,
-    without the keys of an address."""
+    """Base class of errors that input causes. The message is one line of printable characters without credentials."""
 
     def __init__(self, text: str) -> None:
-        text = without_credentials(text)
-        if len(text) > LONGEST:
-            text = f"{text[: LONGEST // 2]} … {text[-LONGEST // 2 :]}"
+        text = remove_credentials(text)
+        if len(text) > MAX_CHARACTERS:
+            text = f"{text[: MAX_CHARACTERS // 2]} … {text[-MAX_CHARACTERS // 2 :]}"
         super().__init__("".join(c if c.isprintable() else ascii(c)[1:-1] for c in text))
 
 
@@ -36,7 +35,7 @@ class DatasetError(GAPONetError):
 
 
 class FolderError(GAPONetError):
-    """A folder to write into is somebody else's, or another process is writing into it."""
+    """An output folder is somebody else's, or another process is writing into it."""
 
 
 class ModelError(GAPONetError):
@@ -44,11 +43,11 @@ class ModelError(GAPONetError):
 
 
 class NoGainError(GAPONetError):
-    """Nothing that was fitted follows the recordings better than what is known already."""
+    """No fitted candidate follows the recordings better than the robot that is given."""
 
 
 class WorkerError(GAPONetError):
-    """The processes that worked on something died of it, one after the other."""
+    """Every worker process of a job died."""
 
 
 class UsageError(GAPONetError):
@@ -66,7 +65,7 @@ EXTRAS = {
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install where an optional dependency is missing; None for any other module."""
+    """Return the install command for a missing optional dependency; None for any other module."""
     module = (error.name or "").split(".")[0]
     if module not in EXTRAS:
         return None

@@ -1,7 +1,7 @@
-"""Jobs in other processes, here or on a cluster: one loop over any concurrent.futures.Executor.
+"""Jobs in other processes of this machine or of a cluster, on any concurrent.futures.Executor.
 
-What a job raises is its outcome. What the executor raises means that its worker died (out of memory, kill -9, a machine
-gone): the job is given to another worker, RETRIES times. Libraries are loaded only where they are asked for.
+An exception of a job is its outcome. An exception of the executor means that the worker died (out of memory, kill -9,
+machine lost): the job is then repeated, up to MAX_RETRIES times. Ray is imported only on request.
 """
 
 from __future__ import annotations
@@ -20,30 +20,29 @@ from functools import partial
 from multiprocessing import get_context
 from typing import Any, Generic, TypeVar
 
-from gaponet.base.child import SAFE
+from gaponet.base.child_process import SAFE_PATH_VARIABLE
 from gaponet.base.errors import UsageError, WorkerError
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 LOCAL = "local"
-RETRIES = 2
-BEAT = 0.3  # s between two looks at what is going on
-MOST_WORKERS = 1024
-POOLS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+MAX_RETRIES = 2  # of a job whose worker died
+POLL_INTERVAL_S = 0.3
+MAX_WORKERS = 1024
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
 class _Outcome(Generic[Job, Result]):
-    """What came of a job."""
+    """Result of one job, or its error: the exception of the job, or a WorkerError if its workers died."""
 
     job: Job
     value: Result | None
     error: Exception | None
-    """What the job raised, or a WorkerError where its workers died."""
 
     def result(self) -> Result:
-        """The value; raises the error."""
+        """Return the value or raise the error."""
         if self.error is not None:
             raise self.error
         return self.value  # type: ignore[return-value]
@@ -51,7 +50,7 @@ class _Outcome(Generic[Job, Result]):
 
 @dataclass(frozen=True)
 class Pool:
-    """An executor, how many jobs it is given at a time, and on how many threads each computes."""
+    """Executor with the number of jobs that it receives at a time, and the threads of each job."""
 
     executor: Executor
     size: int
@@ -61,22 +60,23 @@ class Pool:
         self,
         work: Callable[[Job], Result],
         jobs: Iterable[Job],
-        look: Callable[[], None] = lambda: None,
-        stop: Callable[[Job], bool] = lambda job: True,
+        on_poll: Callable[[], None] = lambda: None,
+        request_stop: Callable[[Job], bool] = lambda job: True,
     ) -> Iterator[_Outcome[Job, Result]]:
-        """Do the jobs; yields what came of each as it ends.
+        """Yield the outcome of each job when it ends.
 
         Args:
-            work: What to do with one; a module's function, or a partial of one.
-            jobs: Taken when there is room for them.
-            look: Called every BEAT.
-            stop: Where the loop is left early: asks a job to end, returns whether it has begun. Those are waited for.
+            work: A module's function, or a partial of one.
+            jobs: Consumed as workers become free.
+            on_poll: Called every POLL_INTERVAL_S.
+            request_stop: Called for each job that is left if the caller leaves the loop early. It asks the job to end
+                and returns True if the job has begun; those jobs are awaited.
         """
         waiting, running = iter(jobs), dict[Future[Any], tuple[Job, int]]()
 
-        def submit(job: Job, died: int) -> None:
-            with _for_children(self.threads):
-                running[self.executor.submit(_done, work, job)] = job, died
+        def submit(job: Job, deaths: int) -> None:
+            with _child_environment(self.threads):
+                running[self.executor.submit(_run_job, work, job)] = job, deaths
 
         try:
             while True:
@@ -84,29 +84,29 @@ class Pool:
                     submit(job, 0)
                 if not running:
                     return
-                for future in wait(running, BEAT, FIRST_COMPLETED).done:
-                    job, died = running.pop(future)
-                    lost = future.exception()
-                    if lost is None:
+                for future in wait(running, POLL_INTERVAL_S, FIRST_COMPLETED).done:
+                    job, deaths = running.pop(future)
+                    death = future.exception()
+                    if death is None:
                         yield _Outcome(job, *future.result())
-                    elif died < RETRIES:
-                        submit(job, died + 1)
+                    elif deaths < MAX_RETRIES:
+                        submit(job, deaths + 1)
                     else:
-                        said = str(lost).strip() or type(lost).__name__
-                        why = f"{died + 1} workers died of it, out of memory? The last: {said}"
-                        yield _Outcome(job, None, WorkerError(why))
-                look()
+                        reason = str(death).strip() or type(death).__name__
+                        message = f"{deaths + 1} workers died of it, out of memory? The last: {reason}"
+                        yield _Outcome(job, None, WorkerError(message))
+                on_poll()
         finally:
             for future, (job, _) in running.items():
-                if not stop(job):
+                if not request_stop(job):
                     future.cancel()
             wait(running)
 
     def map(self, work: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
-        """Results in the order of the jobs, whichever is done first; raises the first error in its turn."""
+        """Yield the results in the order of the jobs; raise the first error in its turn."""
         early: dict[int, _Outcome[Any, Result]] = {}
         turn = 0
-        for outcome in self.run(partial(_second, work), enumerate(jobs)):
+        for outcome in self.run(partial(_run_numbered, work), enumerate(jobs)):
             early[outcome.job[0]] = outcome
             while turn in early:
                 yield early.pop(turn).result()
@@ -114,12 +114,12 @@ class Pool:
 
     @staticmethod
     def cores(threads: int) -> int:
-        """How many jobs on so many threads each this machine has cores for."""
+        """Return how many jobs with this many threads fit the cores of this machine."""
         return max(1, (os.cpu_count() or 1) // threads)
 
 
-def _done(work: Callable[[Job], Result], job: Job) -> tuple[Result | None, Exception | None]:
-    """A job in its worker."""
+def _run_job(work: Callable[[Job], Result], job: Job) -> tuple[Result | None, Exception | None]:
+    """Run a job in its worker."""
     try:
         return work(job), None
     except Exception as error:
@@ -127,24 +127,24 @@ def _done(work: Callable[[Job], Result], job: Job) -> tuple[Result | None, Excep
         return None, error
 
 
-def _second(work: Callable[[Job], Result], job: tuple[int, Job]) -> Result:
+def _run_numbered(work: Callable[[Job], Result], job: tuple[int, Job]) -> Result:
     return work(job[1])
 
 
 @contextmanager
-def opened(where: str | Executor, workers: int, threads: int) -> Iterator[Pool]:
-    """Start what jobs run on, or reach it; what was started here ends with the block.
+def open_pool(where: str | Executor, workers: int, threads: int) -> Iterator[Pool]:
+    """Start or reach an executor; what was started here ends with the block.
 
     Args:
-        where: local; ray, with :ADDRESS of a cluster; or an executor.
+        where: "local"; "ray", with ":ADDRESS" of a cluster; or an executor.
         workers: Jobs at a time; 0 for as many as there are cores.
-        threads: How many one job takes.
+        threads: Threads of one job.
 
     Raises:
-        UsageError: No such executor, or no cluster there.
+        UsageError: There is no such executor, or no cluster at the address.
     """
     with ExitStack() as stack:
-        executor = stack.enter_context(_Processes()) if where == LOCAL else where
+        executor = stack.enter_context(_ProcessPerWorker()) if where == LOCAL else where
         size = workers or Pool.cores(threads)
         if not isinstance(executor, Executor):
             kind, _, address = str(executor).partition(":")
@@ -153,40 +153,40 @@ def opened(where: str | Executor, workers: int, threads: int) -> Iterator[Pool]:
                     f"--executor {where}: choose local, ray or ray:ADDRESS; "
                     "from Python, give a concurrent.futures.Executor (docs/scale.md)"
                 )
-            with _for_children(threads):
-                executor, size = _ray(stack, address, workers, threads)
+            with _child_environment(threads):
+                executor, size = _connect_ray(stack, address, workers, threads)
         yield Pool(executor, max(1, size), threads)
 
 
-class _Processes(Executor):
-    """Processes of this machine, each a pool of its own: one that is killed takes nobody else's job with it."""
+class _ProcessPerWorker(Executor):
+    """Pools of one process each: when a worker is killed, only its own job is lost."""
 
     def __init__(self) -> None:
-        self.last: dict[ProcessPoolExecutor, Future[Any]] = {}
+        self.last_jobs: dict[ProcessPoolExecutor, Future[Any]] = {}
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        for pool in [pool for pool, last in self.last.items() if last.done()]:
+        for pool in [pool for pool, last in self.last_jobs.items() if last.done()]:
             with suppress(BrokenProcessPool):
-                self.last[pool] = pool.submit(fn, *args, **kwargs)
-                return self.last[pool]
-            del self.last[pool]
-        pool = ProcessPoolExecutor(1, get_context("spawn"), _leave_with, (os.getpid(),))
-        self.last[pool] = pool.submit(fn, *args, **kwargs)
-        return self.last[pool]
+                self.last_jobs[pool] = pool.submit(fn, *args, **kwargs)
+                return self.last_jobs[pool]
+            del self.last_jobs[pool]
+        pool = ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent, (os.getpid(),))
+        self.last_jobs[pool] = pool.submit(fn, *args, **kwargs)
+        return self.last_jobs[pool]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        for pool in self.last:
+        for pool in self.last_jobs:
             pool.shutdown(wait, cancel_futures=cancel_futures)
 
 
-class _Ray(Executor):
-    """Ray's tasks as futures; it has no executor of its own."""
+class _RayExecutor(Executor):
+    """Executor of Ray tasks."""
 
-    def __init__(self, call: Any) -> None:
-        self.call = call
+    def __init__(self, task: Any) -> None:
+        self.task = task
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = self.call.remote(fn, *args, **kwargs).future()
+        future: Future[Any] = self.task.remote(fn, *args, **kwargs).future()
         return future
 
 
@@ -194,34 +194,34 @@ def _call(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     return fn(*args, **kwargs)
 
 
-def _ray(stack: ExitStack, address: str, workers: int, threads: int) -> tuple[Executor, int]:
-    """A cluster at an address or $RAY_ADDRESS, else a Ray of our own that nobody outside this machine can reach."""
+def _connect_ray(stack: ExitStack, address: str, workers: int, threads: int) -> tuple[Executor, int]:
+    """Connect to the cluster at an address or $RAY_ADDRESS, or start Ray here, closed to other machines."""
     address = address or os.environ.get("RAY_ADDRESS") or LOCAL
     if address == LOCAL:
-        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # on every system: bind to loopback
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # binds to the loopback interface on every system
     import ray
 
     if not ray.is_initialized():
-        mine: dict[str, Any] = {"include_dashboard": False, "num_cpus": workers * threads or None}
+        own: dict[str, Any] = {"include_dashboard": False, "num_cpus": workers * threads or None}
         quiet = {"log_to_driver": False, "logging_level": "ERROR"}
         try:
-            ray.init(address, **quiet, **(mine if address == LOCAL else {}))
+            ray.init(address, **quiet, **(own if address == LOCAL else {}))
         except (ConnectionError, ValueError) as error:
             raise UsageError(f"--executor ray: no cluster at {address}: {error}") from None
         stack.callback(ray.shutdown)
-    there = int(ray.cluster_resources().get("CPU", 1))
-    call = ray.remote(num_cpus=min(threads, there), max_retries=0)(_call)
-    return _Ray(call), workers or there // threads
+    cpus = int(ray.cluster_resources().get("CPU", 1))
+    task = ray.remote(num_cpus=min(threads, cpus), max_retries=0)(_call)
+    return _RayExecutor(task), workers or cpus // threads
 
 
 @contextmanager
-def _for_children(threads: int) -> Iterator[None]:
-    """What a process that is started now reads from its environment; Ctrl-C in the terminal is for its parent alone."""
-    told = dict.fromkeys(POOLS, str(threads)) | {SAFE: "1"}
-    before = {name: os.environ.get(name) for name in told}
+def _child_environment(threads: int) -> Iterator[None]:
+    """Set the environment that a process started in the block inherits; Ctrl-C reaches its parent only."""
+    variables = dict.fromkeys(THREAD_VARIABLES, str(threads)) | {SAFE_PATH_VARIABLE: "1"}
+    before = {name: os.environ.get(name) for name in variables}
     main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
-    os.environ.update(told)
+    os.environ.update(variables)
     try:
         yield
     finally:
@@ -234,12 +234,12 @@ def _for_children(threads: int) -> Iterator[None]:
             signal.signal(signal.SIGINT, handler)
 
 
-def _leave_with(parent: int) -> None:
-    """A worker whose parent was killed would wait for work forever: it ends itself instead."""
+def _end_with_parent(parent: int) -> None:
+    """End this worker when its parent is gone: it would wait for work forever."""
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(BEAT)
+            time.sleep(POLL_INTERVAL_S)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

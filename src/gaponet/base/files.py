@@ -1,52 +1,59 @@
-"""Writing where a user said: files whole or not at all, one writer to a folder, nothing into somebody else's folder.
+"""Files and folders of the user: atomic writes, one writer per folder, no writes into other people's folders.
 
-A folder that gaponet writes into holds `.gaponet`: its first line says what the folder is, and the file is the lock of
-whoever writes (it ends with its process, whatever ends that). A file being written is `.gaponet-PROCESS-NAME`
-beside its place; those of a killed process are removed by the next that writes there. Nothing else is ever removed.
-What Windows does otherwise is here and in `deploy/stop.py` alone.
+Each folder that gaponet writes into holds a marker file `.gaponet`. Its first line is the kind of folder. The file is
+also the lock of the writer: the system releases it when the process ends, however that happens. A file is written as
+`.gaponet-PROCESS-NAME` beside its place and then renamed. The next writer removes those of killed processes; gaponet
+removes nothing else. Differences of Windows are handled here and in `deploy/stop.py` only.
 """
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import is_dataclass
 from pathlib import Path
+from typing import Any
 
 from gaponet.base.errors import FolderError
 
 WINDOWS = os.name == "nt"
-MARK = ".gaponet"
-# What tells folders that were written before there was a mark.
-EARLIER = {
+FOLDER_MARKER = ".gaponet"
+LOCK_RETRY_S = 0.05
+LOCKED_BYTE = 1 << 30  # Windows: a locked byte cannot be read, so it lies far behind the end of the file
+# Files by which a folder without a marker is recognised: older versions wrote none.
+UNMARKED_FOLDERS = {
     "dataset": ("dataset.json",),
     "run": ("split.json",),
     "experiments": tuple(f"{place}cells/*/setup.json" for place in ("", "rehearsal/", "without-*/")),
     "model": ("card.json",),
 }
 
-_held: set[tuple[str, int]] = set()  # folders of this process's threads
+_locked_here: set[tuple[str, int]] = set()  # (folder, thread) of this process
 
 
 @contextmanager
-def whole(path: Path, named: bool = True) -> Iterator[Path]:
-    """Give a name beside path to write to; what is there when the block ends well takes path's place, on the disk.
+def atomic_write(path: Path, named: bool = True) -> Iterator[Path]:
+    """Yield a temporary path; when the block succeeds, its file replaces `path` and is flushed to the disk.
 
-    Where it is not `named`, its name is not on the disk before `sync(path.parent)`, once for many files.
+    Args:
+        named: Flush the folder's entry too. For many files, pass False and call `flush_to_disk(path.parent)` once.
 
     Raises:
-        OSError: It could not be written; path is as it was.
+        OSError: It could not be written; `path` is unchanged.
     """
-    temporary = path.with_name(f"{MARK}-{os.getpid()}-{path.name}")
+    temporary = path.with_name(f"{FOLDER_MARKER}-{os.getpid()}-{path.name}")
     try:
         yield temporary
-        sync(temporary)
+        flush_to_disk(temporary)
         os.replace(temporary, path)
         if named:
-            sync(path.parent)
+            flush_to_disk(path.parent)
     except OSError as error:
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
@@ -54,13 +61,35 @@ def whole(path: Path, named: bool = True) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
-    with whole(path) as temporary:
+    """Write a text file atomically."""
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def sync(path: Path) -> None:
-    """Return when a file's content, or a folder's list of names, is on the disk (on Windows, files only)."""
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file atomically, with the conversions of `json_compatible`."""
+    write_text(path, json.dumps(json_compatible(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def json_compatible(value: Any) -> Any:
+    """Convert to valid JSON values: NaN and infinity to None, numpy to Python, dataclasses to dicts."""
+    if isinstance(value, str):  # a file name may hold bytes that are no characters
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {json_compatible(str(k)): json_compatible(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [json_compatible(v) for v in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        return json_compatible(vars(value))
+    if hasattr(value, "tolist"):
+        return json_compatible(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def flush_to_disk(path: Path) -> None:
+    """Return when the content of a file, or the entries of a folder, are on the disk (on Windows, files only)."""
     if WINDOWS and path.is_dir():
         return
     descriptor = os.open(path, os.O_RDWR if WINDOWS else os.O_RDONLY)
@@ -70,8 +99,8 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def require_ours(folder: Path, kind: str) -> None:
-    """Refuse a folder that holds anything, dot files too, and was not written by gaponet as this kind of folder.
+def require_own_folder(folder: Path, kind: str) -> None:
+    """Refuse a folder that is not empty and was not written by gaponet as this kind.
 
     Raises:
         FolderError: It is somebody else's, another kind of folder, or a file.
@@ -80,140 +109,148 @@ def require_ours(folder: Path, kind: str) -> None:
         if folder.exists() or folder.is_symlink():
             raise FolderError(f"{folder}: is no folder; choose another place")
         return
-    mark = folder / MARK
-    found = mark.read_text(encoding="utf-8", errors="replace").split()[:1] if mark.is_file() else []
-    if found and found[0] != kind:
-        raise FolderError(f"{folder}: holds gaponet's {found[0]}, not {kind}; choose another folder")
-    if found or any(any(folder.glob(sign)) for sign in EARLIER.get(kind, (MARK,))):
+    marked = _marker_lines(folder)[:1]
+    if marked and marked[0] != kind:
+        raise FolderError(f"{folder}: holds gaponet's {marked[0]}, not {kind}; choose another folder")
+    if marked or any(any(folder.glob(sign)) for sign in UNMARKED_FOLDERS.get(kind, (FOLDER_MARKER,))):
         return
-    strangers = sorted(child.name for child in folder.iterdir() if not child.name.startswith(MARK))
-    if strangers:
-        more = f" and {len(strangers) - 3} more" if len(strangers) > 3 else ""
+    others = sorted(child.name for child in folder.iterdir() if not child.name.startswith(FOLDER_MARKER))
+    if others:
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         raise FolderError(
-            f"{folder}: holds {', '.join(strangers[:3])}{more}, so it is no {kind} of gaponet; choose an empty folder"
+            f"{folder}: holds {', '.join(others[:3])}{more}, so it is no {kind} of gaponet; choose an empty folder"
         )
 
 
-@contextmanager
-def writing(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
-    """Be the only one that writes into a folder, which is made if missing; again within itself, it changes nothing.
+def _marker_lines(folder: Path) -> list[str]:
+    """Return the kind of a folder and the process that writes into it, as far as the marker states them."""
+    marker = folder / FOLDER_MARKER
+    return marker.read_text(encoding="utf-8", errors="replace").split() if marker.is_file() else []
 
-    A folder or mark made here goes again if the block fails before anything was written into it.
+
+@contextmanager
+def lock_folder(folder: Path, kind: str, wait: float = 0.0) -> Iterator[None]:
+    """Lock a folder for this thread, the only writer; the folder is created if missing. Nested calls do nothing.
+
+    If the block fails before it wrote anything, a folder or marker that was created here is removed.
 
     Args:
-        folder: The user's.
-        kind: What the folder is, in one word: dataset, run, model, …
-        wait: For another writer to end, s.
+        kind: One word: dataset, run, model, …
+        wait: Time to wait for another writer, s.
 
     Raises:
-        FolderError: It is somebody else's, or another process writes into it.
+        FolderError: The folder is somebody else's, or another process writes into it.
     """
     key = (os.path.realpath(folder), threading.get_ident())
-    if key in _held:
+    if key in _locked_here:
         yield
         return
-    made = [p for p in (folder, *folder.parents) if not p.exists()]
-    new, line = not (folder / MARK).exists(), f"{kind}\n".encode()
-    descriptor = _sole(folder, kind, wait)
-    _held.add(key)
-    done = False
+    created = [p for p in (folder, *folder.parents) if not p.exists()]
+    new, kind_line = not (folder / FOLDER_MARKER).exists(), f"{kind}\n".encode()
+    descriptor = _lock_marker(folder, kind, wait)
+    _locked_here.add(key)
+    succeeded = False
     try:
         if not os.fstat(descriptor).st_size:
-            _write(descriptor, 0, line)
-        elif os.fstat(descriptor).st_size > len(line):  # the second line says who writes: that one was killed
-            _clear(folder)
-        _write(descriptor, len(line), f"{os.getpid()}\n".encode())
+            _write_at(descriptor, 0, kind_line)
+        elif os.fstat(descriptor).st_size > len(kind_line):  # a second line names a writer that was killed
+            _remove_unfinished(folder)
+        _write_at(descriptor, len(kind_line), f"{os.getpid()}\n".encode())
         yield
-        done = True
+        succeeded = True
     finally:
-        if not done and new and [p.name for p in folder.iterdir()] == [MARK]:
-            with suppress(OSError):  # somebody else put something there; Windows keeps what is open
-                (folder / MARK).unlink()
-                for path in made:
+        if not succeeded and new and [p.name for p in folder.iterdir()] == [FOLDER_MARKER]:
+            with suppress(OSError):  # another program wrote into it; Windows keeps open files
+                (folder / FOLDER_MARKER).unlink()
+                for path in created:
                     path.rmdir()
-        elif os.fstat(descriptor).st_size > len(line):
-            os.ftruncate(descriptor, len(line))
-        _held.discard(key)
+        elif os.fstat(descriptor).st_size > len(kind_line):
+            os.ftruncate(descriptor, len(kind_line))
+        _locked_here.discard(key)
         os.close(descriptor)
 
 
-def _write(descriptor: int, at: int, line: bytes) -> None:
-    os.lseek(descriptor, at, os.SEEK_SET)
+def _write_at(descriptor: int, offset: int, line: bytes) -> None:
+    os.lseek(descriptor, offset, os.SEEK_SET)
     os.write(descriptor, line)
 
 
-def _sole(folder: Path, kind: str, wait: float) -> int:
-    """Lock the folder's mark; returns the file descriptor that holds the lock."""
+def _lock_marker(folder: Path, kind: str, wait: float) -> int:
+    """Lock the marker of a folder; returns the file descriptor that holds the lock."""
     deadline = time.monotonic() + wait
     while True:
-        require_ours(folder, kind)
+        require_own_folder(folder, kind)
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = lock(folder / MARK)
+        descriptor = lock_file(folder / FOLDER_MARKER)
         if descriptor is not None:
             return descriptor
         if time.monotonic() >= deadline:
-            who = (folder / MARK).read_text(encoding="utf-8", errors="replace").split()[1:2]
-            process = f" (process {who[0]})" if who else ""
-            raise FolderError(f"{folder}: another gaponet{process} is writing here; wait for it or stop it")
-        time.sleep(0.05)
+            writer = "".join(f" (process {process})" for process in _marker_lines(folder)[1:2])
+            raise FolderError(f"{folder}: another gaponet{writer} is writing here; wait for it or stop it")
+        time.sleep(LOCK_RETRY_S)
 
 
-def lock(path: Path, opened: Callable[[Path], int] | None = None) -> int | None:
-    """Lock a file, made if missing, against other processes; returns its descriptor, None where another has it.
+def lock_file(path: Path, opener: Callable[[Path], int] | None = None) -> int | None:
+    """Lock a file against other processes; the file is created if missing.
+
+    A descriptor, unlike the locks of libraries, may be inherited by a child and may be of another user's file.
 
     Args:
-        opened: Opens it, for a file that may be another user's; by default it is opened for writing.
+        opener: Opens the file; by default it is opened for reading and writing.
+
+    Returns:
+        The descriptor that holds the lock, or None if another process holds it.
     """
     while True:
-        binary = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
-        descriptor = opened(path) if opened else os.open(path, binary, 0o666)
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)
+        descriptor = opener(path) if opener else os.open(path, flags, 0o666)
         try:
-            _take(descriptor)
+            _lock_descriptor(descriptor)
             if WINDOWS or os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 return descriptor
-        except (BlockingIOError, PermissionError):  # POSIX's word for it and Windows'
+        except (BlockingIOError, PermissionError):  # POSIX, Windows: locked by another process
             os.close(descriptor)
             return None
         except FileNotFoundError:
             pass
-        os.close(descriptor)  # the file that was locked has been removed meanwhile
+        os.close(descriptor)  # the locked file was removed meanwhile
 
 
-def _take(descriptor: int) -> None:
+def _lock_descriptor(descriptor: int) -> None:
     """Lock an open file or raise OSError."""
     try:
         import fcntl
-    except ImportError:  # Windows, where a byte that is locked cannot be read: one far behind the end
+    except ImportError:
         import msvcrt
 
-        os.lseek(descriptor, 1 << 30, os.SEEK_SET)
+        os.lseek(descriptor, LOCKED_BYTE, os.SEEK_SET)
         msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
     else:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def _clear(folder: Path) -> None:
-    """Remove what a killed writer had half written, here and below; not what another process is still writing."""
-    for path in folder.rglob(f"{MARK}-*"):
-        owner = path.name.removeprefix(f"{MARK}-").split("-")[0]
-        if owner.isdigit() and not _alive(int(owner)):
+def _remove_unfinished(folder: Path) -> None:
+    """Remove temporary files of processes that have ended, in the folder and below."""
+    for path in folder.rglob(f"{FOLDER_MARKER}-*"):
+        owner = path.name.removeprefix(f"{FOLDER_MARKER}-").split("-")[0]
+        if owner.isdigit() and not _process_runs(int(owner)):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _alive(process: int) -> bool:
+def _process_runs(process: int) -> bool:
     if WINDOWS:  # where os.kill ends a process, whatever the signal
         import ctypes
 
         kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
-        handle = kernel.OpenProcess(0x100000, False, process)  # the right to wait for its end
+        handle = kernel.OpenProcess(0x100000, False, process)  # SYNCHRONIZE: the right to wait for its end
         try:
-            return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # not yet
+            return bool(handle) and kernel.WaitForSingleObject(handle, 0) == 0x102  # WAIT_TIMEOUT
         finally:
             kernel.CloseHandle(handle)
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # another user's
+    except PermissionError:  # it is another user's
         pass
     return True

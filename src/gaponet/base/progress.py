@@ -1,5 +1,4 @@
-"""One progress bar for all commands, on stderr, so that stdout stays for results; in a file or a pipe, a line now and
-then."""
+"""Progress bars on stderr, since stdout is for results; in a file or a pipe, occasional lines."""
 
 from __future__ import annotations
 
@@ -8,39 +7,31 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from gaponet.base.text import plain
+from gaponet.base.text import escape
 
-EVERY = 10.0  # s between two lines where there is no terminal
-ALMOST = 0.99  # shown at most before the end: what is called 100 % is over
+LINE_INTERVAL_S = 10.0  # without a terminal
+MAX_UNFINISHED = 0.99  # largest fraction that is shown before the end
 
-
-Progress = Callable[[float, float, str], None]  # done, total, what is done now
-Running = dict[str, tuple[float, str]]  # name of a part → share done, note
-_Show = Callable[[Running, float, float, str], None]  # parts running, done, total, note
-
-
-def silent(done: float, total: float, note: str = "") -> None:
-    """A Progress that nobody looks at."""
+Progress = Callable[[float, float, str], None]  # done, total, note
+Running = dict[str, tuple[float, str]]  # name of a parallel task → fraction done, note
+_Show = Callable[[Running, float, float, str], None]  # running tasks, done, total, note
 
 
-def noted(progress: Progress, note: str) -> Callable[[int, int], None]:
-    """progress(done, total) of a part that is called so."""
+def no_progress(done: float, total: float, note: str = "") -> None:
+    """Progress that shows nothing."""
+
+
+def with_note(progress: Progress, note: str) -> Callable[[int, int], None]:
+    """Return progress(done, total) with a fixed note."""
     return lambda done, total: progress(done, total, note)
 
 
 @contextmanager
-def bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
-    """Yields update(done, total, note)."""
+def progress_bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
+    """Show a progress bar; yields update(done, total, note)."""
     with _progress(title) as show:
 
         def update(done: float, total: float, note: str = "") -> None:
@@ -50,17 +41,17 @@ def bar(title: str) -> Iterator[Callable[[float, float, str], None]]:
 
 
 @contextmanager
-def bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
-    """Yields show(running, done): a bar over all, with time left, and one per part that is running."""
+def progress_bars(title: str, total: int) -> Iterator[Callable[[Running, int], None]]:
+    """Show a bar for the whole and one per running task; yields show(running, done)."""
     with _progress(title) as show:
         yield lambda running, done: show(
-            running, done + sum(share for share, _ in running.values()), total, f"{done} of {total} done"
+            running, done + sum(fraction for fraction, _ in running.values()), total, f"{done} of {total} done"
         )
 
 
 @contextmanager
 def _progress(title: str) -> Iterator[_Show]:
-    console = Console(stderr=True, force_jupyter=False)  # in a notebook it is text as well
+    console = Console(stderr=True, force_jupyter=False)  # text in a notebook, too
     if not console.is_terminal:
         with _lines(title, console) as lines:
             yield lines
@@ -77,35 +68,35 @@ def _progress(title: str) -> Iterator[_Show]:
         def show(running: Running, done: float, total: float, note: str = "") -> None:
             for name in shown.keys() - running.keys():
                 progress.remove_task(shown.pop(name))
-            for name, (share, said) in running.items():
+            for name, (fraction, task_note) in running.items():
                 if name not in shown:
-                    shown[name] = progress.add_task(f"  {plain(name)}", total=1.0, note="")
-                progress.update(shown[name], completed=share, note=plain(said))
-            progress.update(whole, completed=min(done, ALMOST * total), total=total, note=plain(note))
+                    shown[name] = progress.add_task(f"  {escape(name)}", total=1.0, note="")
+                progress.update(shown[name], completed=fraction, note=escape(task_note))
+            progress.update(whole, completed=min(done, MAX_UNFINISHED * total), total=total, note=escape(note))
 
         yield show
-        if (task := progress.tasks[0]).percentage >= 100 * ALMOST:
+        if (task := progress.tasks[0]).percentage >= 100 * MAX_UNFINISHED:
             progress.update(whole, completed=task.total)
 
 
 @contextmanager
 def _lines(title: str, console: Console) -> Iterator[_Show]:
-    """The same as lines: the first when there is something to say, then at most one every EVERY seconds; the end."""
-    began = time.monotonic()
-    last, share, newest = began - EVERY, 0.0, ""
+    """Print progress as lines: the first update, then one per LINE_INTERVAL_S at most, and the end."""
+    start = time.monotonic()
+    last, fraction, newest = start - LINE_INTERVAL_S, 0.0, ""
 
     def show(running: Running, done: float, total: float, note: str = "") -> None:
-        nonlocal last, share, newest
-        parts = [note, *(f"{name} {100 * part:.0f} % {said}".rstrip() for name, (part, said) in running.items())]
-        share, newest = done / total if total else 0.0, "; ".join(part for part in parts if part)
-        if time.monotonic() - last >= EVERY and (share < 1 or last >= began):
+        nonlocal last, fraction, newest
+        tasks = [note, *(f"{name} {100 * part:.0f} % {said}".rstrip() for name, (part, said) in running.items())]
+        fraction, newest = done / total if total else 0.0, "; ".join(task for task in tasks if task)
+        if time.monotonic() - last >= LINE_INTERVAL_S and (fraction < 1 or last >= start):
             last = time.monotonic()
-            tell(min(share, ALMOST))
+            print_line(min(fraction, MAX_UNFINISHED))
 
-    def tell(share: float) -> None:
-        line = f"{title}: {100 * share:.0f} %, {time.monotonic() - began:.0f} s{', ' + newest if newest else ''}"
-        console.print(plain(line), markup=False, soft_wrap=True)
+    def print_line(shown: float) -> None:
+        line = f"{title}: {100 * shown:.0f} %, {time.monotonic() - start:.0f} s{', ' + newest if newest else ''}"
+        console.print(escape(line), markup=False, soft_wrap=True)
 
     yield show
-    if share >= 1:
-        tell(1.0)
+    if fraction >= 1:
+        print_line(1.0)

@@ -1,9 +1,9 @@
-"""A sandbox for strangers' content: one child that parses it, within limits of memory, time and files.
+"""Sandbox for untrusted files: one child process parses them within limits of memory, time and open files.
 
-A file of some bytes can ask for gigabytes, or for ever, and no parser says so before it has begun. The child parses;
-what it returns has a size and has come to an end. It is started when it is asked, serves until nobody asks for a while
-or this process ends, and is started again where a file was the end of it. Memory and computing time are limited where
-the system can do that (Linux; macOS limits the time alone); elsewhere a file that does not end is given up after WAIT.
+A file of a few bytes can demand gigabytes or never end, and no parser can tell beforehand. The child is started on
+demand, serves until it is idle for IDLE_S or this process ends, and is restarted when a file was its end. Memory and
+processor time are limited where the system allows it (Linux; macOS limits the time only). Elsewhere a file that does
+not end is given up after MAX_WALL_FACTOR times its processor time.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from itertools import islice
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from gaponet.base import child
+from gaponet.base.child_process import module_command
 from gaponet.base.errors import GAPONetError
 
 try:
@@ -35,125 +35,126 @@ except ImportError:  # Windows
     resource = None  # type: ignore[assignment]
 
 T = TypeVar("T")
-MEMORY = 960 << 20  # bytes of the child, with what it loads
-SECONDS = 6.0  # of computing, and more of it for a larger file
-WAIT = 20.0  # times as long as that on a machine that others use too, before a child that does not compute is ended
-FILES = 256  # open ones
-MOST = 5000  # files around a model whose sizes are added
-REST = 20.0  # s after which a child that nobody asks ends
-IDLE = "ended, as nobody asked"
-# One thread and the system's allocator: what others reserve counts as memory that is used.
-KEPT = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", "TEMP", "TMP", "TMPDIR", "LD_LIBRARY_PATH")
-OWN = {
+MEMORY_BYTES = 960 << 20  # of the child, with the libraries that it loads
+PROCESSOR_S = 6.0  # for a small file
+MAX_WALL_FACTOR = 20.0  # wall time over processor time, on a machine with other work
+MAX_OPEN_FILES = 256
+MAX_FILES_BESIDE_MODEL = 5000  # whose sizes count
+IDLE_S = 20.0
+IDLE = "the child was idle and ended"
+# One thread and the system's allocator: what other allocators reserve counts as memory in use.
+INHERITED_VARIABLES = ("PATH", "HOME", "LANG", "LC_ALL", "SYSTEMROOT", "TEMP", "TMP", "TMPDIR", "LD_LIBRARY_PATH")
+CHILD_VARIABLES = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
-HEAD = struct.Struct("<Q")
+SIZE = struct.Struct("<Q")
 
 
-def inside(
-    error: type[GAPONetError], library: str, pace: float = 1.0
+def sandboxed(
+    error: type[GAPONetError], library: str, seconds_per_mb: float = 1.0
 ) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """A function of a module whose first argument is a stranger's file: it runs in the sandbox, with plain arguments.
+    """Decorate a module's function, whose first argument is an untrusted file, to run in the sandbox.
 
-    What it raises is raised here; where the child ends of it, or wants more than it may have, `error` says which file.
+    Arguments and results are pickled. An exception of the function is raised in the caller.
 
     Args:
-        error: How the caller is told.
-        library: What parses, which is imported before time and memory count.
-        pace: s of computing that it may take for a MB.
+        error: Raised if the child ends or exceeds a limit; the message names the file.
+        library: The parser, imported before time and memory count.
+        seconds_per_mb: Additional processor time, s per MB of the file.
     """
 
     def wrap(function: Callable[..., T]) -> Callable[..., T]:
         @functools.wraps(function)
-        def call(file: Path, *given: Any) -> T:
-            whole = Path(os.path.abspath(file))
-            return _called(function, error, SECONDS + 1e-6 * pace * _size(whole), whole, file, given)
+        def call(file: Path, *arguments: Any) -> T:
+            path = Path(os.path.abspath(file))
+            return _run(function, error, PROCESSOR_S + 1e-6 * seconds_per_mb * _size(path), path, file, arguments)
 
-        call.inside = function, library  # type: ignore[attr-defined]
+        call.sandboxed = function, library  # type: ignore[attr-defined]
         return call
 
     return wrap
 
 
-def here() -> bool:
-    """Whether this process is the sandbox."""
-    return _Child.here
+def in_sandbox() -> bool:
+    """Return True in the child."""
+    return _Child.is_this_process
 
 
-def _called(
-    function: Callable[..., T], error: type[GAPONetError], seconds: float, whole: Path, file: Path, given: Any
+def _run(
+    function: Callable[..., T], error: type[GAPONetError], seconds: float, path: Path, file: Path, arguments: Any
 ) -> T:
-    if _Child.here:
-        return function(file, *given)
-    what = function.__module__, function.__name__, whole, file, given, seconds
+    if _Child.is_this_process:
+        return function(file, *arguments)
+    request = function.__module__, function.__name__, path, file, arguments, seconds
     with _LOCK:
-        found, said = _Child.open().ask(what, seconds)
-        if said == IDLE:
-            found, said = _Child.open().ask(what, seconds)
-    if said == "memory":
-        raise error(f"{file}: takes more than {MEMORY >> 20} MiB to be read, more than a file may; cut it")
-    if said == "time":
+        answer, failure = _Child.current_or_new().request(request, seconds)
+        if failure == IDLE:
+            answer, failure = _Child.current_or_new().request(request, seconds)
+    if failure == "memory":
+        raise error(f"{file}: takes more than {MEMORY_BYTES >> 20} MiB to be read, more than a file may; cut it")
+    if failure == "time":
         raise error(f"{file}: is not read after {seconds:.0f} s, longer than a file of its size may take; cut it")
-    if said:
-        raise error(f"{file}: is not readable ({said}); copy or make it again")
-    if isinstance(found, Exception):
-        raise found
-    return found
+    if failure:
+        raise error(f"{file}: is not readable ({failure}); copy or make it again")
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _size(path: Path) -> int:
-    """Bytes of a file, or of the files directly in a folder; of a model with those around it, which it names."""
+    """Return the bytes of a file or folder; a model counts with the files around it, which it may name."""
     with suppress(OSError):
         if path.is_dir() or path.suffix in (".xml", ".urdf"):
             folder = path if path.is_dir() else path.parent
-            return sum(f.stat().st_size for f in islice(folder.rglob("*"), MOST) if f.is_file())
+            return sum(f.stat().st_size for f in islice(folder.rglob("*"), MAX_FILES_BESIDE_MODEL) if f.is_file())
         return path.stat().st_size
     return 0
 
 
 class _Child:
-    """The child, seen from this process."""
+    """The child process, seen from its parent."""
 
-    here = False  # this process is one
+    is_this_process = False
     current: _Child | None = None
 
     def __init__(self) -> None:
-        kept = {name: os.environ[name] for name in KEPT if name in os.environ}
-        self.owner, self.process = os.getpid(), subprocess.Popen(
-            child.words(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-            cwd=tempfile.gettempdir(), env=kept | OWN,
+        inherited = {name: os.environ[name] for name in INHERITED_VARIABLES if name in os.environ}
+        self.owner = os.getpid()
+        self.process = subprocess.Popen(
+            module_command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            cwd=tempfile.gettempdir(), env=inherited | CHILD_VARIABLES,
         )  # fmt: skip
 
     @classmethod
-    def open(cls) -> _Child:
-        mine = cls.current
-        if mine is None or mine.owner != os.getpid() or mine.process.poll() is not None:
-            mine = cls.current = cls()
-        return mine
+    def current_or_new(cls) -> _Child:
+        child = cls.current
+        if child is None or child.owner != os.getpid() or child.process.poll() is not None:
+            child = cls.current = cls()
+        return child
 
-    def ask(self, what: Any, seconds: float) -> tuple[Any, str]:
-        """What the child answers, and "", or why it does not: memory, time, or in words."""
+    def request(self, request: Any, seconds: float) -> tuple[Any, str]:
+        """Return the answer and "", or None and the failure: "memory", "time", or a reason."""
         assert self.process.stdin
         assert self.process.stdout
-        late = threading.Timer(WAIT * seconds, self.process.kill)
-        late.start()
+        timeout = threading.Timer(MAX_WALL_FACTOR * seconds, self.process.kill)
+        timeout.start()
         try:
-            _write(self.process.stdin, what)
+            _write(self.process.stdin, request)
             return _read(self.process.stdout)
         except (EOFError, BrokenPipeError):
             code = self.process.wait()
             if code == 0:
                 return None, IDLE
-            timed = code == -getattr(signal, "SIGXCPU", 0) or not late.is_alive()
-            return None, "time" if timed else f"its parser ended with code {code}: damaged, or too large"
-        except BaseException:  # an answer that nobody took is not the next one's
+            timed_out = code == -getattr(signal, "SIGXCPU", 0) or not timeout.is_alive()
+            return None, "time" if timed_out else f"its parser ended with code {code}: damaged, or too large"
+        except BaseException:  # an unread answer would be taken for the next one
             self.close()
             raise
         finally:
-            late.cancel()
+            timeout.cancel()
 
     def close(self) -> None:
         if self.owner == os.getpid():
@@ -170,87 +171,87 @@ def _close() -> None:
         _Child.current.close()
 
 
-def _write(stream: IO[bytes], what: Any) -> None:
-    """Pickled; large arrays lie behind it as they are."""
+def _write(stream: IO[bytes], value: Any) -> None:
+    """Write a pickle; large arrays follow it without a copy, which would count as the child's memory."""
     buffers: list[pickle.PickleBuffer] = []
-    parts: list[Any] = [pickle.dumps(what, 5, buffer_callback=buffers.append), *(b.raw() for b in buffers)]
-    stream.write(b"".join(HEAD.pack(n) for n in (len(parts), *(memoryview(part).nbytes for part in parts))))
+    parts: list[Any] = [pickle.dumps(value, 5, buffer_callback=buffers.append), *(b.raw() for b in buffers)]
+    stream.write(b"".join(SIZE.pack(n) for n in (len(parts), *(memoryview(part).nbytes for part in parts))))
     for part in parts:
         stream.write(part)
     stream.flush()
 
 
 def _read(stream: IO[bytes]) -> Any:
-    sizes = [_number(stream) for _ in range(_number(stream))]
-    text, *buffers = (_exactly(stream, size) for size in sizes)
+    sizes = [_read_size(stream) for _ in range(_read_size(stream))]
+    text, *buffers = (_read_exactly(stream, size) for size in sizes)
     return pickle.loads(text, buffers=buffers)
 
 
-def _number(stream: IO[bytes]) -> int:
-    return int(HEAD.unpack(_exactly(stream, HEAD.size))[0])
+def _read_size(stream: IO[bytes]) -> int:
+    return int(SIZE.unpack(_read_exactly(stream, SIZE.size))[0])
 
 
-def _exactly(stream: IO[bytes], size: int) -> bytearray:
-    whole = bytearray(size)
-    view, at = memoryview(whole), 0
-    while at < size:
-        got = stream.readinto(view[at:])  # type: ignore[attr-defined]
-        if not got:
+def _read_exactly(stream: IO[bytes], size: int) -> bytearray:
+    content = bytearray(size)
+    view, position = memoryview(content), 0
+    while position < size:
+        count = stream.readinto(view[position:])  # type: ignore[attr-defined]
+        if not count:
             raise EOFError
-        at += got
-    return whole
+        position += count
+    return content
 
 
 def _serve() -> None:
-    """The child: a request, an answer, until nobody asks."""
+    """Answer requests in the child until it is idle."""
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is no answer
-    _Child.here = True
-    while os.name == "nt" or select.select([0], [], [], REST)[0]:
+    os.dup2(2, 1)  # a library may print; that is no answer
+    _Child.is_this_process = True
+    while os.name == "nt" or select.select([0], [], [], IDLE_S)[0]:
         try:
-            module, name, whole, file, given, seconds = _read(sys.stdin.buffer)
+            module, name, path, file, arguments, seconds = _read(sys.stdin.buffer)
         except EOFError:
             return
         try:
-            function, library = getattr(import_module(module), name).inside
+            function, library = getattr(import_module(module), name).sandboxed
             import_module(library)
-            _limit(seconds)
-            _write(out, _answer(function, whole, file, given))
+            _set_limits(seconds)
+            _write(out, _answer(function, path, file, arguments))
         except ImportError as error:  # an extra that is not installed
             _write(out, (error, ""))
         except MemoryError:
             _write(out, (None, "memory"))
 
 
-def _answer(function: Callable[..., Any], whole: Path, file: Path, given: tuple[Any, ...]) -> tuple[Any, str]:
+def _answer(function: Callable[..., Any], path: Path, file: Path, arguments: tuple[Any, ...]) -> tuple[Any, str]:
     try:
-        return function(whole, *given), ""
+        return function(path, *arguments), ""
     except (MemoryError, ImportError):
         raise
     except GAPONetError as error:
-        return type(error)(str(error).replace(str(whole), str(file))), ""
+        return type(error)(str(error).replace(str(path), str(file))), ""
     except Exception as error:
         return None, f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
 
 
-def _limit(seconds: float) -> None:
-    """For what comes now: what the limits count so far is not its own."""
+def _set_limits(seconds: float) -> None:
+    """Limit what the next request may use, beyond what the child has used already."""
     if resource is None:
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
-    _lower(resource.RLIMIT_CPU, int(used.ru_utime + used.ru_stime + seconds + 1))
-    _lower(resource.RLIMIT_CORE, 0)
-    _lower(resource.RLIMIT_FSIZE, MEMORY)
-    _lower(resource.RLIMIT_NOFILE, FILES)
-    with suppress(OSError):  # /proc is Linux's
-        counts = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
-        resident, private = (int(counts[name].split()[0]) << 10 for name in ("VmRSS", "VmData"))
-        _lower(resource.RLIMIT_DATA, private + max(MEMORY - resident, 0))
+    _set_limit(resource.RLIMIT_CPU, int(used.ru_utime + used.ru_stime + seconds + 1))
+    _set_limit(resource.RLIMIT_CORE, 0)
+    _set_limit(resource.RLIMIT_FSIZE, MEMORY_BYTES)
+    _set_limit(resource.RLIMIT_NOFILE, MAX_OPEN_FILES)
+    with suppress(OSError):  # /proc exists on Linux only
+        status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+        resident, private = (int(status[name].split()[0]) << 10 for name in ("VmRSS", "VmData"))
+        _set_limit(resource.RLIMIT_DATA, private + max(MEMORY_BYTES - resident, 0))
 
 
-def _lower(which: int, soft: int) -> None:
-    _, hard = resource.getrlimit(which)
-    resource.setrlimit(which, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+def _set_limit(kind: int, soft: int) -> None:
+    _, hard = resource.getrlimit(kind)
+    resource.setrlimit(kind, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What a file says becomes a value of a stated type here, or one line that names the file and the field.
+"""Validation of file contents: a value of the stated type, or a one-line error with the file and the field.
 
-A structure is a dataclass or a TypedDict; ranges and sizes stand in its annotations (annotated_types: Ge, Interval,
-Len). pydantic checks it, strictly: no text for a number, no NaN or infinity unless the annotation says so, no unknown
-field unless the caller keeps those. Nothing outside this module asks pydantic.
+A type is a dataclass or a TypedDict; its annotations hold ranges and sizes (annotated_types: Ge, Interval, Len).
+pydantic validates strictly: no text for a number, no NaN or infinity unless the annotation allows it, no unknown field
+unless the caller allows it. Only this module uses pydantic.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from typing_extensions import TypedDict
 from gaponet.base.errors import GAPONetError, UsageError
 
 T = TypeVar("T")
-LARGEST = 64 << 20  # bytes of a document that is read at once; ours have kilobytes
-LARGEST_ARRAYS = 512 << 20  # bytes of the arrays of one file
+MAX_DOCUMENT_BYTES = 64 << 20  # of a document that is read at once; gaponet's own have kilobytes
+MAX_ARRAYS_BYTES = 512 << 20  # of the arrays in one file
 
 
 def _name(text: str) -> str:
@@ -54,140 +54,135 @@ class _Format(TypedDict):
     format: int
 
 
-Name = Annotated[str, AfterValidator(_name)]  # of something that may become the name of a file
+Name = Annotated[str, AfterValidator(_name)]  # may become the name of a file
 Sha256 = Annotated[str, AfterValidator(_hex)]
 Count = Annotated[int, Interval(ge=0, le=10**15)]
 Angle = Annotated[float, Interval(ge=-1e3, le=1e3)]  # rad
 Extended = Annotated[float, AllowInfNan(True), Interval(ge=-math.inf, le=math.inf)]  # infinity too, but no NaN
-# What was measured; None, in a file, where there was nothing to measure.
+# A measured number; in a file, None stands for a missing one.
 Number = Annotated[Annotated[float, AllowInfNan(True)] | None, AfterValidator(lambda x: math.nan if x is None else x)]
-Json = Annotated[Any, AfterValidator(_all_finite)]  # whatever JSON can say in finite numbers
+Json = Annotated[Any, AfterValidator(_all_finite)]  # any JSON value with finite numbers
 
 
 def validated(
-    kind: type[T], data: Any, where: str | Path, error: type[GAPONetError], hint: str = "", more: bool = False
+    kind: type[T], data: Any, where: str | Path, error: type[GAPONetError], hint: str = "", allow_extra: bool = False
 ) -> T:
-    """Plain data (dict, list, text, numbers) as a value of type `kind`.
+    """Convert plain data (dict, list, text, numbers) to a value of type `kind`.
 
     Args:
-        kind: Dataclass, TypedDict, or anything else that pydantic knows, such as dict[str, float].
-        hint: What to do about it, for the error.
-        more: Keep fields that a TypedDict does not name, instead of refusing them.
+        kind: Dataclass, TypedDict, or any other type that pydantic supports, such as dict[str, float].
+        where: Source of the data, for the error.
+        error: Class of the error.
+        hint: What the user can do, for the error.
+        allow_extra: Keep fields that a TypedDict does not name, instead of refusing them.
 
     Raises:
-        error: The error to raise, with file, field, what is wrong with it, and the hint.
+        error: It names the source, the field, what is wrong, and the hint.
     """
     try:
         text = to_json(data, inf_nan_mode="constants")
-    except (PydanticSerializationError, ValueError) as found:  # half a surrogate pair, lists without end
-        raise error(_line(where, str(found), hint)) from None
-    return parse_json(kind, text, where, error, hint, more)
+    except (PydanticSerializationError, ValueError) as invalid:  # unpaired surrogates, recursive lists
+        raise error(_message(where, str(invalid), hint)) from None
+    return parse_json(kind, text, where, error, hint, allow_extra)
 
 
 def parse_json(
-    kind: type[T], text: bytes | str, where: str | Path, error: type[GAPONetError], hint: str = "", more: bool = False
+    kind: type[T],
+    text: bytes | str,
+    where: str | Path,
+    error: type[GAPONetError],
+    hint: str = "",
+    allow_extra: bool = False,
 ) -> T:
-    """JSON text as a value of type `kind`; arguments and error as of `validated`."""
+    """Convert JSON text to a value of type `kind`; arguments and error as for `validated`."""
     try:
-        value = _checker(cast("Any", kind)).validate_json(text, extra="allow" if more else "forbid")
-    except ValidationError as found:
-        raise error(_line(where, _first(found), hint)) from None
-    except GAPONetError as found:  # a dataclass's own rule
-        raise error(_line(where, str(found), hint)) from None
+        value = _type_adapter(cast("Any", kind)).validate_json(text, extra="allow" if allow_extra else "forbid")
+    except ValidationError as invalid:
+        raise error(_message(where, _first_error(invalid), hint)) from None
+    except GAPONetError as invalid:  # raised by __post_init__
+        raise error(_message(where, str(invalid), hint)) from None
     if value is None:
-        raise error(_line(where, "holds nothing (null)", hint))
+        raise error(_message(where, "holds nothing (null)", hint))
     return value
 
 
-def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", more: bool = False) -> T:
-    """A JSON file as a value of type `kind`; arguments and error as of `validated`."""
-    return parse_json(kind, content(path, error, hint), path, error, hint, more)
+def read_json(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "", allow_extra: bool = False) -> T:
+    """Read a JSON file as a value of type `kind`; arguments and error as for `validated`."""
+    return parse_json(kind, read_limited(path, error, hint), path, error, hint, allow_extra)
 
 
 def read_format(kind: type[T], path: Path, newest: int, error: type[GAPONetError], hint: str = "") -> T:
-    """A JSON file whose "format" is a whole number up to `newest`, with fields that `kind` does not name kept."""
-    table = read_json(_Format, path, error, hint, more=True)
+    """Read a JSON file with a "format" of at most `newest`; fields that `kind` does not name are kept."""
+    table = read_json(_Format, path, error, hint, allow_extra=True)
     if table["format"] > newest:
         raise error(f"{path}: format {table['format']} is newer than this gaponet reads ({newest}); upgrade gaponet")
-    return validated(kind, table, path, error, hint, more=True)
+    return validated(kind, table, path, error, hint, allow_extra=True)
 
 
 def read_toml(kind: type[T], path: Path, error: type[GAPONetError], hint: str = "") -> T:
-    """A TOML file as a value of type `kind`; arguments and error as of `validated`."""
+    """Read a TOML file as a value of type `kind`; arguments and error as for `validated`."""
     try:
-        table = tomllib.loads(content(path, error, hint).decode())
-    except (ValueError, RecursionError) as found:  # not TOML, not UTF-8, a number of 5,000 digits
-        raise error(_line(path, f"not valid TOML: {found}", hint)) from None
+        table = tomllib.loads(read_limited(path, error, hint).decode())
+    except (ValueError, RecursionError) as invalid:  # not TOML, not UTF-8, a number of 5,000 digits
+        raise error(_message(path, f"not valid TOML: {invalid}", hint)) from None
     return validated(kind, table, path, error, hint)
 
 
 def load_toml(kind: str, folder: Path, name_or_path: str | Path) -> tuple[Path, dict[str, Any]]:
-    """Path and table of folder/NAME.toml, which the package ships, or of the file at a path.
+    """Read folder/NAME.toml of the package, or the TOML file at a path; returns path and table.
 
     Args:
-        kind: What it is, for messages: "recipe".
+        kind: Noun for messages, such as "recipe".
 
     Raises:
-        UsageError: No such file, or not TOML.
+        UsageError: There is no such file, or it is not TOML.
     """
     path = folder / f"{name_or_path}.toml"
     if not path.is_file():
         path = Path(name_or_path)
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise UsageError(f"no {kind} '{name_or_path}': in the package are {known}; or give a .toml file")
+        names = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
+        raise UsageError(f"no {kind} '{name_or_path}': in the package are {names}; or give a .toml file")
     return path, read_toml(dict[str, Any], path, UsageError)
 
 
 def read_npz(path: Path, error: type[GAPONetError], hint: str = "") -> dict[str, np.ndarray]:
-    """The arrays of an .npz file, by name; nothing pickled is ever loaded."""
+    """Read the arrays of an .npz file by name; pickled objects are refused."""
     if not path.is_file():
-        raise error(_line(path, "is missing, or not a file", hint))
+        raise error(_message(path, "is missing, or not a file", hint))
     try:
         with zipfile.ZipFile(path) as packed:
-            if sum(part.file_size for part in packed.infolist()) > LARGEST_ARRAYS:
-                raise error(_line(path, f"unpacks to more than {LARGEST_ARRAYS >> 20} MiB", hint))
+            if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
+                raise error(_message(path, f"unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB", hint))
         with np.load(path, allow_pickle=False) as file:
             return {name: np.asarray(file[name]) for name in file.files}
-    # NumPy reads a header as Python text; zipfile raises what zlib and struct do.
+    # NumPy parses a header as Python text; zipfile passes on errors of zlib and struct.
     except (
-        OSError,
-        ValueError,
-        KeyError,
-        EOFError,
-        MemoryError,
-        SyntaxError,
-        TypeError,
-        NotImplementedError,
-        OverflowError,
-        RuntimeError,
-        tokenize.TokenError,
-        struct.error,
-        zlib.error,
-        zipfile.BadZipFile,
-    ) as found:
-        reason = " ".join(str(found).split())[:120] or type(found).__name__
-        raise error(_line(path, f"not readable ({reason})", hint)) from None
+        OSError, ValueError, KeyError, EOFError, MemoryError, SyntaxError, TypeError, NotImplementedError,
+        OverflowError, RuntimeError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile,
+    ) as invalid:  # fmt: skip
+        reason = " ".join(str(invalid).split())[:120] or type(invalid).__name__
+        raise error(_message(path, f"not readable ({reason})", hint)) from None
 
 
-def content(path: Path, error: type[GAPONetError], hint: str = "", largest: int = LARGEST) -> bytes:
-    """The bytes of a file; refuses what is none (a folder, a pipe) and what has more than `largest`."""
+def read_limited(path: Path, error: type[GAPONetError], hint: str = "", max_bytes: int = MAX_DOCUMENT_BYTES) -> bytes:
+    """Read a file; refuses folders, pipes and files of more than `max_bytes`."""
     if not path.is_file():
-        raise error(_line(path, "is missing, or not a file", hint))
-    if path.stat().st_size > largest:
-        raise error(_line(path, f"has more than {largest >> 20} MiB", hint))
+        raise error(_message(path, "is missing, or not a file", hint))
+    if path.stat().st_size > max_bytes:
+        raise error(_message(path, f"has more than {max_bytes >> 20} MiB", hint))
     return path.read_bytes()
 
 
 @functools.cache
-def _checker(kind: Any) -> Any:
-    # pydantic takes no configuration for a dataclass itself, but hands that of a union on to its members.
+def _type_adapter(kind: Any) -> Any:
+    # pydantic accepts no configuration for a dataclass, but passes that of a union on to its members.
     return TypeAdapter(kind | None, config=ConfigDict(strict=True, allow_inf_nan=False))
 
 
-def _first(found: Any) -> str:
-    """The first complaint: field, reason, what was there; and how many more there are."""
-    errors = found.errors(include_url=False)
+def _first_error(invalid: ValidationError) -> str:
+    """Describe the first error (field, reason, value) and count the others."""
+    errors = invalid.errors(include_url=False)
     kind, given = errors[0]["type"], errors[0]["input"]
     field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in errors[0]["loc"]).lstrip(".")
     reason = errors[0]["msg"].removeprefix("Input ").removeprefix("Value error, ").rstrip(".")
@@ -201,5 +196,5 @@ def _first(found: Any) -> str:
     return f"{field}{': ' if field else ''}{reason}{rest}"
 
 
-def _line(where: str | Path, reason: str, hint: str) -> str:
+def _message(where: str | Path, reason: str, hint: str) -> str:
     return f"{where}: {reason}" + (f"; {hint}" if hint else "")

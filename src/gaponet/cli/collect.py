@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out
 
@@ -45,7 +45,7 @@ def collect(
     spec, screen = load_robot(robot), Out(json)
     plan = recording.load_recipe(recipe)
     plan = replace(plan, payloads=payloads or plan.payloads, units=units or plan.units)
-    with bar("virtual recordings") as update:
+    with progress_bar("virtual recordings") as update:
         done = recording.collect(
             spec,
             load_fleet(fleet, spec),

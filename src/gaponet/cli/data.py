@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Logs, Robot, Source
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
@@ -34,7 +34,7 @@ def _card(
     stated = {k: v for k, v in (("licence", licence), ("source", source)) if v is not None}
     if stated:
         data.state(**stated)
-    with bar("reading") as update:
+    with progress_bar("reading") as update:
         made = make_card(data, update)
     _show_card(out, made)
     if data.read_only:
@@ -63,7 +63,7 @@ def _split(
 
     out, data = Out(json), Dataset(dataset)
     parts = make_split(data, by, holdout)
-    with bar("comparing") as update:
+    with progress_bar("comparing") as update:
         require_distinct_samples(data, parts, update)
     path = write_split(data, parts, by, holdout)
     rows: dict[str, dict[str, Any]] = {part: count(entries) | _members(entries) for part, entries in parts.items()}
@@ -95,7 +95,7 @@ def _figures(
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
-    with bar("drawing") as update:
+    with progress_bar("drawing") as update:
         written, left_out = draw_all(data, spec, out, update)
     for path in written:
         screen.say(f"written: {path!s}")
@@ -121,7 +121,7 @@ def _export(
 
     screen = Out(json)
     data, spec = open_dataset(dataset, robot)
-    with bar("exporting") as update:
+    with progress_bar("exporting") as update:
         sets = export(data, spec, out, to, update)
     shown = sets[:20]
     screen.table(f"{out!s}: {to}", ["set", "episodes", "frames", "fps"], [

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gaponet import api
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.gap import show_methods
 from gaponet.cli.identify import identify
 from gaponet.cli.options import Json
@@ -72,7 +72,7 @@ def demo(
             run = known
     found = api.evaluate(run, str(dataset)).result
     show_methods(screen, found, ("joint", "payload"))
-    with bar("report") as update:
+    with progress_bar("report") as update:
         path = write_report(run, progress=update, picture=portrait)
     for sentence in verdict(found["methods"]):
         screen.say(sentence)

@@ -76,7 +76,7 @@ def _next(
     screen: Out, spec: RobotSpec, seconds: float, payloads: tuple[float, ...], seed: int
 ) -> tuple[Plan, dict[str, Any]]:
     """Motions that tell most beside the logs, and what they would."""
-    from gaponet.base.progress import bar
+    from gaponet.base.progress import progress_bar
     from gaponet.sysid.knowledge import Knowledge
     from gaponet.sysid.motion.library import Library
     from gaponet.sysid.motion.plan import Plan
@@ -87,7 +87,7 @@ def _next(
         raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or adapt it again")
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
         raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
-    with bar("looking for motions") as update:
+    with progress_bar("looking for motions") as update:
         motions = candidates(Library(spec, seed, payloads[-1]), update)
     pairs = [(mass, motion) for mass in payloads for motion in motions]
     told = Telling.of(spec, mine, [s for mass in payloads for s in expected(spec, motions, mass)])

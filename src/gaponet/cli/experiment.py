@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 import tyro
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.progress import bar, bars
+from gaponet.base.progress import progress_bar, progress_bars
 from gaponet.cli.out import Out, writes
 from gaponet.experiments.compare import Compare, identified
 from gaponet.experiments.data import Data
@@ -58,7 +58,7 @@ def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
         f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
         + (f"; the others take {rest}, {study.at_once} at a time" if todo else "")
     )
-    return bars("trainings", todo)
+    return progress_bars("trainings", todo)
 
 
 def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
@@ -80,7 +80,7 @@ def _prepared(question: Compare, study: Study) -> Study:
         raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
     for word in question.models:
         parse_variant(word, study.config)
-    with bar("identifying") as update:
+    with progress_bar("identifying") as update:
         return identified(study, update)
 
 
@@ -102,7 +102,7 @@ def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options
         runs, part, out = question.played(cells), study.data, study.out
     how = out, options.quick, study, tuple(cells)
     session = Session.of(question, part, data, robot.nominal or robot, runs, *how)
-    with bar("playing") as update:
+    with progress_bar("playing") as update:
         result = question.play(session, lambda what, share: update(share, 1.0, what))
     show_result(result, out, screen)
 

@@ -88,7 +88,7 @@ def export(
 def _made(
     robot: Path, to: str, folder: Path, data: str | None, into: Path | None, prefix: str, payload_mass: float
 ) -> Exported:
-    from gaponet.base.progress import bar
+    from gaponet.base.progress import progress_bar
     from gaponet.export.folder import export_networks, export_robot
     from gaponet.export.forms import recordings_of
     from gaponet.nn.artifact import GapModel
@@ -97,7 +97,7 @@ def _made(
         return export_networks(GapModel.load(robot), robot, folder, data, payload_mass)
     spec = load_robot(_simulator(robot))
     recordings = recordings_of(_simulator(robot), data, spec)
-    with bar("fitting without the law") as update:
+    with progress_bar("fitting without the law") as update:
         return export_robot(spec, to, folder, recordings, into, prefix, payload_mass, update)
 
 

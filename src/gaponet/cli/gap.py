@@ -7,7 +7,7 @@ from typing import Any
 
 from gaponet import api
 from gaponet.base.executor import LOCAL
-from gaponet.base.spread import Table
+from gaponet.base.result_table import ResultTable
 from gaponet.cli.options import Json, Motions, Robot, Source, like
 from gaponet.cli.out import Out
 from gaponet.report.methods import title
@@ -63,7 +63,7 @@ def show_methods(out: Out, result: dict[str, Any], groups: tuple[str, ...] = GRO
         result["robot"],
     )
     whole = totals(methods)
-    out.show("Totals", Table(whole.name, whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
+    out.show("Totals", ResultTable(whole.name, whole.columns[:SHOWN], tuple(row[:SHOWN] for row in whole.rows)))
     ran = result.get("simulators", {})
     if len(set(ran.values())) > 1:
         out.say("; ".join(f"{title(name)} {simulator}" for name, simulator in ran.items()), "ran in: ")

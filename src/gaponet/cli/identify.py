@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from gaponet import api
-from gaponet.base.text import measured
+from gaponet.base.text import format_uncertainty
 from gaponet.cli.options import Flag, Json, Robot, Source, like
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad
@@ -161,4 +161,4 @@ def _tell(screen: Out, found: Identified, errors: dict[str, np.ndarray], details
 def _cell(value: float | None, std: float | None, factor: float) -> str:
     if value is None:
         return ""
-    return measured(value * factor, std * factor) if std else f"{value * factor:.3g}"
+    return format_uncertainty(value * factor, std * factor) if std else f"{value * factor:.3g}"

@@ -47,11 +47,11 @@ def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
     for line in sentences(known):
         screen.say(line)
     if out is not None:
-        from gaponet.base.files import whole
+        from gaponet.base.files import atomic_write
 
         if out.suffix not in (".png", ".svg"):
             raise UsageError(f"--out {out}: a picture is a .png or an .svg")
-        with whole(out) as temporary:
+        with atomic_write(out) as temporary:
             picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
         screen.say(f"picture: {out}")
     screen.result({
@@ -153,10 +153,10 @@ def fleet(
         workers: Robots at a time; 0 for as many as there are cores.
     """
     from gaponet import fleet as known
-    from gaponet.base.progress import bar
+    from gaponet.base.progress import progress_bar
 
     screen, when, found = Out(json), night or date.today().isoformat(), dict[str, known.Night]()
-    with bar("checking") as update:
+    with progress_bar("checking") as update:
         for name, mine, count in known.night(robots, logs, out, when, adapt, payload_mass, executor, workers):
             found[name] = mine
             update(len(found), count, f"{name}: {mine['verdict']}")

@@ -10,7 +10,7 @@ import tyro
 
 from gaponet import api
 from gaponet.base.errors import UsageError
-from gaponet.base.files import writing
+from gaponet.base.files import lock_folder
 from gaponet.cli.options import Flag, Json, Logs, Source, like
 from gaponet.cli.out import Out
 from gaponet.data.signals import FAST
@@ -122,7 +122,7 @@ def doctor(
     if figures is not None:
         from gaponet.report.figures.draw_findings import draw_findings
 
-        with writing(figures, "figures"):
+        with lock_folder(figures, "figures"):
             drawn = draw_findings(data, spec, diagnosis.findings, figures)
         out.say(f"{len(drawn)} pictures written: {figures!s}")
     out.say(f"next: gaponet doctor {dataset} --fix" if diagnosis.count("error") else f"next: gaponet gap {dataset}")

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import GAPONetError, UsageError, missing_extra
-from gaponet.base.text import plain
+from gaponet.base.text import escape
 from gaponet.plugins import load
 
 # Task → commands.
@@ -138,5 +138,5 @@ def _purpose(where: str) -> str:
 
 def _say(text: str) -> int:
     """An error in one line, and its exit code."""
-    print(plain(text), file=sys.stderr)
+    print(escape(text), file=sys.stderr)
     return 2

@@ -14,10 +14,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gaponet.base.files import writing
-from gaponet.base.json_file import finite
-from gaponet.base.spread import Table as ResultTable
-from gaponet.base.text import plain
+from gaponet.base.files import json_compatible, lock_folder
+from gaponet.base.result_table import ResultTable as ResultTable
+from gaponet.base.text import escape
 
 if TYPE_CHECKING:
     from gaponet.robot.finding import Finding
@@ -45,20 +44,22 @@ class Out:
 
     def say(self, text: str, start: str = "", style: str = "bold") -> None:
         """A line for people; `start` stands before the text, in this style. Neither is markup, whatever it holds."""
-        self.console.print(Text.assemble((plain(start), style), plain(text)), soft_wrap=True)
+        self.console.print(Text.assemble((escape(start), style), escape(text)), soft_wrap=True)
 
     def table(self, title: str, columns: list[str], rows: Iterable[list[str]]) -> None:
         """A table for people; the first column is text, the others are right-aligned numbers, which are never cut."""
-        lines = [[plain(cell) for cell in row] for row in rows]
-        table = Table(title=Text(plain(title)), title_justify="left", title_style="bold")
+        lines = [[escape(cell) for cell in row] for row in rows]
+        table = Table(title=Text(escape(title)), title_justify="left", title_style="bold")
         for i, column in enumerate(columns):
             cells = [line[i] for line in lines]
             if i == 0:
-                table.add_column(Text(plain(column)), overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL)
-            else:
-                words = [len(word) for cell in (plain(column), *cells) for word in cell.split()]
                 table.add_column(
-                    Text(plain(column)), overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER)
+                    Text(escape(column)), overflow="fold", no_wrap=max(map(len, cells), default=0) <= LABEL
+                )
+            else:
+                words = [len(word) for cell in (escape(column), *cells) for word in cell.split()]
+                table.add_column(
+                    Text(escape(column)), overflow="fold", justify="right", min_width=min(max(words, default=1), NUMBER)
                 )
         for line in lines:
             table.add_row(*map(Text, line))
@@ -76,7 +77,7 @@ class Out:
     def result(self, value: dict[str, Any]) -> None:
         """The command's result as one JSON object; nothing without --json."""
         if self.as_json:
-            json.dump(finite(value), sys.stdout, ensure_ascii=False, allow_nan=False)
+            json.dump(json_compatible(value), sys.stdout, ensure_ascii=False, allow_nan=False)
             sys.stdout.write("\n")
 
 
@@ -89,7 +90,7 @@ def writes(kind: str) -> Callable[[Command], Command]:
             given = inspect.signature(command).bind(*args, **kwargs)
             given.apply_defaults()
             out = given.arguments["out"]
-            with nullcontext() if out is None else writing(out, kind):
+            with nullcontext() if out is None else lock_folder(out, kind):
                 return command(*args, **kwargs)
 
         return cast("Command", held)

@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet import api
 from gaponet.base.errors import UsageError
-from gaponet.base.files import whole, write_text
+from gaponet.base.files import atomic_write, write_text
 from gaponet.cli.options import Json, Logs
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
@@ -110,5 +110,5 @@ def _keep(out: Path, found: list[Answer], robot: RobotSpec) -> None:
         series = {"target": a.target, "rollout": a.rollout, "robot": a.robot}
         series |= {"low": a.robot - a.half, "high": a.robot + a.half, "dt": np.array(a.dt)}
         held |= {f"{name}_{k}": values for name, values in series.items()}
-    with whole(out) as temporary, temporary.open("wb") as file:
+    with atomic_write(out) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **held)

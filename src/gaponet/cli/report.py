@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.gap import show_verdict
 from gaponet.cli.options import Json, Known, Robot
 from gaponet.cli.out import Out
@@ -25,7 +25,7 @@ def report(
     from gaponet.report.report import write_report
 
     out = Out(json)
-    with bar("report") as update:
+    with progress_bar("report") as update:
         path = write_report(run, dataset, also, robot, update, portrait)
     out.say(f"report: {path}")
     metrics = read_metrics(run)

@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Json, Model
 from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, as_option, available, load_robot
@@ -144,7 +144,7 @@ def _picture(made: Made, label: str, still: Callable[..., bytes]) -> Path:
 
     path = made.robot.folder / "picture.png"
     png = still([(label, made.vendor, made.pose), ("robot.xml", build_model(made.robot), made.robot.qpos_home)])
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(png)
     return path
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from gaponet.base.text import without_credentials
+from gaponet.base.text import remove_credentials
 from gaponet.cli.options import Flag, Folder, Json, like
 from gaponet.cli.out import Out
 from gaponet.share import move
@@ -21,7 +21,7 @@ def push(
 ) -> None:  # fmt: skip
     """Put a dataset or a run onto the Hugging Face Hub or a bucket."""
     screen = Out(json)
-    moved, shown = move.push(path, address, private, replace, prune), without_credentials(address)
+    moved, shown = move.push(path, address, private, replace, prune), remove_credentials(address)
     screen.say(f" of {moved.files} files, {moved.size / 1e6:,.1f} MB, is now at {shown}", moved.kind)
     if prune:
         screen.say(f"{moved.pruned} files of earlier pushes were deleted")

@@ -18,8 +18,7 @@ from typing_extensions import TypedDict
 
 from gaponet import api
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text, writing
-from gaponet.base.json_file import write_json
+from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import read_json
 from gaponet.cli.logs import joint_map, show_diagnosis
 from gaponet.cli.main import COMMANDS, main
@@ -158,7 +157,7 @@ def start(
             for line in lines:
                 screen.say(line, "  ")
         else:
-            with writing(out, "started"):
+            with lock_folder(out, "started"):
                 if found.described:
                     write_text(told, found.described)
                     files[f"{out.name}/logs.toml"] = _sha256(told)

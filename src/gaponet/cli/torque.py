@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.base.errors import NoGainError
-from gaponet.base.json_file import write_json
-from gaponet.base.text import measured
+from gaponet.base.files import write_json
+from gaponet.base.text import format_uncertainty
 from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.data.split import split_entries
@@ -74,9 +74,12 @@ def _tell(screen: Out, found: Driven, spec: RobotSpec, current: bool, virtual: s
     for j, name in enumerate(spec.operated):
         i = spec.operated_index[j]
         values = {f: float(getattr(found.robot, f)[i]) for f in TERMS}
-        cells = [measured(k * values[f], k * found.std[name][f]) if values[f] else "0" for f, (_, k) in UNITS.items()]
+        cells = [
+            format_uncertainty(k * values[f], k * found.std[name][f]) if values[f] else "0"
+            for f, (_, k) in UNITS.items()
+        ]
         rows.append([name, *cells, f"{1e3 * found.robot.delay[i]:.0f}", f"{found.bias[j]:+.2g}",
-                     *([measured(float(found.constant[j]), found.std[name]["constant"])] if current else []),
+                     *([format_uncertainty(float(found.constant[j]), found.std[name]["constant"])] if current else []),
                      *(f"{x[j]:.3g}" for x in found.torque)])  # fmt: skip
     columns = ["joint", *(title for title, _ in UNITS.values()), "delay, ms", "bias, N·m"]
     columns += ["N·m per unit"] * current + ["torque apart before, N·m", "after"]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaponet.base.errors import UsageError
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Flag, Json, Robot
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
@@ -73,7 +73,7 @@ def view(
     out = Out(json)
     data, spec = open_dataset(dataset, robot)
     entry = pick(data, model if spec.nominal is None else (*model, spec.folder), motion, unit, payload_mass)
-    with bar("replaying") as update:
+    with progress_bar("replaying") as update:
         shown = side_by_side(data, entry, spec, model, update)
     shown = shown.only(tuple(n for n in show if n != "aligned" or model or spec.nominal is not None))
     clip = Clip.of(shown, start, duration, speed, fps)
@@ -123,6 +123,6 @@ def _film(scene: Scene, clip: Clip, path: Path, width: int, magnify: float, cour
     from gaponet.report.view.picture import Camera
 
     span = (clip.start, clip.stop)
-    with Camera(scene, width, clip.speed, magnify, course, span) as camera, bar("rendering") as update:
+    with Camera(scene, width, clip.speed, magnify, course, span) as camera, progress_bar("rendering") as update:
         pictures = write(camera, clip, path, lambda done, total: update(done, total, "pictures"))
     out.say(f"{path}: {pictures} picture{'s' * (pictures > 1)}, {path.stat().st_size / 1e6:.2f} MB")

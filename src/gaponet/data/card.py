@@ -13,7 +13,7 @@ from gaponet import __version__
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import write_text
-from gaponet.base.progress import Progress, silent
+from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
 from gaponet.data.log import UNITS
 from gaponet.data.repeatability import Repetitions
@@ -30,7 +30,7 @@ SHARES: dict[str, Callable[[Entry], str]] = {
 }
 
 
-def make_card(dataset: Dataset, progress: Progress = silent) -> dict[str, Any]:
+def make_card(dataset: Dataset, progress: Progress = no_progress) -> dict[str, Any]:
     """Read every sequence once, repetitions of a motion one after the other, and count.
 
     Raises:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from gaponet.base.spread import Table
-from gaponet.base.text import markdown
+from gaponet.base.result_table import ResultTable
+from gaponet.base.text import escape_markdown
 from gaponet.data.card import NOT_STATED
 
 TITLES = {"level": "Level", "payload_kg": "Payload, kg per hand", "unit": "Unit", "rate_hz": "Rate, Hz"}
@@ -17,7 +17,14 @@ ASK = "set with `gaponet data card DIR --{0} …`"
 def card_text(card: dict[str, Any]) -> str:
     """The card as Markdown; the first line says whether robots were virtual."""
     return "\n".join(
-        [f"# {markdown(headline(card))}", "", *_facts(card), *_shares(card), *_repeatability(card), *_signals(card)]
+        [
+            f"# {escape_markdown(headline(card))}",
+            "",
+            *_facts(card),
+            *_shares(card),
+            *_repeatability(card),
+            *_signals(card),
+        ]
     )
 
 
@@ -33,12 +40,12 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     total = card["total"]
     for name in ("licence", "source"):
         value = card[name]
-        yield f"- {name}: {markdown(value)}" + (f"; {ASK.format(name)}" if value == NOT_STATED else "")
+        yield f"- {name}: {escape_markdown(value)}" + (f"; {ASK.format(name)}" if value == NOT_STATED else "")
     recorded = card["recorded"]
     dates = recorded if isinstance(recorded, str) else " to ".join(dict.fromkeys(recorded))
-    yield f"- recorded: {markdown(dates)}"
+    yield f"- recorded: {escape_markdown(dates)}"
     if card["collected"]:
-        fleet, seed = (markdown(str(card["collected"].get(name))) for name in ("fleet", "seed"))
+        fleet, seed = (escape_markdown(str(card["collected"].get(name))) for name in ("fleet", "seed"))
         yield f"- made by gaponet collect: fleet {fleet}, seed {seed}"
     yield f"- {total['frames']:,} frames of {len(card['joints'])} joints, {total['motions']} motions"
     yield f"- {card['bytes'] / 1e6:,.1f} MB, dataset hash {card['dataset_hash']}, gaponet {card['gaponet']}"
@@ -47,10 +54,10 @@ def _facts(card: dict[str, Any]) -> Iterator[str]:
     yield ""
 
 
-def shares(card: dict[str, Any], by: str) -> Table:
+def shares(card: dict[str, Any], by: str) -> ResultTable:
     """How much there is, by one of TITLES."""
     rows = tuple((key, c["sequences"], c["hours"], c["frames"], c["motions"]) for key, c in card["shares"][by].items())
-    return Table(by, (TITLES[by], "sequences", "hours", "frames", "motions"), rows)
+    return ResultTable(by, (TITLES[by], "sequences", "hours", "frames", "motions"), rows)
 
 
 def _shares(card: dict[str, Any]) -> Iterator[str]:
@@ -80,7 +87,7 @@ def _repeatability(card: dict[str, Any]) -> Iterator[str]:
     rows = [(joint, *(_number(c["joints"].get(joint)) for c in channels.values())) for joint in joints]
     mean = ("mean", *(_number(c["mean"]) for c in channels.values()))
     heads = ("joint", *(f"{name}, {c['unit']}" for name, c in channels.items()))
-    yield from (Table("repeatability", heads, (*rows, mean)).markdown(), "")
+    yield from (ResultTable("repeatability", heads, (*rows, mean)).markdown(), "")
 
 
 def _signals(card: dict[str, Any]) -> Iterator[str]:
@@ -91,7 +98,7 @@ def _signals(card: dict[str, Any]) -> Iterator[str]:
         yield ""
         rows = tuple((joint, *map(_number, values.values())) for joint, values in signal["joints"].items())
         heads = ("joint", *(HEADS[k] for k in next(iter(signal["joints"].values()))))
-        yield from (Table(name, heads, rows).markdown(), "")
+        yield from (ResultTable(name, heads, rows).markdown(), "")
 
 
 def _number(value: float | None) -> str:

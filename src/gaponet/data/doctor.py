@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.errors import DatasetError
 from gaponet.base.executor import LOCAL
-from gaponet.base.progress import Progress, silent
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.checks import CHECKS
 from gaponet.data.checks.gravity import gravity
 from gaponet.data.checks.looked import Looked
@@ -61,7 +61,7 @@ class Diagnosis:
         cls,
         dataset: Dataset,
         robot: RobotSpec,
-        progress: Progress = silent,
+        progress: Progress = no_progress,
         model: Gravity | None = None,
         heights: Heights | None = None,
         simulator: str = "",

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import DatasetError, LogError, UsageError
-from gaponet.base.files import writing
-from gaponet.base.progress import Progress, silent
+from gaponet.base.files import lock_folder
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.formats import find_logs, read_logs
 from gaponet.data.holds import Holds
 from gaponet.data.log import Log, skipping
@@ -70,7 +70,7 @@ def import_logs(
     fmt: str | None = None,
     gravity: Gravity | None = None,
     simulator: str = "",
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     kp: tuple[str, ...] = (),
     kd: tuple[str, ...] = (),
     skip_bad: bool = False,
@@ -112,7 +112,7 @@ def import_logs(
     )
     if cut is not None and not cut >= 0.8:
         raise UsageError(f"--cut {cut:g}: pieces are 0.8 s long or more")
-    with writing(out, KIND):
+    with lock_folder(out, KIND):
         known = Dataset.peek(out, robot)
         if known is not None:
             read_offsets(known)  # a damaged one is said before anything is read

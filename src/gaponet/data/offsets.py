@@ -153,7 +153,7 @@ def read_offsets(dataset: Dataset) -> dict[str, Any]:
     if not file.is_file():
         return {"applied": False, "unit": "rad", "units": {}}
     hint = "delete it, the next import writes it again"
-    return {**read_json(_OffsetsFile, file, DatasetError, hint, more=True)}
+    return {**read_json(_OffsetsFile, file, DatasetError, hint, allow_extra=True)}
 
 
 def _nominal_sag(qpos: Array, setting: Load, robot: RobotSpec, gravity: Gravity) -> Array:

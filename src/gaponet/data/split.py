@@ -23,7 +23,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.base.files import write_text
-from gaponet.base.progress import Progress, silent
+from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json
 from gaponet.data.commands import Sketch, alike, sketch
 from gaponet.data.pair import hash_order
@@ -273,7 +273,7 @@ def _kilograms(text: str) -> str:
         raise UsageError(f"--holdout {text}: payloads are numbers, kg") from None
 
 
-def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress = silent) -> None:
+def require_distinct_samples(dataset: Dataset, parts: Parts, progress: Progress = no_progress) -> None:
     """Refuse parts that share samples, whatever unit or payload these are filed under.
 
     Content hashes contain unit and payload: a log imported twice, for two units, has two. So commands and states are
@@ -336,7 +336,9 @@ def read_split(path: str | Path, dataset: Dataset) -> Parts:
     Raises:
         DatasetError: Not a split file, a sequence of it is not in the dataset, or parts share one.
     """
-    hashes = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", more=True)["parts"]
+    hashes = read_json(_SplitFile, Path(path), DatasetError, "make one with gaponet data split", allow_extra=True)[
+        "parts"
+    ]
     parts: Parts = {part: [] for part in PARTS}
     taken: dict[str, str] = {}
     for part in PARTS:

@@ -11,7 +11,7 @@ from typing import Any
 
 import tyro
 
-from gaponet.base.spread import Spread, Table, text
+from gaponet.base.result_table import MeanStd, ResultTable, format_cell
 from gaponet.data.split import split_entries
 from gaponet.experiments.found import Found, spread
 from gaponet.experiments.options import MODELS
@@ -62,7 +62,7 @@ class Compare:
         )
         columns = ("method", "seed", "units", "group", "key", *MEASURES)
         tables = [
-            Table("all", columns, tuple(_lines(runs)), shown=False),
+            ResultTable("all", columns, tuple(_lines(runs)), shown=False),
             _totals(runs),
             _groups(runs),
             _horizons(runs),
@@ -91,7 +91,7 @@ def keys(runs: Runs, units: str, group: str) -> list[str]:
     return sorted(found, key=float) if group == "by_payload" else found
 
 
-def _totals(runs: Runs) -> Table:
+def _totals(runs: Runs) -> ResultTable:
     """A row per method."""
     payloads, new = keys(runs, "known", "by_payload"), keys(runs, "new", "by_unit")
     nominal = spread(runs["nominal"], "known", "mpjae").mean
@@ -105,16 +105,16 @@ def _totals(runs: Runs) -> Table:
         if len(payloads) > 1:
             by = {p: spread(runs[m], "known", "by_payload", p, "mpjae") for p in payloads}
             worst = max(by, key=lambda p: by[p].mean)
-            row.append(f"{text(by[worst])} ({worst} kg)")
+            row.append(f"{format_cell(by[worst])} ({worst} kg)")
         if new:
             row.append(spread(runs[m], "new", "mpjae"))
-        minutes = Spread.of([run["seconds"] for run in found if "seconds" in run], 1 / 60).mean
-        rows.append((*row, text(minutes, 1)))
+        minutes = MeanStd.from_values([run["seconds"] for run in found if "seconds" in run], 1 / 60).mean
+        rows.append((*row, format_cell(minutes, 1)))
     note = f"Units never trained on: {', '.join(new)}; all other columns are of the units trained on." if new else ""
-    return Table("totals", tuple(columns), tuple(rows), note)
+    return ResultTable("totals", tuple(columns), tuple(rows), note)
 
 
-def _groups(runs: Runs) -> Table:
+def _groups(runs: Runs) -> ResultTable:
     """A row per payload, unit and joint, a column per method."""
     rows = []
     for units, group, name in (("known", "by_payload", "{} kg"), ("known", "by_unit", "{}"),
@@ -122,16 +122,16 @@ def _groups(runs: Runs) -> Table:
         found = keys(runs, units, group)
         if len(found) > 1 or (units == "new" and found):
             rows += [(name.format(k), *(spread(runs[m], units, group, k, "mpjae") for m in runs)) for k in found]
-    return Table("groups", ("MPJAE, mrad", *(title(m) for m in runs)), tuple(rows))
+    return ResultTable("groups", ("MPJAE, mrad", *(title(m) for m in runs)), tuple(rows))
 
 
-def _horizons(runs: Runs) -> Table:
+def _horizons(runs: Runs) -> ResultTable:
     """A row per time since the common start."""
     times = list(runs["nominal"][0]["known"].get("by_horizon", {}))
     name = lambda t: f"{t} s" if t != "whole" else "whole motion"  # noqa: E731
     rows = [(name(t), *(spread(f, "known", "by_horizon", t, "mpjae") for f in runs.values())) for t in times]
     note = "MPJAE in mrad by time since the common start, of the last half of that time."
-    return Table("horizons", ("after", *(title(m) for m in runs)), tuple(rows), note)
+    return ResultTable("horizons", ("after", *(title(m) for m in runs)), tuple(rows), note)
 
 
 def _lines(runs: Runs) -> Iterator[tuple[Any, ...]]:

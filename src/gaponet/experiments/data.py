@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gaponet.base.errors import UsageError
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.found import Found
 from gaponet.experiments.kept import read_kept
 from gaponet.experiments.options import MODELS
@@ -62,7 +62,7 @@ class Data:
         methods = {title(m): (colours[m], x, list(error[m].values())) for m in order}
         figure = lines([(f"Error against recordings trained on\n{study.who}", methods)],
                        ("minutes trained on", "MPJAE, mrad"), [(v, f"{v:.3g}") for v in x], log=True)  # fmt: skip
-        table = Table("data", ("training motions", "minutes", *heads), rows, caption)
+        table = ResultTable("data", ("training motions", "minutes", *heads), rows, caption)
         said = [_sentence(title(w), error[w], error["nominal"], minutes) for w in self.models]
         return found.result(study, "data", "How much must be recorded", [table], {"data": figure}, said)
 
@@ -88,7 +88,9 @@ def _recorded(asked: Data, found: Found) -> tuple[dict[float, int], dict[float, 
     return motions, minutes
 
 
-def _sentence(name: str, error: dict[float, Spread], nominal: dict[float, Spread], minutes: dict[float, float]) -> str:
+def _sentence(
+    name: str, error: dict[float, MeanStd], nominal: dict[float, MeanStd], minutes: dict[float, float]
+) -> str:
     """How little is enough."""
     known = {s: e for s, e in error.items() if e.count}
     if not known:

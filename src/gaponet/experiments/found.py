@@ -10,10 +10,10 @@ from functools import cache
 from typing import Any, Protocol
 
 from gaponet.base.errors import ModelError
-from gaponet.base.executor import opened
-from gaponet.base.json_file import write_json
+from gaponet.base.executor import open_pool
+from gaponet.base.files import write_json
 from gaponet.base.progress import Running
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.kept import read_kept
 from gaponet.experiments.measure import Outcome, evaluate_baselines, train_and_evaluate
 from gaponet.experiments.pool import RESULT, Cell, run_cells
@@ -69,18 +69,18 @@ class Found:
         """What each finished seed of a model gave."""
         return self.runs.get((word, left_out), [])
 
-    def spread(self, word: str, *path: str, left_out: str = "", scale: float = 1e3) -> Spread:
+    def spread(self, word: str, *path: str, left_out: str = "", scale: float = 1e3) -> MeanStd:
         """One number of a model over its seeds, by its place in cell.json; mrad of rad unless scale says otherwise."""
         return spread(self.of_word(word, left_out), *path, scale=scale)
 
-    def base(self, name: str, *path: str, word: str = "", left_out: str = "", scale: float = 1e3) -> Spread:
+    def base(self, name: str, *path: str, word: str = "", left_out: str = "", scale: float = 1e3) -> MeanStd:
         """One number of a baseline, on the test motions of a model, or of any that leaves the same unit out."""
         keys = [k for k in self.runs if k[1] == left_out and word in ("", k[0])]
         found = self.baselines(keys[0]).get(name) if keys else None
         return spread([found] if found else [], *path, scale=scale)
 
     def result(
-        self, study: Study, name: str, heading: str, tables: ListOf[Table], figures: Mapping[str, Any],
+        self, study: Study, name: str, heading: str, tables: ListOf[ResultTable], figures: Mapping[str, Any],
         sentences: ListOf[str], **more: Any,
     ) -> Result:  # fmt: skip
         """Everything together, with what it takes to repeat it and how long the trainings took."""
@@ -118,7 +118,7 @@ def train_all(cells: ListOf[Cell], study: Study, show: Show) -> list[str]:
     todo = [c for c in cells if not c.done]
     failed = dict[str, str]()
     if todo:
-        with opened(study.executor, study.workers, study.threads) as pool:
+        with open_pool(study.executor, study.workers, study.threads) as pool:
             failed = run_cells(todo, train_and_evaluate, pool, show)
     if not any(c.done for c in cells):
         raise ModelError(f"{study.out}: every training failed; the first: {next(iter(failed.values()))}")
@@ -140,7 +140,7 @@ def baselines(cell: Cell, study: Study) -> Outcome:
     return read_kept(file)
 
 
-def spread(found: ListOf[Outcome], *path: str, scale: float = 1e3) -> Spread:
+def spread(found: ListOf[Outcome], *path: str, scale: float = 1e3) -> MeanStd:
     """One number over several outcomes, by its place in them; those that do not hold it are passed over."""
     values = []
     for value in found:
@@ -148,4 +148,4 @@ def spread(found: ListOf[Outcome], *path: str, scale: float = 1e3) -> Spread:
             value = value.get(key) if value else None  # type: ignore[assignment]
         if value is not None:
             values.append(float(value))  # type: ignore[arg-type]
-    return Spread.of(values, scale)
+    return MeanStd.from_values(values, scale)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gaponet.base.json_file import write_json
+from gaponet.base.files import write_json
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.experiments.pool import RESULT, Cell, Tell, train_cell

@@ -16,10 +16,9 @@ from markupsafe import Markup
 from typing_extensions import TypedDict
 
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import write_text, writing
-from gaponet.base.json_file import write_json
+from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.base.structure import Json, Name, read_json, validated
-from gaponet.base.text import markdown, plain
+from gaponet.base.text import escape, escape_markdown
 from gaponet.experiments.result import Result, fact_rows
 from gaponet.report.figures.style import save
 from gaponet.report.page import element, facts_table, page, picture, tag
@@ -61,7 +60,7 @@ def write(result: Result, folder: Path) -> list[Path]:
     Raises:
         FolderError: folder is somebody else's, or another process writes into it.
     """
-    with writing(folder, KIND):
+    with lock_folder(folder, KIND):
         files: list[Path] = []
         for table, stem in zip(result.tables, stems(result.name, [t.name for t in result.tables]), strict=True):
             files.append(folder / f"{stem}.csv")
@@ -87,12 +86,14 @@ def stems(name: str, parts: list[str]) -> list[str]:
 
 
 def _markdown(result: Result, pictures: list[str]) -> str:
-    parts = [f"# {markdown(result.title)}", f"**{markdown(result.virtual)}**"]
+    parts = [f"# {escape_markdown(result.title)}", f"**{escape_markdown(result.virtual)}**"]
     if result.sentences:
-        parts.append("\n".join(f"- {markdown(s)}" for s in result.sentences))
+        parts.append("\n".join(f"- {escape_markdown(s)}" for s in result.sentences))
     parts += [t.markdown() for t in result.tables if t.shown]
     parts += [f"![]({stem}.svg)" for stem in pictures]
-    parts.append("\n".join(f"- {markdown(key)}: {markdown(value)}" for key, value in fact_rows(result.facts)))
+    parts.append(
+        "\n".join(f"- {escape_markdown(key)}: {escape_markdown(value)}" for key, value in fact_rows(result.facts))
+    )
     return "\n\n".join(parts) + "\n"
 
 
@@ -105,7 +106,7 @@ def write_report(folder: Path) -> Path:
     records = found(folder)
     if not records:
         raise DatasetError(f"{folder}: no result of gaponet experiment here; run one with this folder as OUT")
-    contents = [Markup('<li><a href="#{}">{}</a></li>').format(plain(r["name"]), plain(r["title"])) for r in records]
+    contents = [Markup('<li><a href="#{}">{}</a></li>').format(escape(r["name"]), escape(r["title"])) for r in records]
     body = element("h1", "Experiments") + element("ul", *contents) if len(records) > 1 else Markup("")
     path = folder / "report.html"
     write_text(path, page("gaponet experiments", body + Markup("").join(_section(r, folder) for r in records)))
@@ -123,7 +124,7 @@ def found(folder: Path) -> list[Record]:
 
 
 def _section(record: Record, folder: Path) -> Markup:
-    head = Markup('<h1 id="{}">{}</h1>').format(plain(record["name"]), plain(record["title"]))
+    head = Markup('<h1 id="{}">{}</h1>').format(escape(record["name"]), escape(record["title"]))
     parts = [
         head,
         element("p", tag("VIRTUAL" in record["virtual"]), " ", record["virtual"]),

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import GAPONetError, UsageError, missing_extra
-from gaponet.base.executor import BEAT, Pool
-from gaponet.base.files import MARK, write_text, writing
+from gaponet.base.executor import POLL_INTERVAL_S, Pool
+from gaponet.base.files import FOLDER_MARKER, lock_folder, write_text
 from gaponet.base.progress import Running
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.kept import read_kept
@@ -142,7 +142,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
             tell(s.fraction, s.note)
 
         budget = Budget.parse(cell.budget)
-        with writing(cell.folder, "run", wait=PATIENCE):
+        with lock_folder(cell.folder, "run", wait=PATIENCE):
             resume = (cell.folder / "checkpoint.pt").is_file()
             write_text(cell.folder / SETUP, json.dumps(cell.setup(data), indent=1) + "\n")
             trainer = Trainer(data, cell.robot, cell.folder, config, budget, resume, cell.holdout_units, show)
@@ -194,7 +194,7 @@ class _Post:
 
     def __call__(self, share: float, note: str) -> None:
         now = time.monotonic()
-        if now - self.last < BEAT:
+        if now - self.last < POLL_INTERVAL_S:
             return
         self.last = now
         try:
@@ -224,7 +224,7 @@ def run_cells(
     Raises:
         KeyboardInterrupt: After every running cell has kept what it reached.
     """
-    failed, done, own = dict[str, str](), 0, f"{MARK}-{os.getpid()}-"
+    failed, done, own = dict[str, str](), 0, f"{FOLDER_MARKER}-{os.getpid()}-"
     cells = [replace(c, folder=c.folder.absolute()) for c in cells]
     shown: tuple[Running, int] = {}, 0
     alive = cells[0].folder.with_name(f"{own}alive")

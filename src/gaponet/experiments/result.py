@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gaponet.base.spread import Table
+from gaponet.base.result_table import ResultTable
 from gaponet.data.store import Dataset, dataset_hash
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class Result:
     """Whose numbers these are, as a sentence (label())."""
     facts: Mapping[str, Any]
     """Facts that a reader needs to repeat it (facts())."""
-    tables: tuple[Table, ...] = ()
+    tables: tuple[ResultTable, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
     """Figures by name."""
     sentences: tuple[str, ...] = ()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gaponet.base.errors import UsageError
-from gaponet.base.executor import LOCAL, MOST_WORKERS, Pool
+from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool
 from gaponet.data.store import Dataset
 from gaponet.experiments.kept import read_kept
 from gaponet.experiments.options import (
@@ -102,7 +102,7 @@ class Study:
     @property
     def at_once(self) -> int:
         """Trainings, as far as is known before a cluster is asked."""
-        return self.workers or (Pool.cores(self.threads) if self.executor == LOCAL else MOST_WORKERS)
+        return self.workers or (Pool.cores(self.threads) if self.executor == LOCAL else MAX_WORKERS)
 
     def variant(self, word: str) -> Variant:
         """A model as written, on this configuration."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from gaponet.base.errors import UsageError
-from gaponet.base.spread import Spread, Table, text
+from gaponet.base.result_table import MeanStd, ResultTable, format_cell
 from gaponet.data.store import Dataset
 from gaponet.experiments.found import Found, spread
 from gaponet.experiments.options import MODELS
@@ -43,11 +43,11 @@ class Unit:
         base = {b: [found.base(b, "new", "mpjae", left_out=u) for u in units] for b in BASELINES}
         parts = [(f"{title(b).removesuffix(' simulator')}, mrad", values) for b, values in base.items()]
         for word in self.models:
-            shares = [v.over(n.mean) for v, n in zip(never[word], base["nominal"], strict=True)]
+            shares = [v.divided_by(n.mean) for v, n in zip(never[word], base["nominal"], strict=True)]
             parts += [(f"{title(word)}: never seen, mrad", never[word]), ("trained on, mrad", known[word]),
                       ("never seen, of nominal", shares)]  # fmt: skip
         rows = [(u, *(p[i] for _, p in parts)) for i, u in enumerate(units)]
-        rows.append(("mean ± std over units", *(Spread.of([v.mean for v in p]) for _, p in parts)))
+        rows.append(("mean ± std over units", *(MeanStd.from_values([v.mean for v in p]) for _, p in parts)))
         caption = (
             "MPJAE of held-out motions in whole-motion free run, mean ± std over seeds. Never seen: trained on the "
             "other units; trained on: the same unit and motions in the folds that left another unit out."
@@ -57,7 +57,7 @@ class Unit:
         for word in self.models:
             methods[f"{title(word)}, never seen"] = (colours[word], never[word])
             methods[f"{title(word)}, trained on"] = (shade(colours[word], 0.55), known[word])
-        table = Table("unit", ("unit left out", *(name for name, _ in parts)), tuple(rows), caption)
+        table = ResultTable("unit", ("unit left out", *(name for name, _ in parts)), tuple(rows), caption)
         figure = bars(units, methods, "MPJAE, mrad", f"Leave one unit out\n{study.who}")
         said = _sentences(self.models, never, known, base["nominal"])
         return found.result(study, "unit", "A unit never trained on", [table], {"unit": figure}, said)
@@ -75,19 +75,19 @@ def units_of(data: Dataset) -> list[str]:
     return units
 
 
-def seen(found: Found, unit: str, word: str) -> Spread:
+def seen(found: Found, unit: str, word: str) -> MeanStd:
     """Error on a unit among those trained on, over the seeds and folds that left another one out, mrad."""
     runs = [f for (name, left_out), part in found.runs.items() if name == word and left_out != unit for f in part]
     return spread(runs, "known", "by_unit", unit, "mpjae")
 
 
 def _sentences(
-    words: ListOf[str], never: dict[str, list[Spread]], known: dict[str, list[Spread]], nominal: list[Spread]
+    words: ListOf[str], never: dict[str, list[MeanStd]], known: dict[str, list[MeanStd]], nominal: list[MeanStd]
 ) -> list[str]:
-    out, before = [], Spread.of([n.mean for n in nominal])
-    means = {w: Spread.of([v.mean for v in never[w]]) for w in words}
+    out, before = [], MeanStd.from_values([n.mean for n in nominal])
+    means = {w: MeanStd.from_values([v.mean for v in never[w]]) for w in words}
     for word in words:
-        there = Spread.of([v.mean for v in known[word]])
+        there = MeanStd.from_values([v.mean for v in known[word]])
         worse = sum(v.mean > n.mean for v, n in zip(never[word], nominal, strict=True))
         line = f"{title(word)} leaves {means[word].mean / before.mean:.2f} of the nominal error on a unit never seen"
         if there.count:
@@ -98,7 +98,7 @@ def _sentences(
         if word != best:
             ratio = [a.mean / b.mean for a, b in zip(never[best], never[word], strict=True)]
             out.append(
-                f"On a unit never seen, {title(best)} leaves {text(Spread.of(ratio))} of the error of {title(word)} "
-                f"(over units), less on {sum(r < 1 for r in ratio)} of {len(ratio)}."
+                f"On a unit never seen, {title(best)} leaves {format_cell(MeanStd.from_values(ratio))} of the error "
+                f"of {title(word)} (over units), less on {sum(r < 1 for r in ratio)} of {len(ratio)}."
             )
     return out

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.data.sequence import Sequence
 from gaponet.data.split import spread
 from gaponet.export.forms import comparable, mean_error
@@ -238,15 +238,15 @@ def _write(net: ActuatorNet, folder: Path, name: str, told: dict[str, Any]) -> N
     x = torch.zeros(2, 2 * told["length"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        with whole(folder / f"{name}.onnx") as path:
+        with atomic_write(folder / f"{name}.onnx") as path:
             torch.onnx.export(net, (x,), path, input_names=["past"], output_names=["torque"], dynamo=False,
                               dynamic_axes={"past": {0: "batch"}, "torque": {0: "batch"}})  # fmt: skip
             graph = onnx.load(path)
             onnx.helper.set_model_props(graph, {"metadata": json.dumps(told)})
             onnx.save(graph, path)
-        with whole(folder / f"{name}.pt2") as path, path.open("wb") as file:
+        with atomic_write(folder / f"{name}.pt2") as path, path.open("wb") as file:
             batch = ({0: torch.export.Dim("batch", min=1, max=2**31)},)
             torch.export.save(torch.export.export(net, (x,), dynamic_shapes=batch), file,
                               extra_files={"metadata.json": json.dumps(told)})  # fmt: skip
-        with whole(folder / f"{name}.pt") as path:
+        with atomic_write(folder / f"{name}.pt") as path:
             torch.jit.save(torch.jit.trace(net, x), path)

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.files import writing
+from gaponet.base.files import lock_folder
 from gaponet.export.facts import PLAIN_FIELDS, Joints
 from gaponet.robot.mjcf import compiled, read_mjcf, require_size
 from gaponet.robot.spec import RobotSpec
@@ -275,7 +275,7 @@ def _write(source: Source, out: Path) -> Path:
     """The edited files and all that they name, where they lay to each other; returns the main one."""
     needed = {Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(source.main))} | set(source.text)
     root = Path(os.path.commonpath([f.parent for f in needed]))
-    with writing(out, "engine"):
+    with lock_folder(out, "engine"):
         for file in sorted(needed):
             place = out / file.relative_to(root)
             place.parent.mkdir(parents=True, exist_ok=True)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.export.edit import Source, Tag, difference, text_of
 from gaponet.export.facts import Joints
 from gaponet.robot.spec import RobotSpec
@@ -46,7 +46,7 @@ def edit_urdf(path: Path, out: Path, joints: Joints, operated: tuple[str, ...], 
             raise RobotError(f"{path}: has no joint '{prefix + name}' (--prefix); it has {known}")
         (_urdf if root == "robot" else _sdf)(source, tag, joints[name])
     target = out / path.name
-    with writing(out, "engine"):
+    with lock_folder(out, "engine"):
         write_text(target, source.edited()[source.main].decode("utf-8"))
     return target, difference(source)
 

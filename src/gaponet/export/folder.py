@@ -14,9 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import library
+from gaponet.base.arrays import array_module
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.data.sequence import Sequence
 from gaponet.export import mujoco_servos
 from gaponet.export.configs import CONFIGS
@@ -117,7 +117,7 @@ def export_robot(
     prices = {"in gaponet": left(judging, robot)}
     if robot.has_law:
         prices["in gaponet, fitted without the law"] = left(judging, plain)
-    with writing(out, KIND):
+    with lock_folder(out, KIND):
         file, told, more = _write_form(robot, plain, to, out, facts, judging, source, prefix, payload_mass)
         _write_motions(out / CHECK, motions)
         _ship(out, to)
@@ -211,7 +211,7 @@ def export_model(model: GapModel, run: Path, folder: Path, payload_mass: float =
     robot = model.simulator()
     rates = model.card.get("dt") or [robot.dt]
     dt = robot.dt if any(abs(rate / robot.dt - 1) < 0.02 for rate in rates) else rates[0]
-    with writing(folder, KIND):
+    with lock_folder(folder, KIND):
         difference = export_program(model, run, folder)
         past = {"depth": (model.config.history - 1) * model.config.stride + 1, "parity_rad": difference}
         facts = simulator_facts(robot, dt, payload_mass)
@@ -243,7 +243,7 @@ def export_networks(
     train, val = recordings(run, data, robot, payload_mass)
     motions, dt = check_motions(val, robot), train[0].dt
     facts = simulator_facts(robot, dt, payload_mass) | {"file": ROBOT, "virtual": train[0].meta.virtual}
-    with writing(folder, KIND):
+    with lock_folder(folder, KIND):
         _write_scene(robot, folder / ROBOT, payload_mass, servos=False, dt=dt)
         left = write_networks(train, motions, model.corrector(robot), robot, folder, facts)
         facts["left_mrad"] = {form: 1e3 * error for form, error in left.items()}
@@ -276,7 +276,7 @@ def _ship(folder: Path, to: str) -> None:
     """Files that need no gaponet: the law, the action term, the check."""
     here = Path(__file__).parent
     told = (servo.present, servo.passing_friction, servo.resting_friction, servo.friction_limit, servo.servo_torque)
-    law = [inspect.getsource(f) for f in (library, *told)]
+    law = [inspect.getsource(f) for f in (array_module, *told)]
     limits = f"SLOWEST, FINEST = {servo.SLOWEST}, {servo.FINEST}  # rad/s of stribeck_speed, rad of encoder_step\n"
     write_text(folder / "servo_law.py", "\n\n".join([LAW + limits, *law]))
     shipped = {"mujoco_servos.py": here / "mujoco_servos.py"}

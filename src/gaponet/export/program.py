@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.export.action_term import PROGRAM, Past
 from gaponet.export.step import DeltaStep, delta_step, require_parity
 from gaponet.nn.artifact import GapModel
@@ -34,7 +34,7 @@ def export_program(model: GapModel, run: Path, folder: Path) -> float:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of torch about its own storages
         torch.export.save(program(step), content)
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(content.getvalue())
         content.seek(0)
         return require_parity(_Stepped(torch.export.load(content).module(), step), model, "torch.export", path)

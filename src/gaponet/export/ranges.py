@@ -18,8 +18,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.base.files import write_text, writing
-from gaponet.base.json_file import write_json
+from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.export import unit_of_mujoco
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.knowledge import Knowledge, believed, seen, values_of
@@ -159,7 +158,7 @@ def _factor(count: int) -> float:
 def write_ranges(made: Ranges, engine: Engine, folder: Path) -> Path:
     """The file of an engine, beside the units and ranges as JSON."""
     text = {"mujoco": _mujoco, "mjlab": _mjlab, "isaaclab": _isaaclab}.get(engine)
-    with writing(folder, KIND):
+    with lock_folder(folder, KIND):
         write_json(folder / FILE, {
             "robot": made.robot, "scope": made.scope, "joints": list(made.ranges),
             "ranges": {j: {f: dict(zip(("low", "value", "high"), r, strict=True)) for f, r in by.items()}

@@ -17,8 +17,7 @@ from typing import Annotated
 from annotated_types import Interval
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import writing
-from gaponet.base.json_file import write_json
+from gaponet.base.files import lock_folder, write_json
 from gaponet.base.structure import read_json
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
@@ -59,7 +58,7 @@ class Adaptation:
     def save(self, run: Path) -> Path:
         """RUN/adaptation/UNIT.json; an earlier one of this unit, of whatever model, is replaced."""
         path = run / FOLDERS[-1] / f"{re.sub(r'[^A-Za-z0-9._-]', '_', self.unit_id)}.json"
-        with writing(run, "run"):
+        with lock_folder(run, "run"):
             path.parent.mkdir(exist_ok=True)
             write_json(path, asdict(self))
         return path

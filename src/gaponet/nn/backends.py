@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 
 Network = Callable[[Any], Any]  # x (B, dim) float32 → Δa (B, n) rad; numpy arrays or torch tensors
 TRUSTED: set[str] = set()  # hashes of the ONNX files that were written by this process, or tried
@@ -73,7 +73,7 @@ def _onnxruntime() -> Any:
     return onnxruntime
 
 
-@inside(ModelError, "onnxruntime")
+@sandboxed(ModelError, "onnxruntime")
 def _try(path: Path) -> None:
     try:
         network = OnnxNetwork(path.read_bytes())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.arrays import Array, copy_of, library, zeros_like
+from gaponet.base.arrays import Array, array_module, copy_array, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.nn.backends import Network, OnnxNetwork
 from gaponet.nn.config import ModelConfig
@@ -53,7 +53,7 @@ class DeltaLoop:
         self.history = History(config, n, x)
         self._q, self._v, self._action = (x[:, part] for part in (at.q, at.v, at.action))
         self._mass, self._most = x[:, at.payload.start], config.payload_max if config.payload_input else None
-        self._host, self._xp = isinstance(x, np.ndarray), library(x)
+        self._host, self._xp = isinstance(x, np.ndarray), array_module(x)
         self._shapes = [(num_envs, n), *([(n,)] if num_envs == 1 else [])]
         self.low, self.high = (
             np.array(side[None], float) if self._host else x.new_tensor(side) for side in np.transpose(qpos_range)
@@ -172,7 +172,7 @@ class DeltaLoop:
 
         Else the correction would be none either, would enter the history, and no later one would be a number.
         """
-        a, last = a.reshape(-1, self.n), copy_of(self.history.target)
+        a, last = a.reshape(-1, self.n), copy_array(self.history.target)
         if self.any_fresh:
             last[self.fresh] = q.reshape(-1, self.n)[self.fresh]
         return self._xp.where(self._xp.isfinite(a), a, last)

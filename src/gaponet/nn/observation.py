@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.arrays import Array, copy_of, zeros_like
+from gaponet.base.arrays import Array, copy_array, zeros_like
 from gaponet.nn.config import ModelConfig
 
 
@@ -75,7 +75,7 @@ class History:
     def push(self, qpos: Any, qvel: Any, u: Any) -> None:
         """Append the frame just lived through: state at t and target applied over [t, t+1), (num_envs, n) each; None,
         None is the state that x shows."""
-        self.older[...] = self.younger if self.host else copy_of(self.younger)  # torch would overwrite what it reads
+        self.older[...] = self.younger if self.host else copy_array(self.younger)  # torch would overwrite what it reads
         if qpos is None:
             self.state[...] = self.present
         else:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
-from gaponet.base.files import whole, write_text, writing
+from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS
 from gaponet.nn.backends import TRUSTED, OnnxNetwork
 from gaponet.nn.deeponet import build_network
@@ -38,7 +38,7 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
     Raises:
         ModelError: The difference is above 1e-5 rad; nothing is written.
     """
-    with writing(folder, "model"):
+    with lock_folder(folder, "model"):
         frozen = copy.deepcopy(net).eval()
         content = onnx_content(frozen)
         with torch.inference_mode():
@@ -48,7 +48,7 @@ def export(net: DeltaNet, folder: Path, card: dict[str, Any], samples: Array) ->
             raise ModelError(
                 f"{folder}: ONNX and torch differ by {difference:.2e} rad (limit {PARITY:.0e}); not written"
             )
-        with whole(folder / WEIGHTS) as onnx:
+        with atomic_write(folder / WEIGHTS) as onnx:
             onnx.write_bytes(content)
         (folder / "weights.npz").unlink(missing_ok=True)  # an earlier version's copy of the weights
         digest = hashlib.sha256(content).hexdigest()

@@ -177,5 +177,5 @@ def read_origin(folder: Path) -> _Origin | None:
     if not file.is_file():
         return None
     return read_json(
-        _Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", more=True
+        _Origin, file, RobotError, "identify again, or remove it: all recordings then count as seen", allow_extra=True
     )

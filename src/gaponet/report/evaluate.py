@@ -15,9 +15,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.base.files import whole, writing
-from gaponet.base.json_file import write_json
-from gaponet.base.progress import Progress, noted, silent
+from gaponet.base.files import atomic_write, lock_folder, write_json
+from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.pair import Twin
 from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
@@ -83,8 +82,8 @@ class Evaluation:
                 arrays[f"{row}/{name}"] = part[i].qpos_sim
             for name, delta in self.deltas.items():
                 arrays[f"{row}/delta/{name}"] = delta[i]
-        with writing(folder, "robot" if is_robot(folder) else "run"):
-            with whole(folder / "trajectories.npz") as temporary:
+        with lock_folder(folder, "robot" if is_robot(folder) else "run"):
+            with atomic_write(folder / "trajectories.npz") as temporary:
                 np.savez_compressed(temporary, **{k: v.astype(np.float32) for k, v in arrays.items()})  # type: ignore[arg-type]
             write_json(folder / "metrics.json", result)
 
@@ -94,7 +93,7 @@ def evaluate(
     dataset: Dataset,
     robot: RobotSpec,
     motions: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     target: RobotSpec | None = None,
     units: tuple[str, ...] = (),
 ) -> Evaluation:
@@ -131,13 +130,13 @@ def evaluate(
     simulators: dict[str, str] = {}
     for name, simulator, corrector in itertools.chain(_methods(known, nominal), _transferred(target, first, nominal)):
         simulators[name] = model_hash(simulator)
-        twins = replay(sequences, simulator, corrector, progress=noted(progress, name), lock_idle=True)
+        twins = replay(sequences, simulator, corrector, progress=with_note(progress, name), lock_idle=True)
         done_runs[name] = runs(sequences, [t.qpos for t in twins], robot)
         if name in models:
             deltas[name] = [(t.ctrl - s.ctrl)[:-1, op] for s, t in zip(sequences, twins, strict=True)]
     adapted = first.adaptations()
     if any(s.meta.unit_id in adapted for s in sequences):
-        twins = _by_unit(sequences, first, adapted, noted(progress, "adapted"))
+        twins = _by_unit(sequences, first, adapted, with_note(progress, "adapted"))
         done_runs["adapted"] = runs(sequences, [t.qpos for t in twins], robot)
         simulators["adapted"] = simulators[first.method]
     methods = {name: summary(part, robot) for name, part in done_runs.items()}

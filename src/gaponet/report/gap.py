@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.progress import Progress, noted, silent
+from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
@@ -31,7 +31,7 @@ def gap_by_step(
     one: Candidate,
     dataset: Dataset,
     motions: tuple[str, ...] = (),
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Mean |error| left after each step, in free run over whole motions that the robot folder or the run never saw.
 
@@ -56,7 +56,7 @@ def gap_by_step(
     sequences = dataset.sequences(entries)
     found, done = causes(robot), {}
     for name, physics, corrector in _steps(one, found):
-        told = noted(progress, name)
+        told = with_note(progress, name)
         twins = replay(sequences, physics, corrector, lock_idle=True, progress=told, creeps=name == "friction")
         done[name] = runs(sequences, [t.qpos for t in twins], robot)
     units = {s.meta.unit_id for s in sequences}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
 
-from gaponet.base.text import plain
+from gaponet.base.text import escape as one_line
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -58,7 +58,7 @@ summary { cursor: pointer; color: var(--faint); margin: .6rem 0 }
 
 def element(name: str, *content: str, css: str = "") -> Markup:
     """Make one element of a page. Content that is not Markup is text, whatever it holds, and is escaped here."""
-    inside = Markup("").join(c if isinstance(c, Markup) else escape(plain(c)) for c in content)
+    inside = Markup("").join(c if isinstance(c, Markup) else escape(one_line(c)) for c in content)
     kind = Markup(' class="{}"').format(css) if css else ""
     return Markup("<{0}{1}>{2}</{0}>").format(name, kind, inside)
 

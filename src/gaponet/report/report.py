@@ -14,8 +14,8 @@ from markupsafe import Markup
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, ModelError, UsageError
 from gaponet.base.files import write_text
-from gaponet.base.progress import Progress, silent
-from gaponet.base.spread import Table
+from gaponet.base.progress import Progress, no_progress
+from gaponet.base.result_table import ResultTable
 from gaponet.data.sequence import SequenceMeta
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
@@ -39,7 +39,7 @@ def write_report(
     dataset: Path | None = None,
     also: tuple[Path, ...] = (),
     robot: str | None = None,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     picture: Picture | None = None,
 ) -> Path:
     """Write report.html into a run or a robot folder from its newest evaluation, evaluating first where there is none.
@@ -303,7 +303,7 @@ def _by_joint(methods: dict[str, Any], own: str, metrics: dict[str, Any]) -> Mar
     return table([*mean.columns, f"{title(own)} static", f"{title(own)} dynamic", "moves in"], rows)
 
 
-def _table(made: Table, best: int | None = None) -> Markup:
+def _table(made: ResultTable, best: int | None = None) -> Markup:
     return table(made.columns, made.texts(), best)
 
 

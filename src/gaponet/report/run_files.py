@@ -129,13 +129,13 @@ def read_config(run: Path) -> dict[str, Any]:
     Raises:
         ModelError: Missing or damaged, as of all functions here; with file and field.
     """
-    return dict(read_json(_Config, run / "config.json", ModelError, MEND, more=True))
+    return dict(read_json(_Config, run / "config.json", ModelError, MEND, allow_extra=True))
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
     """metrics.json of a run: the same groups in every method as in the nominal one; absent numbers are NaN."""
     file = run / "metrics.json"
-    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, more=True)}
+    metrics: dict[str, Any] = {**read_json(_Metrics, file, ModelError, MEND, allow_extra=True)}
     for key in ("methods", "ratio_to_nominal"):
         metrics[key] = {FORMER_METHODS.get(name, name): value for name, value in metrics[key].items()}
     methods = metrics["methods"]
@@ -175,7 +175,7 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
         return []
     lines = file.read_bytes().split(b"\n")[:-1]
     return [
-        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, MEND, more=True)}
+        {**parse_json(_Validation, line, f"{file}:{number}", ModelError, MEND, allow_extra=True)}
         for number, line in enumerate(lines, 1)
         if line.strip()
     ]
@@ -207,7 +207,7 @@ def read_gap(run: Path) -> dict[str, Any] | None:
     file, again = run / "gap.json", "make it again with gaponet gap DATASET --run RUN"
     if not file.is_file():
         return None
-    gap = read_json(_Gap, file, ModelError, again, more=True)
+    gap = read_json(_Gap, file, ModelError, again, allow_extra=True)
     steps = list(gap["left"])
     if not steps or any(list(panel["left"]) != steps for panel in gap["by_joint"].values()):
         raise ModelError(f"{file}: by_joint: should have the steps of left; {again}")

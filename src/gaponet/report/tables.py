@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from gaponet.base.spread import Table
+from gaponet.base.result_table import ResultTable
 from gaponet.report.methods import title
 
 
@@ -16,7 +16,7 @@ def mrad(value: float | None) -> str:
 
 def totals(
     methods: dict[str, Any], angle: Callable[[float], str] = mrad, simulators: Mapping[str, str] | None = None
-) -> Table:
+) -> ResultTable:
     """A row per method, from its metrics (metrics.summary); angle says how an MPJAE is written.
 
     With the simulators in which they ran, by hash, in a last column.
@@ -24,7 +24,7 @@ def totals(
     base = methods["nominal"]["mpjae"]
     columns = ("method", "MPJAE, mrad", "of nominal", "RMSE, mrad", "static, mrad", "dynamic, mrad", "Q_dis, rad·s",
                "≥ 0.05 rad", "≥ 0.1 rad", "correlation", *["simulator"] * bool(simulators))  # fmt: skip
-    return Table("totals", columns, tuple(
+    return ResultTable("totals", columns, tuple(
         (title(name), angle(m["mpjae"]), m["mpjae"] / base if base else "–", mrad(m["rmse"]), mrad(m["static"]),
          mrad(m["dynamic"]), f"{m['q_dis']:.3f}", f"{m['large_0.05'] * 100:.1f} %", f"{m['large_0.1'] * 100:.2f} %",
          f"{m['correlation']:.4f}", *([simulators[name]] if simulators else []))
@@ -32,8 +32,8 @@ def totals(
     ))  # fmt: skip
 
 
-def by_group(methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad) -> Table:
+def by_group(methods: dict[str, Any], group: str, angle: Callable[[float], str] = mrad) -> ResultTable:
     """MPJAE by joint, payload, unit, horizon or motion: a row for each, a column per method."""
     parts = [m[f"by_{group}"] for m in methods.values()]
     rows = tuple((key, *(angle(part[key]["mpjae"]) for part in parts)) for key in parts[0])
-    return Table(group, ("MPJAE, mrad", *map(title, methods)), rows)
+    return ResultTable(group, ("MPJAE, mrad", *map(title, methods)), rows)

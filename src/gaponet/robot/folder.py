@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.robot.spec import BUILTIN, LAW, SERVO, RobotSpec, available, load_robot
 
 KEPT = "robot"  # folder of a run or a dataset
@@ -55,7 +55,7 @@ def save_robot(robot: RobotSpec, folder: Path) -> None:
     xml = robot.mjcf.read_text(encoding="utf-8")
     xml = bare_mjcf(robot.mjcf) if FILES.search(xml) else xml
     beside = {name: robot.folder / name for name in BESIDE if (robot.folder / name).is_file()}
-    with writing(folder, "robot"):
+    with lock_folder(folder, "robot"):
         (folder / "robot.toml").unlink(missing_ok=True)  # without it, nothing is kept: it comes last
         write_text(folder / "robot.xml", xml)
         for name, file in beside.items():

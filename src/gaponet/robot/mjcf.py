@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 from gaponet.base import sandbox
 from gaponet.base.errors import RobotError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 
 if TYPE_CHECKING:
     import mujoco
@@ -85,13 +85,13 @@ def said(path: Path, what: str) -> Iterator[None]:
         yield
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         text = " ".join(str(error).split())
-        if sandbox.here() and "allocat" in text:
+        if sandbox.in_sandbox() and "allocat" in text:
             raise MemoryError from None
         text = "MuJoCo does not say why; does it ask for too much?" if "unknown exception" in text else text
         raise RobotError(f"{path}: {what}: {text}") from None
 
 
-@inside(RobotError, "mujoco", 0.5)
+@sandboxed(RobotError, "mujoco", 0.5)
 def _try(path: Path) -> None:
     require_moderate(compiled(read_mjcf(path, tried=True), path), path)
 

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.robot.bare import bare_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import freeze
@@ -86,7 +86,7 @@ def new_robot(path: Path, out: Path, wanted: Wanted) -> Made:
             text, robot_toml = (t.replace(f'"{name}"', f'"{name.replace("/", "_")}"') for t in (text, robot_toml))
     if (out / "robot.toml").exists():
         raise UsageError(f"{out}: holds a robot; choose another --out, or move it away")
-    with writing(out, "robot"):
+    with lock_folder(out, "robot"):
         write_text(out / "robot.xml", text)
         write_text(out / "robot.toml", robot_toml)
     return Made(load_robot(out), found, model, pose, notes)

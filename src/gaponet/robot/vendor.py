@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 from gaponet.robot.finding import some
 from gaponet.robot.mjcf import compiled, read_mjcf, require_moderate, require_size, said
 
@@ -30,8 +30,8 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
         RobotError: Neither MJCF nor URDF, or broken.
     """
     if path.is_dir():
-        inside = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
-        raise RobotError(f"{path}: is a folder; name the model in it: {some(inside) or 'there is no .xml or .urdf'}")
+        models = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
+        raise RobotError(f"{path}: is a folder; name the model in it: {some(models) or 'there is no .xml or .urdf'}")
     if path.suffix == ".xacro":
         raise RobotError(f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf")
     require_size(path)
@@ -40,7 +40,7 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
     return _read(path, packages)
 
 
-@inside(RobotError, "mujoco", 0.5)
+@sandboxed(RobotError, "mujoco", 0.5)
 def _try(path: Path, packages: dict[str, Path]) -> None:
     spec, _ = _read(path, packages)
     require_moderate(compiled(spec, path), path)

@@ -15,9 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from gaponet.base.files import MARK, write_text
-from gaponet.base.progress import bar
-from gaponet.base.text import without_credentials
+from gaponet.base.files import FOLDER_MARKER, write_text
+from gaponet.base.progress import progress_bar
+from gaponet.base.text import remove_credentials
 from gaponet.share.errors import RemoteError
 from gaponet.share.target import INDEX, MAX_INDEX_BYTES, Index, Kind, Part, reaching
 
@@ -36,7 +36,7 @@ class Bucket:
         Args:
             address: s3://BUCKET/FOLDER, gs://BUCKET/FOLDER or file:///FOLDER.
         """
-        self.address = without_credentials(address)
+        self.address = remove_credentials(address)
         scheme, _, rest = address.partition("://")
         if scheme not in MODULES or not rest.strip("/") or "::" in rest:
             raise RemoteError(f"{self.address}: no such place; use USER/NAME, s3://, gs:// or file:// and a folder")
@@ -67,7 +67,7 @@ class Bucket:
                 raise RemoteError(f"{self.address}: no bucket '{bucket}'; make it with the provider's tools")
             elif self._info(self.root):
                 names = {path.rpartition("/")[2] for path in self.fs.ls(self.root, detail=False)} - {"", OBJECTS}
-                if name := min((name for name in names if not name.startswith(MARK)), default=""):
+                if name := min((name for name in names if not name.startswith(FOLDER_MARKER)), default=""):
                     raise RemoteError(f"{self.address}: holds {name} and no {INDEX}: gaponet did not push it")
         return self._found
 
@@ -116,7 +116,7 @@ class Bucket:
         from fsspec.callbacks import Callback
 
         if pairs:
-            with bar(title) as update, reaching(self.address):
+            with progress_bar(title) as update, reaching(self.address):
                 show = Callback(hooks={"bar": lambda size, value, **_: update(value, size or 0, "")})
                 transfer(*map(list, zip(*pairs, strict=True)), callback=show, batch_size=AT_ONCE)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gaponet.base.errors import DatasetError
 from gaponet.base.files import write_text
-from gaponet.base.progress import bar
+from gaponet.base.progress import progress_bar
 from gaponet.data.card import make_card
 from gaponet.data.card_text import card_text
 from gaponet.data.formats.lerobot_set import Stated
@@ -39,7 +39,7 @@ def lay_out(path: Path, folder: Path, address: str) -> tuple[str, ...]:
     dataset = Dataset(path)
     robot = kept_robot(dataset.path, dataset.robot_name)
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
-    with bar("reading") as update:
+    with progress_bar("reading") as update:
         done = iter(range(1, len(dataset) + 1))
         sets = write(dataset, robot, folder, lambda motion: update(next(done), len(dataset), motion))
     (folder / BESIDE).mkdir()
@@ -66,7 +66,7 @@ def take_in(pushed: Dataset, robot: RobotSpec, out: Path) -> None:
     if new:
         dataset.state(**{name: str(pushed.header[name]) for name in Stated.__annotations__ if name in pushed.header})
     missing = [entry for entry in pushed.entries if dataset.find(entry.hash) is None]
-    with dataset.appending(), bar("checking") as update:
+    with dataset.appending(), progress_bar("checking") as update:
         for done, entry in enumerate(missing, 1):
             sequence = pushed.read(entry)
             dataset.append(sequence, entry.findings or findings(sequence), entry.hash)

@@ -16,7 +16,7 @@ from pathlib import Path
 from tempfile import gettempdir
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import MARK, writing
+from gaponet.base.files import FOLDER_MARKER, lock_folder
 from gaponet.data.store import Dataset
 from gaponet.share import dataset as datasets
 from gaponet.share import run as runs
@@ -138,13 +138,13 @@ def _require_newer(there: Index | None, kind: Kind, contents: tuple[str, ...], a
 def _beside(path: Path, what: str) -> Iterator[Path]:
     """A working folder beside a path, for one process at a time; it is removed if it is empty at the end."""
     place = path.parent if os.access(path.parent, os.W_OK) else Path(gettempdir())  # a disk that is only read
-    folder = place / f"{MARK}-{what}-{path.name}"
-    with writing(folder, what):
+    folder = place / f"{FOLDER_MARKER}-{what}-{path.name}"
+    with lock_folder(folder, what):
         yield folder
     shutil.rmtree(folder)
 
 
 def _empty(folder: Path, but: str = "") -> None:
     for child in folder.iterdir():
-        if child.name not in (MARK, but):
+        if child.name not in (FOLDER_MARKER, but):
             shutil.rmtree(child) if child.is_dir() else child.unlink()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from gaponet.base.text import markdown
+from gaponet.base.text import escape_markdown
 from gaponet.data.card import NOT_STATED
 from gaponet.nn.artifact import GapModel
 from gaponet.report.tables import totals
@@ -35,12 +35,13 @@ def run_readme(facts: dict[str, Any], address: str) -> str:
     card, metrics = facts["card"], facts["metrics"]
     virtual, rates = ", trained on VIRTUAL robots", ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", []))
     lines = [
-        f"# {markdown(card['robot'])}: a model of its motor gap{virtual * bool(card.get('virtual'))}",
+        f"# {escape_markdown(card['robot'])}: a model of its motor gap{virtual * bool(card.get('virtual'))}",
         "",
-        f"- corrects the targets of {len(card['joint_names'])} joints: {markdown(', '.join(card['joint_names']))}",
-        f"- trained {markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
-        f"{markdown(str(card.get('dataset_hash', '')))}",
-        f"- at {rates} Hz, in simulator {markdown(card['simulator'])}",
+        f"- corrects the targets of {len(card['joint_names'])} joints: "
+        f"{escape_markdown(', '.join(card['joint_names']))}",
+        f"- trained {escape_markdown(GapModel.how_trained(card))}, on {card.get('hours', 0):.2f} h of dataset "
+        f"{escape_markdown(str(card.get('dataset_hash', '')))}",
+        f"- at {rates} Hz, in simulator {escape_markdown(card['simulator'])}",
         f"- weights {facts['weights']}",
     ]
     if metrics:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import ModelError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.report.run_files import read_config, read_metrics
 from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, require_bare
@@ -50,7 +50,7 @@ def take_in(folder: Path, index: Index, out: Path) -> None:
     Raises:
         GAPONetError: It is another network, or a file is not what it should be.
     """
-    with writing(folder, "run"):
+    with lock_folder(folder, "run"):
         if sha256(folder / "model" / WEIGHTS) not in index.contents:
             raise RemoteError("model/model.onnx is not the network that was pushed, by its hash; push it again")
         _facts(folder)

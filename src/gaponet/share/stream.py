@@ -18,8 +18,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.formats.lerobot import read_episode
 from gaponet.data.formats.lerobot_set import FEATURES, Set, Stated, sets_under
 from gaponet.data.sequence import ARRAYS, SequenceMeta, to_sequence
@@ -135,7 +135,7 @@ def open_pushed(address: str) -> Pushed:
     return pushed
 
 
-@inside(RemoteError, "pyarrow.parquet")
+@sandboxed(RemoteError, "pyarrow.parquet")
 def _rows_of(file: Path, first: int, rows: int) -> pa.Table:
     """Rows of a data file; they fill whole row groups, and no others are read."""
     import pyarrow.parquet as pq
@@ -144,8 +144,8 @@ def _rows_of(file: Path, first: int, rows: int) -> pa.Table:
     ends = np.cumsum([parquet.metadata.row_group(i).num_rows for i in range(parquet.num_row_groups)])
     groups = np.flatnonzero((ends > first) & (ends <= first + rows)).tolist()
     parts = [parquet.metadata.row_group(i) for i in groups]
-    if 8 * sum(part.column(k).num_values for part in parts for k in range(part.num_columns)) > LARGEST_ARRAYS:
-        raise RemoteError(f"{file}: a recording in it has more than {LARGEST_ARRAYS >> 20} MiB")
+    if 8 * sum(part.column(k).num_values for part in parts for k in range(part.num_columns)) > MAX_ARRAYS_BYTES:
+        raise RemoteError(f"{file}: a recording in it has more than {MAX_ARRAYS_BYTES >> 20} MiB")
     table = parquet.read_row_groups(groups, use_threads=False)
     if len(table) != rows:
         raise RemoteError(f"{file}: rows {first} to {first + rows} are not whole row groups; {AGAIN}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import like
+from gaponet.base.arrays import array_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import LAW, STOPS, RobotSpec
@@ -337,8 +337,11 @@ class CommandHistory:
         parts = buffer.reshape(len(buffer), model.nu, 2 + 2 * self.samples)  # a view
         self.cursor, self.times = parts[..., :2], parts[..., 2 : -self.samples]
         self.values = parts[..., -self.samples :]
-        self.ago = like(time, np.arange(self.samples, 0, -1))  # oldest first
-        self._newest, self._each = like(time, [0.0, self.samples - 1.0]), like(time, np.arange(len(time))[:, None])
+        self.ago = array_like(time, np.arange(self.samples, 0, -1))  # oldest first
+        self._newest, self._each = (
+            array_like(time, [0.0, self.samples - 1.0]),
+            array_like(time, np.arange(len(time))[:, None]),
+        )
 
     def fill(self, ids: Any, past: Any, nstep: Any, timestep: Any) -> None:
         """Write past targets, newest first, each held for nstep (k,) physics steps of timestep (k,) s; time is 0."""

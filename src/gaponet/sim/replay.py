@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gaponet.base.executor import LOCAL, opened
+from gaponet.base.executor import LOCAL, open_pool
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
@@ -238,7 +238,7 @@ def _pair(
                 work(part, progress=lambda k, of: progress(done + k, total)) for part in sequences
             )
         else:
-            pool = stack.enter_context(opened(executor, 0, 1))
+            pool = stack.enter_context(open_pool(executor, 0, 1))
             replayed = pool.map(partial(work, nthread=1), sequences)
         for part, twins in zip(parts, replayed, strict=True):
             for entry, twin in zip(part, twins, strict=True):

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from gaponet.base.arrays import Array, library
+from gaponet.base.arrays import Array, array_module
 from gaponet.robot.spec import LAW
 
 Law = dict[str, Any]  # name of LAW → values that broadcast to the simulations' joints, numpy or torch
@@ -45,13 +45,15 @@ def friction_limit(law: Law, frictionloss: Any, qvel: Any, torque: Any, load: An
         by_motor, by_load = law.get("friction_motor", 0.0), law.get("friction_external", 0.0)
         limit = limit + passing_friction(by_motor, by_load, torque, load)
     if "stribeck" in law:
-        limit = limit + resting_friction(library(qvel).exp, law["stribeck"], law.get("stribeck_speed", SLOWEST), qvel)
+        limit = limit + resting_friction(
+            array_module(qvel).exp, law["stribeck"], law.get("stribeck_speed", SLOWEST), qvel
+        )
     return limit
 
 
 def servo_torque(law: Law, kp: Any, aim: Any, qpos: Any) -> Any:
     """What the servo asks of its motor, N·m, for an angle (rad) that it reads in its encoder's steps."""
-    xp, read, deadband = library(qpos), qpos, 0.0
+    xp, read, deadband = array_module(qpos), qpos, 0.0
     if "encoder_step" in law:
         step = law["encoder_step"]
         fine, deadband = step.clip(min=FINEST), 0.5 * step * kp

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from gaponet.base.text import measured
+from gaponet.base.text import format_uncertainty
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import LAW, RobotSpec
 from gaponet.sim.metrics import standard_error
@@ -554,7 +554,7 @@ class Fit:
                     continue
                 value, error = values[f][i], std[joint].get(f, 0.0)
                 if error > WIDE * max(abs(value), ahead[f][i] - value):
-                    wide[f] = f"{f} {measured(value, error)}"
+                    wide[f] = f"{f} {format_uncertainty(value, error)}"
                     ratio = over_kp.get(joint, {}).get(f, np.inf)
                     if f not in OVER_KP or ratio > WIDE * max(abs(x[i, k]), 1.0):
                         alone.append(f)

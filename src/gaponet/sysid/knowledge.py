@@ -16,7 +16,7 @@ from typing_extensions import TypedDict
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError
-from gaponet.base.json_file import write_json
+from gaponet.base.files import write_json
 from gaponet.base.structure import read_json
 from gaponet.robot.folder import KNOWN
 from gaponet.robot.spec import RobotSpec

@@ -26,7 +26,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
 from gaponet.base.files import write_text
-from gaponet.base.text import measured
+from gaponet.base.text import format_uncertainty
 from gaponet.data.log import Log
 from gaponet.sysid.torque import Gains, servo_gains
 
@@ -108,9 +108,9 @@ class Labels:
         if loaded:
             told += [f"torque alone, whichever the unit, says {near} payloads within {NEAR:g} kg of their label"]
         told += [
-            f"{joint}: torque is kp (command − position) − kd velocity, kp {measured(g.kp, g.error)} N·m/rad ("
-            f"{measured(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: {g.explained:.1%} of "
-            "its variance"
+            f"{joint}: torque is kp (command − position) − kd velocity, kp {format_uncertainty(g.kp, g.error)} "
+            f"N·m/rad ({format_uncertainty(end.kp, end.error)} by the end of recordings), kd {g.kd:.2f} N·m·s/rad: "
+            f"{g.explained:.1%} of its variance"
             for joint, (g, end) in self.gains.items()
             if g.trusted
         ]

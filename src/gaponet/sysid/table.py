@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.text import measured
+from gaponet.base.text import format_uncertainty
 from gaponet.sysid.knowledge import Knowledge
 
 SHOWN = {  # field → heading, factor from SI
@@ -39,7 +39,11 @@ class Certainty:
         factor = SHOWN[field][1]
         if self.share(field) > UNKNOWN and self.values[field] == 0:
             return "none seen"
-        return measured(self.values[field] * factor, self.errors[field] * factor) if self.errors[field] < 1e3 else "?"
+        return (
+            format_uncertainty(self.values[field] * factor, self.errors[field] * factor)
+            if self.errors[field] < 1e3
+            else "?"
+        )
 
 
 def certainty(known: Knowledge, joint: str) -> Certainty:

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.executor import LOCAL, MOST_WORKERS, Pool, opened
-from gaponet.base.files import write_text, writing
-from gaponet.base.progress import Progress, silent
+from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool, open_pool
+from gaponet.base.files import lock_folder, write_text
+from gaponet.base.progress import Progress, no_progress
 from gaponet.base.structure import read_json, validated
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
@@ -59,7 +59,7 @@ def collect(
     out: str | Path,
     seed: int = 0,
     nproc: int = 0,
-    progress: Progress = silent,
+    progress: Progress = no_progress,
     twins: bool = True,
     executor: str | Executor = LOCAL,
 ) -> Collected:
@@ -80,15 +80,13 @@ def collect(
     start = time.monotonic()
     robot = robot.with_gain_scale(fleet.gain_scale or robot.gain_scale)
     recipe = validated(Recipe, asdict(recipe), "recipe", UsageError)  # options may have changed it
-    if not 0 <= nproc <= MOST_WORKERS or not 0 <= seed < 2**63:
-        raise UsageError(
-            f"--nproc {nproc}, --seed {seed}: up to {MOST_WORKERS} processes, 0 for one per core; seed ≥ 0"
-        )
+    if not 0 <= nproc <= MAX_WORKERS or not 0 <= seed < 2**63:
+        raise UsageError(f"--nproc {nproc}, --seed {seed}: up to {MAX_WORKERS} processes, 0 for one per core; seed ≥ 0")
     for unit in recipe.units:
         fleet.unit(unit)
     files = tuple(read_motion(file, robot) for file in recipe.files)
     wanted = takes(recipe, library(robot, seed, recipe, files).names(recipe.variants))
-    with writing(Path(out), KIND):
+    with lock_folder(Path(out), KIND):
         dataset = Dataset.create(out, robot)
         require_kept(dataset.path, robot, DatasetError, MOVE_KEPT)
         _claim(dataset, robot, fleet, recipe, seed)
@@ -179,7 +177,7 @@ def _record(
         for job in jobs:
             yield from work(job)
         return
-    with opened(executor, nproc, 1) as pool:
+    with open_pool(executor, nproc, 1) as pool:
         for played in pool.map(work, jobs):
             yield from played
 

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.hw.control.clock import MonotonicClock, uncollected
 from gaponet.hw.drivers import hg
 from gaponet.hw.drivers.unitree import MOTOR_NAMES, VIRTUAL_MARK, WEIGHT_MOTOR
@@ -49,7 +49,7 @@ class Heard:
 
     def save(self, path: Path) -> None:
         """Write what was heard as npz."""
-        with whole(path) as temporary, temporary.open("wb") as file:
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **{name: np.array(values) for name, values in vars(self).items()})  # type: ignore[arg-type]
 
 

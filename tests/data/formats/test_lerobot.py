@@ -10,7 +10,7 @@ import pytest
 from logs import SO101, arm_sequence, late, stock, wave
 
 from gaponet.base.errors import DatasetError, JointMismatchError, LogError, UsageError
-from gaponet.base.progress import silent
+from gaponet.base.progress import no_progress
 from gaponet.data.formats import detect, read_logs
 from gaponet.data.importer import import_logs
 from gaponet.data.store import Dataset
@@ -18,7 +18,7 @@ from gaponet.data.writers import export
 from gaponet.data.writers import lerobot as lerobot_export
 
 
-def export_lerobot(dataset, out, progress=silent):
+def export_lerobot(dataset, out, progress=no_progress):
     return export(dataset, None, out, "lerobot", progress)  # the robot is not asked
 
 

@@ -50,7 +50,7 @@ def notes(tmp_path: Path) -> Path:
 @pytest.fixture
 def dog(notes: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Watchdog]:
     """A watchdog in a process of its own that could damp the robot; its parameter is after how many s it does."""
-    monkeypatch.setattr(watchdog.child, "words", lambda _, text: [sys.executable, "-c", ROBOT, text])
+    monkeypatch.setattr(watchdog.child_process, "module_command", lambda _, text: [sys.executable, "-c", ROBOT, text])
     lock = os.open(notes.with_suffix(".lock"), os.O_CREAT | os.O_RDWR)
     dog = Watchdog({"early": True, "notes": str(notes)}, lock, getattr(request, "param", PATIENT), DAMP)
     os.close(lock)

@@ -9,7 +9,7 @@ import pytest
 from arm import commands
 
 from gaponet.base.errors import UsageError
-from gaponet.base.structure import _checker
+from gaponet.base.structure import _type_adapter
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
@@ -340,8 +340,8 @@ def test_times_and_acceleration_must_be_positive():
 
 
 def test_nothing_is_taken_apart_for_the_first_time_while_the_robot_moves(arm):
-    _checker.cache_clear()
+    _type_adapter.cache_clear()
     LiveTargets(SimpleNamespace(address="here"), arm, arm.joint_names, SimulatedClock(), DT, 5.0)
-    made = _checker.cache_info().misses
+    made = _type_adapter.cache_info().misses
     assert decode("a", b'{"time": 1.0, "target": {"shoulder": 0.1}}').wrong == ""
-    assert made == _checker.cache_info().misses == 1
+    assert made == _type_adapter.cache_info().misses == 1

@@ -4,12 +4,12 @@ import math
 
 import pytest
 
-from gaponet.base.spread import Spread
+from gaponet.base.result_table import MeanStd
 from gaponet.report.figures.charts import bars, lines
 
 
 def test_a_line_has_error_bars_where_there_are_seeds():
-    one = {"m": ("#000000", [0, 1], [Spread(1, 0.5, 3), Spread(2, math.nan, 1)])}
+    one = {"m": ("#000000", [0, 1], [MeanStd(1, 0.5, 3), MeanStd(2, math.nan, 1)])}
     fig = lines([("left", one), ("right", one)], ("kg", "mrad"))
     left, _ = fig.axes
     (bar,) = left.containers
@@ -18,8 +18,8 @@ def test_a_line_has_error_bars_where_there_are_seeds():
 
 
 def test_bars_stand_side_by_side():
-    ax = bars(["a", "b"], {"m": ("#000000", [Spread(1, 0.1, 2), Spread(2, 0.1, 2)]),
-                           "n": ("#111111", [Spread(3, 0.1, 2), Spread(4, 0.1, 2)])}, "mrad", "t").axes[0]  # fmt: skip
+    m, n = [MeanStd(1, 0.1, 2), MeanStd(2, 0.1, 2)], [MeanStd(3, 0.1, 2), MeanStd(4, 0.1, 2)]
+    ax = bars(["a", "b"], {"m": ("#000000", m), "n": ("#111111", n)}, "mrad", "t").axes[0]
     heights = sorted(p.get_height() for p in ax.patches)
     assert heights == [1, 2, 3, 4]
     assert len({round(p.get_x(), 6) for p in ax.patches}) == 4

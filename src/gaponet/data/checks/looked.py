@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.base.executor import LOCAL, opened
-from gaponet.base.files import MARK
+from gaponet.base.executor import LOCAL, open_pool
+from gaponet.base.files import FOLDER_MARKER
 from gaponet.base.progress import Progress
 from gaponet.data.checks.touching import RATE, Heights, Standing
 from gaponet.data.holds import Holds
@@ -102,7 +102,7 @@ class Looked:
         if executor == LOCAL and (len(parts) < 2 or sum(e.rows + OWN for e in todo) < MANY):
             yield from ((pair[0], self._find([pair])[0]) for part in read for pair in part)
             return
-        with opened(executor, 0, 1) as pool:
+        with open_pool(executor, 0, 1) as pool:
             for part, found in zip(parts, pool.map(self._find, map(list, read)), strict=True):
                 yield from zip(part, found, strict=True)
 
@@ -124,7 +124,7 @@ class Looked:
         """Without waiting for the disk: a file that a power cut took half of has another hash."""
         content = self._hash(entry, both) + both
         folder = Path(self._elsewhere.name) if self._elsewhere else self.dataset.path / SURVEYS
-        temporary = folder / f"{MARK}-{os.getpid()}-{entry.id}"
+        temporary = folder / f"{FOLDER_MARKER}-{os.getpid()}-{entry.id}"
         try:
             folder.mkdir(exist_ok=True)
             temporary.write_bytes(content)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS, parse_json
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
@@ -50,10 +50,10 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
             yield _recording(file, name, motion)
 
 
-@inside(LogError, "numpy")
+@sandboxed(LogError, "numpy")
 def _read(file: Path) -> Any:
-    if file.stat().st_size > LARGEST_ARRAYS:
-        raise LogError(f"{file}: has more than {LARGEST_ARRAYS >> 20} MiB; split it into files of one motion")
+    if file.stat().st_size > MAX_ARRAYS_BYTES:
+        raise LogError(f"{file}: has more than {MAX_ARRAYS_BYTES >> 20} MiB; split it into files of one motion")
     return pickles.load(file.read_bytes(), str(file))
 
 

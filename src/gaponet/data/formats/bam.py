@@ -78,7 +78,7 @@ def read(
     if not files:
         raise LogError(f"{path}: no recording of BAM (JSON with trajectory and entries)")
     for file in files:
-        told = read_json(BamFile, file, LogError, "record it again, or leave the file out", more=True)
+        told = read_json(BamFile, file, LogError, "record it again, or leave the file out", allow_extra=True)
         yield told["trajectory"], partial(_log, file, told, robot, joint_map)
 
 

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import WIDEST, Recording, Signal, reading
 from gaponet.data.formats import DESCRIBED, files_under
@@ -50,13 +50,13 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         arrays = _listed(file)
         demos = sorted({"/".join(n.split("/")[:2]) for n in arrays if n.startswith("data/")}, key=_by_number)
         for demo in demos or [""]:
-            inside = {n.removeprefix(demo).lstrip("/"): labels for n, labels in arrays.items() if n.startswith(demo)}
+            members = {n.removeprefix(demo).lstrip("/"): labels for n, labels in arrays.items() if n.startswith(demo)}
             part = demo.rpartition("/")[2]
             name = f"{file.stem}-{part}" if part else file.stem
-            aloha = not demo and {"action", "observations/qpos"} <= inside.keys()
+            aloha = not demo and {"action", "observations/qpos"} <= members.keys()
             yield Recording(
-                name, f"{file}#{part}" if part else str(file), inside, partial(_load, file, demo), str(file),
-                (str(file),), default=_there(ALOHA, inside) if aloha else LogsFile(),
+                name, f"{file}#{part}" if part else str(file), members, partial(_load, file, demo), str(file),
+                (str(file),), default=_there(ALOHA, members) if aloha else LogsFile(),
             )  # fmt: skip
 
 
@@ -78,7 +78,7 @@ def _opened(file: Path) -> Iterator[Any]:
         yield root
 
 
-@inside(LogError, "h5py")
+@sandboxed(LogError, "h5py")
 def _listed(file: Path) -> dict[str, tuple[str, ...]]:
     with _opened(file) as root:
         return _arrays(root)
@@ -108,13 +108,13 @@ def _arrays(root: Any) -> dict[str, tuple[str, ...]]:
     return dict(sorted(found.items()))
 
 
-@inside(LogError, "h5py")
+@sandboxed(LogError, "h5py")
 def _load(file: Path, demo: str, names: list[str]) -> dict[str, Signal]:
     with _opened(file) as root:
         found = {}
         for name in names:
             item = root[f"{demo}/{name}".lstrip("/")]
-            if item.size * 8 > LARGEST_ARRAYS:
+            if item.size * 8 > MAX_ARRAYS_BYTES:
                 raise LogError(f"{file}: {name} has {item.shape} numbers; cut the log into shorter ones")
             found[name] = Signal(np.asarray(item[()], float))
         return found

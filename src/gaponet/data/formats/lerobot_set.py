@@ -140,7 +140,7 @@ def sets_under(path: Path) -> list[Set]:
 
 
 def _open(file: Path) -> Set:
-    info = read_json(Info, file, LogError, AGAIN, more=True)
+    info = read_json(Info, file, LogError, AGAIN, allow_extra=True)
     version = info["codebase_version"]
     if version.split(".")[0] not in VERSIONS:
         raise LogError(
@@ -150,7 +150,7 @@ def _open(file: Path) -> Set:
     root, features = file.parents[1], info["features"]
     ours = file.with_name(OURS)
     told = (
-        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", more=True)
+        read_json(Ours, ours, LogError, "restore it, or delete it to read the set as a stock one", allow_extra=True)
         if ours.is_file()
         else None
     )
@@ -163,7 +163,7 @@ def _open(file: Path) -> Set:
         raise LogError(f"{root}: meta/episodes lists no episode; {AGAIN}")
     episodes.sort(key=lambda e: e["episode_index"])
     known = {
-        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, more=True)
+        f: validated(Feature, features[f], f"{file}: features.{f}", LogError, AGAIN, allow_extra=True)
         for f in FEATURES.values()
         if f in features
     }
@@ -179,7 +179,9 @@ def _open(file: Path) -> Set:
 def _listed(file: Path, chunk: int) -> list[dict[str, Any]]:
     """Episodes of a v2.1 set, a line of JSON each."""
     lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
-    rows = [parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, more=True) for i, line in enumerate(lines, 1)]
+    rows = [
+        parse_json(Listed, line, f"{file}:{i}", LogError, AGAIN, allow_extra=True) for i, line in enumerate(lines, 1)
+    ]
     return [dict(r) | {"data/chunk_index": r["episode_index"] // chunk} for r in rows]
 
 
@@ -188,7 +190,7 @@ def _episodes(file: Path, ours: Ours | None) -> list[dict[str, Any]]:
     hint = f"restore it, or delete meta/{OURS} to read the set as a stock one" if ours else AGAIN
     table = read_table(file, (*NEEDED, *said), ("tasks", "content_hash", "findings"), hint)
     rows = _rows(file, table)
-    known = validated(list[Episode], rows, file, LogError, AGAIN, more=True)
+    known = validated(list[Episode], rows, file, LogError, AGAIN, allow_extra=True)
     return [_state(row, file, hint) if ours else row for row in cast("list[dict[str, Any]]", known)]
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading
 from gaponet.data.formats import DESCRIBED, files_under
@@ -38,7 +38,7 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         yield Recording.of_arrays(file, _read(file))
 
 
-@inside(LogError, "scipy.io")
+@sandboxed(LogError, "scipy.io")
 def _read(file: Path) -> dict[str, Any]:
     from scipy.io import loadmat
 

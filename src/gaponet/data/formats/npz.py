@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS, parse_json
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES, parse_json
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading, restated
 from gaponet.data.formats import DESCRIBED, files_under, pickles
@@ -94,13 +94,13 @@ def _motions(file: Path, arrays: dict[str, Any], names: tuple[str, ...]) -> Iter
         )
 
 
-@inside(LogError, "numpy")
+@sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array; those of objects by a safe unpickler."""
     with reading(file, "npz file"), zipfile.ZipFile(file) as packed:
         parts = packed.infolist()
-        if sum(part.file_size for part in parts) > LARGEST_ARRAYS:
-            raise LogError(f"{file}: unpacks to more than {LARGEST_ARRAYS >> 20} MiB; split it")
+        if sum(part.file_size for part in parts) > MAX_ARRAYS_BYTES:
+            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; split it")
         return {p.filename.removesuffix(".npy"): _array(packed.read(p), f"{file}: {p.filename}") for p in parts}
 
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, reading
 from gaponet.data.formats import DESCRIBED, files_under, pickles
@@ -59,12 +59,12 @@ def recordings(path: Path, told: LogsFile) -> Iterator[Recording]:
         yield Recording.of_arrays(file, arrays, default=gains)
 
 
-@inside(LogError, "numpy")
+@sandboxed(LogError, "numpy")
 def _read(file: Path) -> dict[str, Any]:
     """Every array of numbers; others are left alone."""
     with reading(file, ".pt file of tensors"), zipfile.ZipFile(file) as packed:  # as torch 1.6 and later write
-        if sum(part.file_size for part in packed.infolist()) > LARGEST_ARRAYS:
-            raise LogError(f"{file}: unpacks to more than {LARGEST_ARRAYS >> 20} MiB; cut it into shorter logs")
+        if sum(part.file_size for part in packed.infolist()) > MAX_ARRAYS_BYTES:
+            raise LogError(f"{file}: unpacks to more than {MAX_ARRAYS_BYTES >> 20} MiB; cut it into shorter logs")
         top = next((n.removesuffix("data.pkl") for n in packed.namelist() if n.endswith("/data.pkl")), None)
         if top is None:
             raise LogError(f"{file}: a zip file without data.pkl, so not what torch.save writes; is it the right file?")

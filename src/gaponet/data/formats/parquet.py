@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
-from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.base.sandbox import sandboxed
+from gaponet.base.structure import MAX_ARRAYS_BYTES
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
-@inside(LogError, "pyarrow.parquet")
+@sandboxed(LogError, "pyarrow.parquet")
 def header(file: Path) -> tuple[list[str], dict[str, str]]:
     """Names of the columns, in their order, and what the file says of itself beside."""
     import pyarrow.parquet as pq
@@ -26,7 +26,7 @@ def header(file: Path) -> tuple[list[str], dict[str, str]]:
         return list(schema.names), {k.decode("utf-8", "replace"): v.decode("utf-8", "replace") for k, v in said}
 
 
-@inside(LogError, "pyarrow.parquet")
+@sandboxed(LogError, "pyarrow.parquet")
 def read(file: Path, wanted: list[str]) -> pa.Table:
     """These columns.
 
@@ -40,10 +40,10 @@ def read(file: Path, wanted: list[str]) -> pa.Table:
         parts = [source.metadata.row_group(i) for i in range(source.metadata.num_row_groups)]
         chunks = (part.column(k) for part in parts for k in range(part.num_columns))
         values = sum(c.num_values for c in chunks if c.path_in_schema.split(".")[0] in wanted)
-        if 8 * values > LARGEST_ARRAYS:
+        if 8 * values > MAX_ARRAYS_BYTES:
             raise LogError(
                 f"{file}: {source.metadata.num_rows:,} rows of {len(wanted)} columns are {values:,} values, more than "
-                f"{LARGEST_ARRAYS >> 20} MiB; cut the log into shorter ones"
+                f"{MAX_ARRAYS_BYTES >> 20} MiB; cut the log into shorter ones"
             )
         return source.read(columns=wanted, use_threads=False).select(wanted)
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.structure import LARGEST_ARRAYS
+from gaponet.base.structure import MAX_ARRAYS_BYTES
 
 KINDS = "biufUS"  # of dtypes: numbers and text of fixed size
 STORAGES = {"Float": "f4", "Double": "f8", "Half": "f2", "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1",
@@ -79,7 +79,7 @@ class _Wrapped:
         if padding is not None:
             stream.seek(stream.read(1)[0], io.SEEK_CUR)
         size = int(np.prod([int(n) for n in shape], dtype=object)) * kind.real().itemsize
-        if not 0 <= size <= LARGEST_ARRAYS:
+        if not 0 <= size <= MAX_ARRAYS_BYTES:
             raise _RefusedError(f"an array of {size} bytes")
         data = stream.read(size)
         order: Any = "F" if state.get("order") == "F" else "C"
@@ -202,7 +202,7 @@ def load(data: bytes, where: str, storage: Callable[[str], bytes] | None = None)
     try:
         if data[:1] == b"\x78":
             packed = zlib.decompressobj()
-            data = packed.decompress(data, LARGEST_ARRAYS)
+            data = packed.decompress(data, MAX_ARRAYS_BYTES)
         return made(_Unpickler(io.BytesIO(data), storage).load())
     except Exception as error:  # a damaged stream makes the machine of a pickle fail in any way
         reason = " ".join(str(error).split())[:150] or type(error).__name__

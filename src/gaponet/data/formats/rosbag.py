@@ -23,7 +23,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
-from gaponet.base.sandbox import inside
+from gaponet.base.sandbox import sandboxed
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal, reading
 from gaponet.data.formats import DESCRIBED, files_under
@@ -132,7 +132,7 @@ def _known(reader: Any) -> list[Any]:
     return [c for c in reader.connections if c.msgcount and c.msgtype in known and not NOT_JOINTS.match(c.msgtype)]
 
 
-@inside(LogError, "rosbags.highlevel", 4.0)
+@sandboxed(LogError, "rosbags.highlevel", 4.0)
 def _peeked(bag: Path) -> dict[str, dict[str, tuple[str, ...]]]:
     with _opened(bag) as reader:
         return _peek(bag, reader)
@@ -169,7 +169,7 @@ def _load(bag: Path, meta: dict[str, Any], names: list[str]) -> dict[str, Signal
     return loaded
 
 
-@inside(LogError, "rosbags.highlevel", 4.0)
+@sandboxed(LogError, "rosbags.highlevel", 4.0)
 def _read(bag: Path, names: list[str]) -> tuple[dict[str, Signal], dict[str, Any]]:
     """The same, and notes."""
     with _opened(bag) as reader:

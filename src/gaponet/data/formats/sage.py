@@ -18,7 +18,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
-from gaponet.base.structure import LARGEST_ARRAYS, content
+from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.joints import resolve_all
 from gaponet.data.describe.limits import to_radians
 from gaponet.data.log import Channel, Log
@@ -85,7 +85,7 @@ def _read_motion(folder: Path, robot: RobotSpec, joint_map: dict[str, str] | Non
 def _read_csv(file: Path, n: int, kind: str) -> tuple[Array, dict[str, Array]]:
     """Time (k,) in seconds and {column: (k, n)}."""
     needed = "a SAGE motion needs control.csv and state_motor.csv, each of one recording"
-    first, _, body = content(file, LogError, needed, LARGEST_ARRAYS).partition(b"\n")
+    first, _, body = read_limited(file, LogError, needed, MAX_ARRAYS_BYTES).partition(b"\n")
     header = first.decode("utf-8", errors="replace").strip().lstrip("\ufeff")
     columns = [c.strip().lower() for c in header.split(",")]
     lists = columns[2:]
@@ -163,7 +163,7 @@ def _seconds(file: Path, time: Array) -> float:
 
 def _text(file: Path) -> str:
     try:
-        return content(file, LogError).decode()
+        return read_limited(file, LogError).decode()
     except UnicodeDecodeError as error:
         raise LogError(
             f"{file}: not UTF-8 text ({error.reason} at byte {error.start}); is it the right file?"

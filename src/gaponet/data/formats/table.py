@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from gaponet.base.errors import LogError
-from gaponet.base.structure import LARGEST_ARRAYS, content
+from gaponet.base.structure import MAX_ARRAYS_BYTES, read_limited
 from gaponet.data.describe.logs_file import LogsFile
 from gaponet.data.describe.recording import Recording, Signal
 from gaponet.data.formats import DESCRIBED, files_under, parquet
@@ -118,7 +118,7 @@ def _read_csv(file: Path, names: list[str], first: int, wanted: list[str]) -> di
     import pyarrow as pa
     import pyarrow.csv as pc
 
-    body = content(file, LogError, "cut the log into shorter ones", LARGEST_ARRAYS)
+    body = read_limited(file, LogError, "cut the log into shorter ones", MAX_ARRAYS_BYTES)
     line, _, rest = body.partition(b"\n")
     delimiter = _delimiter(line.decode("utf-8", "replace"))
     body = (rest if first else body.removeprefix(b"\xef\xbb\xbf")).rstrip()

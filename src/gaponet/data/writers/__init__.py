@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.files import MARK, sync, write_text, writing
-from gaponet.base.progress import Progress, silent
+from gaponet.base.files import FOLDER_MARKER, flush_to_disk, lock_folder, write_text
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.store import Dataset, Entry
 from gaponet.robot.spec import RobotSpec
 
@@ -36,7 +36,9 @@ class Written:
     fps: float
 
 
-def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = silent) -> list[Written]:
+def export(
+    dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progress: Progress = no_progress
+) -> list[Written]:
     """Write a dataset in a format of others.
 
     Args:
@@ -62,22 +64,22 @@ def export(dataset: Dataset, robot: RobotSpec, out: str | Path, to: str, progres
         done += 1
         progress(done, len(dataset), motion)
 
-    temporary = out.with_name(f"{MARK}-{out.name}")
-    with writing(temporary, "export"):
+    temporary = out.with_name(f"{FOLDER_MARKER}-{out.name}")
+    with lock_folder(temporary, "export"):
         _empty(temporary)  # of an export that was killed
         try:
             written = writer.write(dataset, robot, temporary, tell)
             if getattr(writer, "SHEET", False):
                 _describe(dataset, temporary)
             for path in temporary.rglob("*"):
-                sync(path)
+                flush_to_disk(path)
             if out.exists():
                 out.rmdir()
             temporary.rename(out)
         except BaseException:
             _empty(temporary)
             raise
-        (out / MARK).unlink()
+        (out / FOLDER_MARKER).unlink()
     return [replace(w, path=out / w.path) for w in written]
 
 
@@ -108,7 +110,7 @@ def stated(entry: Entry) -> str:
 
 def _empty(folder: Path) -> None:
     for child in folder.iterdir():
-        if child.name != MARK:
+        if child.name != FOLDER_MARKER:
             shutil.rmtree(child) if child.is_dir() else child.unlink()
 
 

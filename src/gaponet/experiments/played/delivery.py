@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.errors import UsageError
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.data.store import Dataset
 from gaponet.experiments.paper import TABLE_1, TABLE_1_METHODS
 from gaponet.experiments.played.deliver import HOLD, LAST, NEAR, Cost, Placed, ShownHand, deliver
@@ -106,17 +106,19 @@ def result(session: Session, found: ListOf[Placed], costs: ListOf[Cost], example
     return session.result("delivery", heading, tables, figures, sentences(found), **told)
 
 
-def by_method(name: str, found: ListOf[M], columns: Mapping[str, Callable[[list[M]], Spread]], caption: str) -> Table:
+def by_method(
+    name: str, found: ListOf[M], columns: Mapping[str, Callable[[list[M]], MeanStd]], caption: str
+) -> ResultTable:
     """A row per payload and method."""
     rows = [
         (f"{p:g} kg, {title(m)}", *(value(of(found, m, p)) for value in columns.values()))
         for p in payloads(found)
         for m in methods(found)
     ]
-    return Table(name, ("payload per hand", *columns), tuple(rows), caption)
+    return ResultTable(name, ("payload per hand", *columns), tuple(rows), caption)
 
 
-def offsets(found: ListOf[Placed]) -> Table:
+def offsets(found: ListOf[Placed]) -> ResultTable:
     """Offsets by axis, success, settling; by the true place and by the encoders'."""
     columns: dict[str, Any] = {f"{a}, cm": _along("offset", i) for i, a in enumerate(AXES)}
     columns["within 1 cm, %"] = lambda some: over_seeds(some, lambda d: d.near, 1e2)
@@ -132,7 +134,7 @@ def offsets(found: ListOf[Placed]) -> Table:
     return by_method("offsets", found, columns, caption)
 
 
-def beside_paper(found: ListOf[Placed]) -> Table:
+def beside_paper(found: ListOf[Placed]) -> ResultTable:
     """Table 1 as the paper has it, its numbers below ours."""
     shown = [m for m in TABLE_1_METHODS if m in methods(found)]
     columns = ["payload per hand", *(f"{title(m)}: {a}, cm" for m in shown for a in AXES)]
@@ -146,16 +148,16 @@ def beside_paper(found: ListOf[Placed]) -> Table:
         "Mean |hand − goal| by axis, as Table 1 of the paper, and its numbers: a real H1-2, goals and heights that are "
         "not known here. Its third column is the simulator's output, sent as it is: raw targets here."
     )
-    return Table("table1", tuple(columns), tuple(rows), caption)
+    return ResultTable("table1", tuple(columns), tuple(rows), caption)
 
 
-def moving(found: ListOf[Placed]) -> Table:
+def moving(found: ListOf[Placed]) -> ResultTable:
     """How far the hand is from its target while it lifts and lowers."""
     columns = {f"{way}ing, {a}, cm": _along("moving", i, way) for way in ("lift", "lower") for i, a in enumerate(AXES)}
     return by_method("moving", found, columns, "Mean |hand − its target| on ways that rise or fall by 5 cm or more.")
 
 
-def spent(costs: ListOf[Cost]) -> Table:
+def spent(costs: ListOf[Cost]) -> ResultTable:
     """Torque and heat."""
     columns: dict[str, Any] = {
         "motor torque, N·m RMS": lambda some: over_seeds(some, lambda c: c.torque),
@@ -164,7 +166,7 @@ def spent(costs: ListOf[Cost]) -> Table:
     return by_method("cost", costs, columns, "Operated joints: torque while holding, warming over a trajectory.")
 
 
-def _along(field: str, a: int, way: str | None = None) -> Callable[[list[Placed]], Spread]:
+def _along(field: str, a: int, way: str | None = None) -> Callable[[list[Placed]], MeanStd]:
     """One axis of a field, cm; on ways that lift or lower alone where that is said."""
     return lambda some: over_seeds([d for d in some if way in (None, d.way)], lambda d: getattr(d, field)[a], 1e2)
 
@@ -201,10 +203,10 @@ def draw_offsets(found: ListOf[Placed]) -> Figure:
     fig, masses = figure(10.2, 3.5), payloads(found)
     for a, ax in enumerate(fig.subplots(1, 3)):
 
-        def over_goals(method: str, payload: float, a: int = a) -> Spread:
+        def over_goals(method: str, payload: float, a: int = a) -> MeanStd:
             values = np.array([d.offset[a] for d in of(found, method, payload)]) * 1e2
             goals = max(len(values) // len({d.seed for d in of(found, method)}), 1)
-            return Spread(float(values.mean()), float(values.std() / np.sqrt(goals)), goals)
+            return MeanStd(float(values.mean()), float(values.std() / np.sqrt(goals)), goals)
 
         draw_bars(ax, [f"{p:g} kg" for p in masses], series(found, masses, over_goals))
         ax.axhline(NEAR * 1e2, color="#111111", lw=0.7, ls=DASHED)

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gaponet import __version__
-from gaponet.base.json_file import finite, write_json
+from gaponet.base.files import json_compatible, write_json
 from gaponet.experiments.kept import read_kept
 
 T = TypeVar("T")
@@ -37,7 +37,7 @@ class KeptParts:
             facts: What this part depends on besides; functions are called for theirs, when something is kept.
         """
         if self.folder is None:
-            return json.loads(json.dumps(finite(make())))
+            return json.loads(json.dumps(json_compatible(make())))
         known = [f() if callable(f) else f for f in facts]
         file = self.folder / f"{_digest([self._common, known])[:16]}.json"
         if not file.is_file():
@@ -53,7 +53,7 @@ class KeptParts:
 
 
 def _digest(facts: Any) -> str:
-    return hashlib.sha256(json.dumps(finite(facts), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(json_compatible(facts), sort_keys=True).encode()).hexdigest()
 
 
 def revived(kind: type[T], record: dict[str, Any]) -> T:

@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-from gaponet.base.spread import Spread
+from gaponet.base.result_table import MeanStd
 from gaponet.report.figures.colours import colour
 from gaponet.report.methods import title
 
@@ -50,16 +50,16 @@ def of(found: Iterable[M], method: str | None = None, payload: float | None = No
     return [m for m in found if method in (None, m.method) and payload in (None, m.payload)]
 
 
-def over_seeds(found: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, middle: Any = np.mean) -> Spread:
+def over_seeds(found: ListOf[M], value: Callable[[M], Any], scale: float = 1.0, middle: Any = np.mean) -> MeanStd:
     """The mean (or another middle) of each seed, over seeds; a method without seeds gives one number."""
     by_seed: dict[int | None, list[float]] = {}
     for m in found:
         by_seed.setdefault(m.seed, []).append(value(m))
     finite = [[v for v in values if v == v] for values in by_seed.values()]
-    return Spread.of([float(middle(values)) for values in finite if values], scale)
+    return MeanStd.from_values([float(middle(values)) for values in finite if values], scale)
 
 
-def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], Spread]) -> dict[str, Any]:
+def series(found: ListOf[M], groups: ListOf[Any], value: Callable[[str, Any], MeanStd]) -> dict[str, Any]:
     """Bars of every method, one for each group."""
     return {title(m): (colour(m), [value(m, group) for group in groups]) for m in methods(found)}
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gaponet.base.errors import UsageError
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.data.card import count
 from gaponet.data.store import Dataset
 from gaponet.experiments.found import Found, spread
@@ -136,7 +136,7 @@ def _new(words: ListOf[str], *known: str) -> list[str]:
     return [w for w in dict.fromkeys(words) if w not in known]
 
 
-def card(data: Dataset, robot: RobotSpec) -> Table:
+def card(data: Dataset, robot: RobotSpec) -> ResultTable:
     """What the dataset holds beside what the paper counts."""
     entries = data.entries
     here = count(entries) | {
@@ -151,19 +151,19 @@ def card(data: Dataset, robot: RobotSpec) -> Table:
         "The paper's counts do not agree with each other: 28.46 h at 50 Hz are 5.1 million frames, and 257,493 frames "
         "of 11,198 sequences are 23 frames each. Signals: channels that any sequence holds."
     )
-    return Table("card", ("what", "the paper", "here"), tuple(rows), caption)
+    return ResultTable("card", ("what", "the paper", "here"), tuple(rows), caption)
 
 
 def _listed(values: Any) -> str:
     return ", ".join(f"{v:g}" for v in sorted(set(values)))
 
 
-def claims(scores: ListOf[Score], placed: ListOf[Placed], joints: tracking.Joints) -> Table:
+def claims(scores: ListOf[Score], placed: ListOf[Placed], joints: tracking.Joints) -> ResultTable:
     """What the paper claims, and the same of each model here: how much less error, %."""
     learned = [m for m in LEARNED if m in methods(scores)]
     rows: list[tuple[Any, ...]] = []
 
-    def less(some: ListOf[Any], base: float, value: Callable[[Any], float]) -> list[Spread]:
+    def less(some: ListOf[Any], base: float, value: Callable[[Any], float]) -> list[MeanStd]:
         return [over_seeds(of(some, m), lambda measured: cut(value(measured), base)) for m in learned]
 
     for part in dict.fromkeys(s.part for s in scores):
@@ -182,14 +182,16 @@ def claims(scores: ListOf[Score], placed: ListOf[Placed], joints: tracking.Joint
         f"Per cent less error, mean ± std over seeds; Q_dis of {joints[0]}. The paper says Q_dis once of simulator and "
         "robot (alignment) and once of target and robot (compensation)."
     )
-    return Table("claims", ("claim", "the paper, %", *(f"{title(m)}, %" for m in learned)), tuple(rows), caption, 0)
+    return ResultTable(
+        "claims", ("claim", "the paper, %", *(f"{title(m)}, %" for m in learned)), tuple(rows), caption, 0
+    )
 
 
 def _along(axis: int, measured: Placed) -> float:
     return float(measured.offset[axis])
 
 
-def ratios(placed: ListOf[Placed]) -> Table:
+def ratios(placed: ListOf[Placed]) -> ResultTable:
     """Offsets of GAPONet as shares of the MLP's and of raw targets', as the printed Table 1 gives them and here."""
     shown = [m for m in (FORM, "gaponet") if m in methods(placed)]
     rows: list[tuple[Any, ...]] = []
@@ -205,10 +207,10 @@ def ratios(placed: ListOf[Placed]) -> Table:
         "Mean |offset| along an axis as a share of that of the MLP and of raw targets. The paper's text claims 0.6 in "
         "X and Y and 0.3 in Z against the MLP; its own table gives the shares in the first columns."
     )
-    return Table("ratios", columns, tuple(rows), caption)
+    return ResultTable("ratios", columns, tuple(rows), caption)
 
 
-def table_2(found: Found, study: Study, *extra: Setting) -> Table:
+def table_2(found: Found, study: Study, *extra: Setting) -> ResultTable:
     """Table 2 of the paper with the rows of one network, and the paper's row behind each."""
     masses = sorted({e.meta.payload_mass for e in study.data.entries})
     columns = ("setting", "Obs Dim", *(f"{m:g} kg" for m in masses), "eight joints", "of nominal", "the paper")
@@ -219,7 +221,7 @@ def table_2(found: Found, study: Study, *extra: Setting) -> Table:
         "without wrists, all payloads. The paper: Obs Dim, then mrad at 0, 1, 2 and 3 kg. Its action duration stands "
         "twice: correction held, sensors held."
     )
-    return Table(f"table2_{kind}", columns, tuple(rows), caption)
+    return ResultTable(f"table2_{kind}", columns, tuple(rows), caption)
 
 
 def _row(found: Found, study: Study, masses: list[float], setting: Setting) -> tuple[Any, ...]:
@@ -231,6 +233,6 @@ def _row(found: Found, study: Study, masses: list[float], setting: Setting) -> t
         study.variant(word).config.model.observation_dim(n),
         *(spread(runs, "known", "by_payload", f"{m:g}", "mpjae") for m in masses),
         spread(runs, "known", "mpjae_no_wrist"),
-        Spread.of([run["known"]["mpjae"] / nominal for run in runs]),
+        MeanStd.from_values([run["known"]["mpjae"] / nominal for run in runs]),
         f"{printed.obs_dim}: {' '.join(f'{v * 1e3:.0f}' for v in printed.mpjae)}" if printed else "",
     )

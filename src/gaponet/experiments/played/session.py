@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.base.spread import Table
+from gaponet.base.result_table import ResultTable
 from gaponet.data.store import Dataset
 from gaponet.deploy.compensator import CompensatorConfig
 from gaponet.experiments.options import MODELS, Options
@@ -126,7 +126,7 @@ class Session:
         return who, fleet.unit(who), asked.payloads or tuple({seen[0]: 0, seen[-1]: 0} if self.quick else seen)
 
     def result(
-        self, name: str, heading: str, tables: ListOf[Table], figures: Mapping[str, Any], sentences: ListOf[str],
+        self, name: str, heading: str, tables: ListOf[ResultTable], figures: Mapping[str, Any], sentences: ListOf[str],
         config: CompensatorConfig | None = None, **more: Any,
     ) -> Result:  # fmt: skip
         """Everything together, with what it takes to repeat it; config as the unit was driven by, if it was played."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gaponet.base.spread import Spread, Table
+from gaponet.base.result_table import MeanStd, ResultTable
 from gaponet.experiments.played.measured import (
     LEFT_OUT,
     RIVALS,
@@ -143,7 +143,7 @@ def by_source(scores: ListOf[Score]) -> dict[str, list[Score]]:
     return {source: [s for s in scores if s.source == source] for source in dict.fromkeys(s.source for s in scores)}
 
 
-def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
+def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> ResultTable:
     """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
     of_part = [s for s in scores if s.part == part]
     names, masses = methods(of_part), payloads(of_part)
@@ -158,10 +158,10 @@ def by_payload(scores: ListOf[Score], part: str, sets: ListOf[Joints]) -> Table:
                 rows.append((where, *values.values(), *cuts))
     heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
     caption = f"Mean Q_dis per joint, rad·s, {WHAT[part]}; ± is the spread of training seeds."
-    return Table(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
+    return ResultTable(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
 
 
-def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> Table:
+def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
     """The same joint by joint and payload by payload."""
     of_part = [s for s in scores if s.part == part]
     names = methods(of_part)
@@ -172,19 +172,21 @@ def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> Table:
         for i, joint in enumerate(robot.operated)
     ]
     head = ("Q_dis, rad·s", *(title(m) for m in names))
-    return Table(f"{part}-joints", head, tuple(rows), f"Q_dis {WHAT[part]}, joint by joint.", digits=4)
+    return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {WHAT[part]}, joint by joint.", digits=4)
 
 
-def _motions(motions: ListOf[Unseen], robot: RobotSpec) -> Table:
+def _motions(motions: ListOf[Unseen], robot: RobotSpec) -> ResultTable:
     rows = [(m.name, SOURCES[m.source], len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions]
     caption = (
         "None was trained or chosen on: the motion of training or validation that is most like it, and how far apart "
         "their targets are."
     )
-    return Table("motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1)
+    return ResultTable(
+        "motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1
+    )
 
 
-def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> Spread:
+def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
     """Mean over motions and joints, over seeds."""
     return over_seeds(of(scores, method), lambda s: s.q_dis[columns].mean())
 
@@ -205,7 +207,7 @@ def sentences(scores: ListOf[Score], part: str, joints: Joints) -> list[str]:
     return said
 
 
-def _pick(values: dict[str, list[Spread]], method: str, joint: int) -> Spread:
+def _pick(values: dict[str, list[MeanStd]], method: str, joint: int) -> MeanStd:
     return values[method][joint]
 
 
@@ -231,14 +233,14 @@ def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
     return fig
 
 
-def over_motions(scores: ListOf[Score]) -> list[Spread]:
+def over_motions(scores: ListOf[Score]) -> list[MeanStd]:
     """Mean over motions and its standard error for each joint, seeds averaged first."""
     by_motion: dict[str, list[Any]] = {}
     for s in scores:
         by_motion.setdefault(s.motion, []).append(s.q_dis)
     values = np.array([np.mean(v, axis=0) for v in by_motion.values()])  # (motions, n)
-    found = [Spread.of(column) for column in values.T]
-    return [replace(f, std=f.error) for f in found]
+    found = [MeanStd.from_values(column) for column in values.T]
+    return [replace(f, std=f.standard_error) for f in found]
 
 
 def draw_example(shown: ShownMotion, robot: RobotSpec, tag: str) -> Figure:

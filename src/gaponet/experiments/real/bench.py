@@ -16,8 +16,7 @@ import numpy as np
 
 from gaponet import plugins
 from gaponet.base.errors import GAPONetError, UsageError
-from gaponet.base.files import write_text
-from gaponet.base.json_file import finite
+from gaponet.base.files import json_compatible, write_text
 from gaponet.experiments.real.adversaries import ADVERSARIES, Adversary
 from gaponet.experiments.real.cards import Card, Cards, prepare
 from gaponet.experiments.real.questions import Question, floor, questions, recorded
@@ -52,7 +51,7 @@ class Row:
     def as_dict(self) -> dict[str, Any]:
         """For JSON: mrad, with the standard error over motions, of differences paired."""
         less = 1e3 * (self.nominal - self.error)
-        return finite({
+        return json_compatible({
             "set": self.set, "question": self.question, "method": self.method, "mrad": 1e3 * self.error.mean(),
             "standard_error": 1e3 * standard_error(self.error), "of_nominal": self.error.mean() / self.nominal.mean(),
             "less_than_nominal": less.mean(), "less_standard_error": standard_error(less), "motions": len(self.error),

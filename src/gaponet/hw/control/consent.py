@@ -6,7 +6,7 @@ import os
 import sys
 
 from gaponet.base.errors import UsageError
-from gaponet.base.text import plain
+from gaponet.base.text import escape
 
 
 def require_terminal(option: str = "--yes") -> int:
@@ -48,7 +48,7 @@ def require_consent(
     import termios  # not on Windows
 
     termios.tcflush(descriptor, termios.TCIFLUSH)  # an answer typed before the question was shown answers nothing
-    sys.stderr.write(f"{plain(what)} {question} Type '{word}' to start; anything else leaves: ")
+    sys.stderr.write(f"{escape(what)} {question} Type '{word}' to start; anything else leaves: ")
     sys.stderr.flush()
     line = os.read(descriptor, 1024).decode(errors="replace")  # not sys.stdin, which may hold earlier bytes
     if not line.endswith("\n"):  # end of file, also behind a word

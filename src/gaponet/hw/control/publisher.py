@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import lock
+from gaponet.base.files import lock_file
 
 LOCKS = Path("/tmp")  # the same for all users of the computer, whatever TMPDIR says
 
@@ -28,7 +28,7 @@ def sole_publisher(address: str) -> Iterator[int]:
     name = re.sub(r"[^A-Za-z0-9]+", "-", _device(address)).strip("-")
     path = LOCKS / f"gaponet-{name}.lock"
     try:
-        descriptor = lock(path, _opened)
+        descriptor = lock_file(path, _opened)
     except OSError as error:
         raise UsageError(f"{address}: its lock {path} cannot be opened ({error.strerror}); ask its owner") from None
     if descriptor is None:

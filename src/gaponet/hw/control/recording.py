@@ -13,7 +13,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError
-from gaponet.base.files import whole, write_text, writing
+from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.data.formats.table import NOT_OBEYED
 from gaponet.data.log import Channel, Log
 from gaponet.hw.control.rows import CYCLES, READINGS, Rows
@@ -64,7 +64,7 @@ class Recording:
         Raises:
             FolderError, OSError: Nothing can be written there.
         """
-        with writing(folder, KIND):
+        with lock_folder(folder, KIND):
             self.rows.grow_in(folder)
 
     @property
@@ -142,7 +142,7 @@ class Recording:
         Raises:
             OSError: A file could not be written; the periods that grew in this folder are kept all the same.
         """
-        with writing(folder, KIND):
+        with lock_folder(folder, KIND):
             return self._save(folder, name)
 
     def _save(self, folder: Path, name: str) -> Path:
@@ -160,7 +160,7 @@ class Recording:
                 for channel, (_, values) in log.channels.items():
                     columns |= {f"{channel}.{j}": values[:, i] for i, j in enumerate(log.joint_names)}
                 table = pa.table(columns, metadata={NOT_OBEYED: self.not_obeyed} if self.not_obeyed else None)
-                with whole(path) as temporary:
+                with atomic_write(path) as temporary:
                     pq.write_table(table, temporary)
             write_text(folder / f"{name}.json", json.dumps(self.summary(), indent=1, ensure_ascii=False) + "\n")
         except OSError as error:

@@ -18,7 +18,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.hw.control.driver import State
 
 CYCLES = ".cycles.npy"
@@ -108,7 +108,7 @@ class Rows:
             self.path = path
             return
         rows = self.table()
-        with whole(path) as temporary, temporary.open("wb") as file:
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
             file.write(self._header(len(rows)))
             for at in range(0, len(rows), CHUNK):
                 file.write(rows[at : at + CHUNK].tobytes())

@@ -20,7 +20,7 @@ import sys
 import time
 from typing import Any
 
-from gaponet.base import child
+from gaponet.base import child_process
 from gaponet.hw.control.driver import Driver, DriverError
 
 RELEASE = b"\xff"
@@ -43,7 +43,7 @@ class Watchdog:
         """
         text = json.dumps(spec | {"hang": hang, "damp": damp})
         self._process = subprocess.Popen(
-            child.words("gaponet.hw.control.watchdog", text),
+            child_process.module_command("gaponet.hw.control.watchdog", text),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=(lock,), start_new_session=True, bufsize=0,
         )  # fmt: skip
         assert self._process.stdin

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gaponet.base.arrays import Array, copy_of, library, like, zeros_like
+from gaponet.base.arrays import Array, array_like, array_module, copy_array, zeros_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.nn.config import ModelConfig
@@ -135,7 +135,7 @@ class DeltaEnv:
         # Of each simulation the row that it stands at, its recording's first and last, and periods since the reset: on
         # the host, which thus need not ask the device who ended; the row and the last are there as well.
         self.row, self.first, self.last, self.elapsed = (np.zeros(num, np.int64) for _ in ROWS)
-        self.here, self.until = (copy_of(place(x)) for x in (self.row, self.last))
+        self.here, self.until = (copy_array(place(x)) for x in (self.row, self.last))
         self.now = zeros_like(self.track, num, self.track.shape[1])  # the recorded row, as in track
         self.target = zeros_like(self.sim.qpos, *sim.qpos.shape)
         self.shown = zeros_like(self.track, num, 1)  # 1 where the actor sees the recorded state
@@ -162,18 +162,18 @@ class DeltaEnv:
         """Actor and critic observations of the present row."""
         n, sim = self.num_actions, self.sim
         q, v = sim.qpos[:, self.at], sim.qvel[:, self.at]
-        actor = copy_of(self.loop.observe(q, v, self.now[:, 2 * n :], self.payload))
-        rows = library(self.here).minimum(self.here[:, None] + self.ahead, self.until[:, None])
+        actor = copy_array(self.loop.observe(q, v, self.now[:, 2 * n :], self.payload))
+        rows = array_module(self.here).minimum(self.here[:, None] + self.ahead, self.until[:, None])
         ahead = _rows_of(self.track, rows)  # (num_envs, rows ahead, 3n)
         # Relative to where the simulation stands: an error of 5 mrad is invisible in angles that span a radian.
         seen = [self.now[:, :n] - q, self.now[:, n : 2 * n] - v, (ahead[..., :n] - q[:, None]).reshape(len(q), -1),
                 (ahead[..., 2 * n :] - q[:, None]).reshape(len(q), -1), self.condition_features]  # fmt: skip
-        critic = _single(library(ahead).concatenate(seen, 1))
+        critic = _single(array_module(ahead).concatenate(seen, 1))
         return {"actor": torch.as_tensor(actor), "critic": torch.as_tensor(critic)}
 
     def _extra(self) -> Any:
         """What x holds behind [o_t | a_t] (nn/observation.py), (num_envs, …)."""
-        sim, join, parts = self.sim, library(self.now).concatenate, []
+        sim, join, parts = self.sim, array_module(self.now).concatenate, []
         if self.config.asks_simulator:
             parts.append(self.oracle(sim.qpos, sim.qvel).reshape(self.num_envs, -1))
         if self.config.real_state:
@@ -220,7 +220,7 @@ class DeltaEnv:
     def _reward(self) -> Any:
         c, n = self.reward_config, self.num_actions
         cost = (abs(self.sim.qpos[:, self.at] - self.now[:, :n]) / c.position).clip(max=c.cap)
-        cost = library(cost).nan_to_num(cost + self.unsaid)
+        cost = array_module(cost).nan_to_num(cost + self.unsaid)
         self.reward_sum = self.reward_sum - cost.mean()
         self.reward_count += 1
         return -_single(cost)
@@ -260,11 +260,11 @@ class DeltaEnv:
             getattr(self, name)[:] = arrays[name]
         self.here[:], self.until[:] = self.sim.array(self.row), self.sim.array(self.last)
         self.now[:] = self.track[self.here]
-        self.loop.history.frames[:] = like(self.loop.history.frames, arrays["frames"])
+        self.loop.history.frames[:] = array_like(self.loop.history.frames, arrays["frames"])
         for name in ("age", "x") if self.loop.holds else ():
-            getattr(self.loop, name)[:] = like(getattr(self.loop, name), arrays[name])
+            getattr(self.loop, name)[:] = array_like(getattr(self.loop, name), arrays[name])
         if self.config.real_state:
-            self.shown[:] = like(self.shown, arrays["shown"])
+            self.shown[:] = array_like(self.shown, arrays["shown"])
         self.sim.set_state(arrays)
         self.reward_sum, self.reward_count = state["reward"]
         self.rng_state = state["rng"]
@@ -274,7 +274,7 @@ def _rows_of(x: Any, rows: Any, out: Any = None) -> Any:
     """x[rows], or the same written into out for rows (k,)."""
     if isinstance(x, np.ndarray):
         return x.take(rows, axis=0, out=out)  # quicker than an index
-    return x[rows] if out is None else library(x).index_select(x, 0, rows, out=out)
+    return x[rows] if out is None else array_module(x).index_select(x, 0, rows, out=out)
 
 
 def _single(x: Any) -> Any:

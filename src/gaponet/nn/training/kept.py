@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import whole, write_text
+from gaponet.base.files import atomic_write, write_text
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
 from gaponet.nn.training.sensor_fit import Report
@@ -58,7 +58,7 @@ class Kept:
         if not ranks.rank():
             content = io.BytesIO()  # torch does not say which error it met on a disk
             torch.save(state | {"others": others}, content)
-            with whole(out / CHECKPOINT) as temporary:
+            with atomic_write(out / CHECKPOINT) as temporary:
                 temporary.write_bytes(content.getbuffer())
             self.write_progress(out)
 

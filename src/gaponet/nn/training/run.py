@@ -27,7 +27,7 @@ import torch
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.base.structure import validated
 from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains
@@ -108,7 +108,7 @@ class Trainer:
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
-        with ranks.on_first(writing(out, "run")):
+        with ranks.on_first(lock_folder(out, "run")):
             if resume:
                 self.kept, self.rng = Kept.read(out, self.net, self.kept.dataset)
             if not ranks.rank():
@@ -122,7 +122,7 @@ class Trainer:
         Raises:
             FolderError: Another process writes into the run.
         """
-        with ranks.on_first(writing(self.out, "run")):
+        with ranks.on_first(lock_folder(self.out, "run")):
             return self._run()
 
     def _run(self) -> GapModel:

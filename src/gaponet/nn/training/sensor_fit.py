@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaponet.base.arrays import Array, copy_of, host
+from gaponet.base.arrays import Array, copy_array, to_numpy
 from gaponet.base.errors import UsageError
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.sensor import ProbeOracle
@@ -71,9 +71,9 @@ def _fit_sensors(net: DeltaNet, env: DeltaEnv, states: int, seed: int, nthread: 
     while sum(map(len, xs)) < states:
         if not again:
             env.reset()
-        xs.append(host(env.get_observations()["actor"]))
-        qs.append(copy_of(host(env.sim.qpos)))
-        vs.append(copy_of(host(env.sim.qvel)))
+        xs.append(to_numpy(env.get_observations()["actor"]))
+        qs.append(copy_array(to_numpy(env.sim.qpos)))
+        vs.append(copy_array(to_numpy(env.sim.qvel)))
     x, q, v = (np.concatenate(part) for part in (xs, qs, vs))
     of = np.tile(np.arange(env.num_envs), len(xs))  # environment of each state
     pick = np.sort(rng.permutation(len(x))[:states])

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch.nn.functional import huber_loss
 
-from gaponet.base.arrays import Array, library
+from gaponet.base.arrays import Array, array_module
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
 from gaponet.nn.training.config import TrainConfig, WarmStartConfig
@@ -92,7 +92,7 @@ class WarmStart:
             xs.append(x[some].contiguous())
             ys.append(torch.as_tensor(y[some], device=x.device))
             if follow_labels:
-                delta = library(y).nan_to_num(y)
+                delta = array_module(y).nan_to_num(y)
             else:
                 with torch.inference_mode():
                     delta = net(x)

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.base.spread import Spread
+from gaponet.base.result_table import MeanStd
 from gaponet.report.figures.style import DASHED, DOTTED, LETTER, figure, legend, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-Bars = Mapping[str, tuple[str, ListOf[Spread]]]  # label → colour, value of each group
+Bars = Mapping[str, tuple[str, ListOf[MeanStd]]]  # label → colour, value of each group
 LEAST = 0.06  # rad, of an axis of positions
 
 
@@ -46,7 +46,7 @@ def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = 
     ax.grid(axis="x", visible=False)
 
 
-def spreads(values: ListOf[Spread]) -> Array | None:
+def spreads(values: ListOf[MeanStd]) -> Array | None:
     """Lengths of error bars; None where nothing was measured twice."""
     std = np.array([v.std if v.std == v.std else 0.0 for v in values])
     return std if std.any() else None
@@ -139,7 +139,7 @@ def _positions(
 
 @styled
 def lines(
-    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[Spread]]]]],
+    panels: ListOf[tuple[str, Mapping[str, tuple[str, ListOf[float], ListOf[MeanStd]]]]],
     axes: tuple[str, str],
     ticks: ListOf[tuple[float, str]] = (),
     log: bool = False,

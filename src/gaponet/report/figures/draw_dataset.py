@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import writing
-from gaponet.base.progress import Progress, silent
+from gaponet.base.files import lock_folder
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.repeatability import MOVED
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset, Entry
@@ -32,7 +32,7 @@ SHOWN_S = 12.0  # s of a long motion
 
 
 def draw_all(
-    dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = silent
+    dataset: Dataset, robot: RobotSpec, out: Path, progress: Progress = no_progress
 ) -> tuple[list[Path], dict[str, str]]:
     """Write every picture that the dataset has data for.
 
@@ -47,13 +47,13 @@ def draw_all(
     dataset.require_robot(robot)
     if not dataset.entries:
         raise DatasetError(f"{dataset.path}: holds no sequences yet; import or collect some")
-    with writing(out, "figures"):
+    with lock_folder(out, "figures"):
         figures, left_out = pictures(dataset, robot, progress=progress)
         return [file for name, fig in figures.items() for file in save(fig, out / name)], left_out
 
 
 def pictures(
-    dataset: Dataset, robot: RobotSpec, names: tuple[str, ...] = (), progress: Progress = silent
+    dataset: Dataset, robot: RobotSpec, names: tuple[str, ...] = (), progress: Progress = no_progress
 ) -> tuple[dict[str, Figure], dict[str, str]]:
     """The pictures of these names, all by default; and {picture: why it was left out}."""
     figures, left_out = dict[str, Figure](), dict[str, str]()

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gaponet.base.arrays import Array
-from gaponet.base.spread import Spread
+from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MOVED
 from gaponet.data.signals import busiest
 from gaponet.report.figures.charts import Course, against, bars, lines
@@ -31,7 +31,10 @@ def by_payload(methods: dict[str, Any]) -> Figure:
 
 def _bars(methods: dict[str, Any], group: str, heading: str, label: Callable[[str], str]) -> Figure:
     keys = list(methods["nominal"][group])
-    values = {title(n): (colour(n), [Spread.of([m[group][k]["mpjae"]], 1e3) for k in keys]) for n, m in methods.items()}
+    values = {
+        title(n): (colour(n), [MeanStd.from_values([m[group][k]["mpjae"]], 1e3) for k in keys])
+        for n, m in methods.items()
+    }
     return _degrees(bars([label(k) for k in keys], values, "mrad", heading))
 
 
@@ -44,7 +47,7 @@ def by_horizon(methods: dict[str, Any]) -> Figure:
         title(n): (
             colour(n),
             [at for at, _ in ticks],
-            [Spread.of([m["by_horizon"][k]["mpjae"]], 1e3) for k in (*keys, "whole")],
+            [MeanStd.from_values([m["by_horizon"][k]["mpjae"]], 1e3) for k in (*keys, "whole")],
         )
         for n, m in methods.items()
     }

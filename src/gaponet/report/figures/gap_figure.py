@@ -8,7 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from gaponet.base.files import write_text, writing
+from gaponet.base.files import lock_folder, write_text
 from gaponet.report.figures.colours import colour, shade
 from gaponet.report.figures.style import figure, joint_label, save, styled
 from gaponet.report.methods import title
@@ -19,7 +19,7 @@ FLOOR = "#1f7a56"
 
 def write_gap(found: dict[str, Any], folder: Path, kind: str) -> None:
     """What eval.gap.gap_by_step found, as gap.json, gap.svg and gap.png of a folder: a robot or a run."""
-    with writing(folder, kind):
+    with lock_folder(folder, kind):
         write_text(folder / "gap.json", json.dumps(found, indent=1) + "\n")
         save(waterfall(found), folder / "gap")
 

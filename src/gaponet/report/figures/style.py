@@ -7,8 +7,8 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
-from gaponet.base.files import whole
-from gaponet.base.text import plain
+from gaponet.base.files import atomic_write
+from gaponet.base.text import escape
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def _printable(fig: Figure) -> Figure:
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
     def lines(text: str, most: int) -> str:
-        every = map(plain, text.split("\n"))
+        every = map(escape, text.split("\n"))
         return "\n".join(s if len(s) <= most else f"{s[: most // 2]}…{s[-most // 2 :]}" for s in every)
 
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
@@ -108,6 +108,6 @@ def save(fig: Figure, path: Path) -> list[Path]:
     how: list[dict[str, Any]] = [{"metadata": {"Date": None}}, {"dpi": 200}]
     with mpl.rc_context(STYLE | {"svg.fonttype": "path"}):
         for file, options in zip(files, how, strict=True):
-            with whole(file) as temporary:
+            with atomic_write(file) as temporary:
                 fig.savefig(temporary, **options)
     return files

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gaponet.base.errors import UsageError
-from gaponet.base.files import whole
+from gaponet.base.files import atomic_write
 from gaponet.report.view.picture import Camera
 from gaponet.report.view.side_by_side import SideBySide
 
@@ -40,11 +40,11 @@ class Clip:
     @classmethod
     def of(cls, shown: SideBySide, start: float | None, duration: float, speed: float = 1.0, fps: float = 20.0) -> Clip:
         """The stretch asked for, or the busiest one, cut at the recording's end."""
-        whole = (len(shown.real) - 1) * shown.real.dt
+        recorded_s = (len(shown.real) - 1) * shown.real.dt
         begin = shown.busiest(duration) if start is None else start
-        if not 0 <= begin < whole:
-            raise UsageError(f"--start is {begin:g} s; the recording lasts {whole:.1f} s")
-        return cls(begin, min(duration, whole - begin), speed, fps)
+        if not 0 <= begin < recorded_s:
+            raise UsageError(f"--start is {begin:g} s; the recording lasts {recorded_s:.1f} s")
+        return cls(begin, min(duration, recorded_s - begin), speed, fps)
 
     @property
     def stop(self) -> float:
@@ -85,7 +85,7 @@ def write(camera: Camera, clip: Clip, path: Path, progress: Callable[[int, int],
             yield camera.picture(float(time))
             progress(i + 1, len(times))
 
-    with whole(path) as temporary:
+    with atomic_write(path) as temporary:
         if kind == ".gif":
             _write_gif(list(pictures()), temporary, 10 * hundredths)
         elif kind == ".mp4":

@@ -10,7 +10,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import DatasetError, UsageError
-from gaponet.base.progress import Progress, noted, silent
+from gaponet.base.progress import Progress, no_progress, with_note
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import busiest
 from gaponet.data.store import Dataset, Entry
@@ -116,7 +116,7 @@ def side_by_side(
     entry: Entry,
     robot: RobotSpec,
     runs: ListOf[Path] = (),
-    progress: Progress = silent,
+    progress: Progress = no_progress,
 ) -> SideBySide:
     """Replay a recording in the nominal simulator, in identified ones, and under each run's shipped model.
 
@@ -139,7 +139,7 @@ def side_by_side(
     target = np.concatenate([real.qpos[:1], real.ctrl[:-1]])  # a command of row t says where to be at t + 1
     shown = {"target": target}
     for name, (simulator, corrector) in simulators.items():
-        told = noted(progress, name)
+        told = with_note(progress, name)
         shown[name] = replay([real], simulator, corrector, progress=told, lock_idle=True)[0].qpos
     shown["recorded"] = real.qpos
     op = robot.operated_index

@@ -11,7 +11,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.base.text import markdown
+from gaponet.base.text import escape_markdown
 from gaponet.report.view.film import Clip
 from gaponet.report.view.scene import Scene
 
@@ -41,7 +41,7 @@ class WebScene:
         meta, gui = scene.shown.real.meta, self.server.gui
         gui.main_panel.dock_right()  # beside the robots, not in front of them
         head = "**VIRTUAL ROBOT**\n\n" if meta.virtual else ""
-        head += markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
+        head += escape_markdown(f"{meta.robot}, {meta.motion}, unit {meta.unit_id}, {meta.payload_mass:g} kg")
         self.title = gui.add_markdown(head + (f"\n\ndifferences drawn {magnify:g}×" if magnify != 1 else ""))
         self.playing = gui.add_checkbox("play", True)
         self.time: Any = gui.add_slider("time, s", clip.start, clip.stop, scene.shown.real.dt, clip.start)

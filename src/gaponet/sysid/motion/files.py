@@ -14,7 +14,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import LogError, UsageError
-from gaponet.base.files import whole, write_text
+from gaponet.base.files import atomic_write, write_text
 from gaponet.data.describe.limits import refuse_degrees
 from gaponet.data.sequence import LONGEST, SHORTEST
 from gaponet.robot.spec import RobotSpec
@@ -66,7 +66,7 @@ def write_motion(path: Path, motion: Motion, robot: RobotSpec, rate: float) -> N
     names = list(motion.named(robot))
     rows = motion.sample(1 / rate)[:, robot.index(names)]
     if path.suffix == ".npz":
-        with whole(path) as temporary, temporary.open("wb") as file:
+        with atomic_write(path) as temporary, temporary.open("wb") as file:
             np.savez(file, joint_names=np.array(names), ctrl=rows, dt=1 / rate)
         return
     if path.suffix == ".txt" and abs(rate * SAGE_DT - 1) > 1e-9:

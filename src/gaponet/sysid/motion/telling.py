@@ -17,7 +17,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.base.progress import Progress, silent
+from gaponet.base.progress import Progress, no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import static_torque
@@ -125,7 +125,7 @@ class Telling:
         return played
 
 
-def candidates(library: Library, progress: Progress = silent) -> list[Motion]:
+def candidates(library: Library, progress: Progress = no_progress) -> list[Motion]:
     """Motions within a robot's limits: joints alone, tours, and all joints at once with a signal each."""
     robot = library.robot
     alone = [f"{s}-{short(j)}" for j in robot.operated for s in SIGNALS] if len(robot.operated) <= ALONE else []

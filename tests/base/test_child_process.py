@@ -22,8 +22,8 @@ SCRIPT = "import sys\nfrom gaponet.__main__ import entry\nentry()\n"
 
 EVERY_COMMAND = """
 from contextlib import suppress
-from gaponet.base.child import leave_folder
-leave_folder()
+from gaponet.base.child_process import exclude_current_folder
+exclude_current_folder()
 from gaponet.cli.main import COMMANDS, main
 for command in COMMANDS:
     with suppress(SystemExit):
@@ -32,13 +32,13 @@ for command in COMMANDS:
 
 CHILDREN = """
 import sys, os
-from gaponet.base import child
-child.leave_folder()
+from gaponet.base import child_process
+child_process.exclude_current_folder()
 from pathlib import Path
 from gaponet.data.importer import import_logs
 from gaponet.hw.control.driver import DriverError
 from gaponet.hw.control.watchdog import Watchdog
-from gaponet.base.executor import opened
+from gaponet.base.executor import open_pool
 from gaponet.robot.spec import load_robot
 
 if __name__ == "__main__":
@@ -49,7 +49,7 @@ if __name__ == "__main__":
     watchdog.wait_ready()
     watchdog.release()
     print("watched")
-    with opened("local", 1, 1) as pool:
+    with open_pool("local", 1, 1) as pool:
         print(*pool.map(abs, [-3]), "computed")
 """
 

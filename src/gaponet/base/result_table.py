@@ -1,0 +1,115 @@
+"""Means of repeated measurements, and tables of results as plain text, Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from gaponet.base.text import escape_markdown
+
+
+@dataclass(frozen=True)
+class MeanStd:
+    """Mean and standard deviation of repeated measurements.
+
+    Attributes:
+        std: Standard deviation of the sample (n − 1); NaN for a single value.
+        count: Number of values.
+    """
+
+    mean: float
+    std: float
+    count: int
+
+    @classmethod
+    def from_values(cls, values: Iterable[float], scale: float = 1.0) -> MeanStd:
+        """Summarise the finite values, times `scale` (1e3 turns rad into mrad); without any, the mean is NaN."""
+        finite = np.array([v for v in values if math.isfinite(v)]) * scale
+        std = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
+        return cls(float(finite.mean()) if len(finite) else math.nan, std, len(finite))
+
+    def divided_by(self, value: float) -> MeanStd:
+        """Return mean and standard deviation as multiples of an exact number."""
+        return MeanStd(self.mean / value, self.std / value, self.count)
+
+    @property
+    def standard_error(self) -> float:
+        """Standard error of the mean; NaN for a single value."""
+        return self.std / math.sqrt(self.count) if self.count else math.nan
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """Table of results; the first column names the row.
+
+    Attributes:
+        columns: Headings with their units, such as "MPJAE, mrad".
+        rows: Cells: text, numbers, MeanStd, or None for a blank.
+        digits: Digits behind the decimal point in text; CSV and JSON have full precision.
+        shown: False for a table that is written as CSV only.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    caption: str = ""
+    digits: int = 2
+    shown: bool = True
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.columns):
+                raise ValueError(f"table '{self.name}': {len(row)} cells under {len(self.columns)} columns: {row}")
+
+    def texts(self) -> list[list[str]]:
+        """Return the rows as formatted cells."""
+        return [[format_cell(cell, self.digits) for cell in row] for row in self.rows]
+
+    def record(self) -> dict[str, Any]:
+        """Return the table as JSON values; a MeanStd becomes an object."""
+        rows = [[asdict(c) if isinstance(c, MeanStd) else c for c in row] for row in self.rows]
+        return {"name": self.name, "caption": self.caption, "columns": list(self.columns), "rows": rows,
+                "texts": self.texts()}  # fmt: skip
+
+    def markdown(self) -> str:
+        """Return the table in Markdown, with the caption below."""
+        ruler = ["---", *["---:"] * (len(self.columns) - 1)]
+        lines = [map(escape_markdown, self.columns), ruler, *(map(escape_markdown, row) for row in self.texts())]
+        table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        return f"{table}\n\n{escape_markdown(self.caption)}" if self.caption else table
+
+    def csv(self) -> str:
+        """Return the table as CSV at full precision; a column with MeanStd is followed by its std and count."""
+        with_std = [any(isinstance(cell, MeanStd) for cell in column) for column in zip(*self.rows, strict=True)]
+        with_std = with_std or [False] * len(self.columns)
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        names = ((c, f"{c}: std", f"{c}: n") if wide else (c,) for c, wide in zip(self.columns, with_std, strict=True))
+        writer.writerow([name for group in names for name in group])
+        for row in self.rows:
+            line: list[Any] = []
+            for cell, wide in zip(row, with_std, strict=True):
+                values = [cell.mean, cell.std, cell.count] if isinstance(cell, MeanStd) else [cell, None, None]
+                line += values if wide else values[:1]
+            writer.writerow(["" if v is None or (isinstance(v, float) and not math.isfinite(v)) else v for v in line])
+        return out.getvalue()
+
+
+def format_cell(cell: Any, digits: int = 2) -> str:
+    """Format a cell of a table: 12.28 ± 0.08 (mean ± standard deviation), 1,234, yes, or blank."""
+    if isinstance(cell, MeanStd):
+        mean, std = format_cell(cell.mean, digits), format_cell(cell.std, digits)
+        return f"{mean} ± {std}" if mean and std else mean
+    if cell is None or isinstance(cell, str):
+        return cell or ""
+    if isinstance(cell, (bool, np.bool_)):
+        return "yes" if cell else "no"
+    if isinstance(cell, (int, np.integer)):
+        return f"{cell:,}"
+    return f"{cell:.{digits}f}" if math.isfinite(cell) else ""
