@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 import gaponet.nn.onnx_export  # what a child needs is there before it is forked
-import gaponet.nn.training.run  # noqa: F401
+import gaponet.nn.training.trainer  # noqa: F401
 from gaponet.base.files import FOLDER_MARKER
 from gaponet.cli.main import main as gaponet_main
 from gaponet.data.store import Dataset

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from gaponet.nn.training.kept import PROGRESS
+from gaponet.nn.training.checkpoint import PROGRESS
 from gaponet.report.figures.style import figure, legend, save, styled
 
 COLOURS = ("#c8102e", "#d99000", "#8e1b3a", "#3b7dd8", "#2a9d6f", "#7a8fe0")

@@ -43,8 +43,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.split import one_motion
 from gaponet.experiments.real.cards import prepare, read_cards
 from gaponet.experiments.real.rivals import Answer
-from gaponet.nn.corrector import DeltaCorrector
-from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.paper import PaperNet, released_inputs, released_network
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.robot.spec import RobotSpec

@@ -26,11 +26,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from torch import nn
 
 from gaponet.data.sequence import Sequence
-from gaponet.nn.baselines.mlp import DeltaMLP
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import dense, size
 from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.networks import DeltaMLP, build_network
 from gaponet.nn.observation import History
 from gaponet.nn.training.config import RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv

@@ -30,12 +30,12 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import size
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import trained_network
 from gaponet.nn.training.config import RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.ppo import Learner
+from gaponet.nn.training.ppo import PPO
 from gaponet.robot.folder import kept_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
@@ -101,8 +101,8 @@ def bench_train(
     steps, batch = config.ppo.num_steps, num_envs * config.ppo.num_steps
     env = _environment(robot, config.model, num_envs, config.threads)
     net = build_network(config.model, env.num_actions)
-    learner = Learner(env, net, config.ppo)
-    quick_learner = Learner(env, build_network(quick.model, env.num_actions), quick.ppo)
+    learner = PPO(env, net, config.ppo)
+    quick_learner = PPO(env, build_network(quick.model, env.num_actions), quick.ppo)
     collected = learner.collect()
     turns: dict[str, Turn] = {
         "bare Batch loop": _bare_loop(robot, num_envs, steps, config.threads),
@@ -246,7 +246,7 @@ def _idle_steps(env: DeltaEnv, steps: int) -> Turn:
     return run
 
 
-def _inference(learner: Learner, steps: int) -> None:
+def _inference(learner: PPO, steps: int) -> None:
     """Features, sensors, actor and critic, nothing stored."""
     with torch.no_grad():
         for _ in range(steps):

@@ -11,7 +11,7 @@ import torch
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import drawn_states, export
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec

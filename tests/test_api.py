@@ -10,7 +10,7 @@ from arm import recordings, write_arm
 import gaponet as gp
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 
 
 def test_public_names_are_there_and_what_is_not_says_what_is():
@@ -41,7 +41,7 @@ def test_from_a_dataset_to_an_evaluated_model(tmp_path, capsys):
     assert gp.doctor(data, robot).verdict
     small = TrainConfig(
         ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-        warm_start=WarmStartConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
+        warm_start=PretrainingConfig(rounds=2, num_envs=16, steps=60, gradient_steps=60, batch_size=256),
     )
     model = gp.train(data, tmp_path / "run", budget=str(2 * 16 * 60), config=small, robot=robot)
     found = gp.evaluate(model, data, robot=robot).result

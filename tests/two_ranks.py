@@ -17,12 +17,12 @@ from gaponet.base.errors import ModelError
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.layers import Standardise
 from gaponet.nn.training import ranks
-from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.trainer import Trainer
 
 CONFIG = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    warm_start=WarmStartConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    warm_start=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
     episode_s=0.5,
     validate_every=2,

@@ -325,7 +325,7 @@ def train(
     from gaponet.nn.training import ranks
     from gaponet.nn.training.budget import Budget
     from gaponet.nn.training.config import TrainConfig
-    from gaponet.nn.training.run import Trainer
+    from gaponet.nn.training.trainer import Trainer
 
     config = config or TrainConfig()
     config = replace(config, model=replace(config.model, kind=model)) if model else config  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from gaponet.cli.main import main
 from gaponet.deploy.aligned_sim import AlignedSim
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import drawn_states, export
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot

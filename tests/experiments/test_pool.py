@@ -13,11 +13,11 @@ from gaponet.base.executor import open_pool
 from gaponet.data.store import Dataset
 from gaponet.experiments.pool import SETUP, plan, run_cells, train_cell
 from gaponet.experiments.variant import parse_variant
-from gaponet.nn.baselines.delay_offset import DelayOffset
-from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.delay_offset import DelayOffset
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
 SMALL = TrainConfig(
-    warm_start=WarmStartConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),
+    warm_start=PretrainingConfig(rounds=1, num_envs=16, steps=40, gradient_steps=40, batch_size=128),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1),
 )
 

@@ -4,9 +4,9 @@ import pytest
 
 from gaponet.base.errors import UsageError
 from gaponet.experiments.variant import KINDS, _read, parse_variant
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 
-BASE = TrainConfig(warm_start=WarmStartConfig(rounds=7))
+BASE = TrainConfig(warm_start=PretrainingConfig(rounds=7))
 
 
 def test_what_the_word_does_not_say_is_as_in_the_base():

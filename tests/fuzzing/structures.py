@@ -23,7 +23,7 @@ from gaponet.data.split import make_split, read_split, write_split
 from gaponet.data.store import Dataset
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report import run_files
 from gaponet.report.candidate import split_of_run as read_run_split
 from gaponet.robot.collision import Collision
@@ -105,7 +105,7 @@ def _fitted() -> Files:
 
     from gaponet.nn.artifact import make_card
     from gaponet.nn.config import ModelConfig
-    from gaponet.nn.deeponet import build_network
+    from gaponet.nn.networks import build_network
     from gaponet.nn.onnx_export import export
 
     def write(folder: Path) -> None:

@@ -13,7 +13,7 @@ from gaponet.data.store import Dataset
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay

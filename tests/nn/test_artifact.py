@@ -13,7 +13,7 @@ from arm import TOML, recordings, write_arm
 from gaponet.base.errors import ModelError
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.sim.replay import replay
 

@@ -3,7 +3,7 @@
 import numpy as np
 from arm import commands, record, write_arm
 
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.sim.replay import replay
 
 

@@ -6,8 +6,7 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.corrector import DeltaCorrector
-from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.observation import Layout
 from gaponet.nn.training.config import RewardConfig
 from gaponet.nn.training.env import DeltaEnv

@@ -14,17 +14,17 @@ from gaponet.cli.main import main
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import drawn_states, export
 from gaponet.nn.paper import released_inputs, released_network
 from gaponet.nn.sensor import ProbeOracle
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.ppo import Learner
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import fit_inputs
+from gaponet.nn.training.trainer import Trainer
 from gaponet.report.evaluate import evaluate
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
@@ -206,7 +206,7 @@ def test_the_predictor_answers_random_probes_and_ppo_trains_the_learned_ones(tmp
     config, robot = replace(PAPER, sensor_source="learned"), write_arm(tmp_path)
     env = DeltaEnv(recordings(robot, 2, rows=60, kp=0.5), robot, config, 64, 1000, RewardConfig(), nthread=1)
     net = network(config)
-    start, learner = net.probes.clone(), Learner(env, net, TRAINING.ppo)
+    start, learner = net.probes.clone(), PPO(env, net, TRAINING.ppo)
     assert fit_inputs(net, env, env.get_observations()["actor"], 256, 0, 1)["mean"] > 0.6
     fitted = copy.deepcopy(net.predictor.state_dict())
     learner.update()
@@ -277,7 +277,7 @@ def test_other_networks_refuse_the_paper_s_switches():
 
 TRAINING = TrainConfig(
     PAPER,
-    warm_start=WarmStartConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
+    warm_start=PretrainingConfig(rounds=1, num_envs=8, steps=30, gradient_steps=10, batch_size=64, sensor_states=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, mini_batches=2, epochs=1, critic_warmup=0, explained=-1e9, refit_sensors=2,
                   critic_hidden=(16,)),
     episode_s=0.5, validate_every=2, threads=1,

@@ -47,11 +47,11 @@ WAY = """
 from pathlib import Path
 import gaponet as gp
 from gaponet.cli.main import main
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import TrainConfig, PretrainingConfig
 
 work = Path(sys.argv[1])
 gp.import_logs(work / "logs", "so101", work / "data", unit_id="a", payload_mass=0.0)
-small = WarmStartConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
+small = PretrainingConfig(rounds=1, num_envs=4, steps=20, gradient_steps=5, batch_size=64, sensor_states=16)
 gp.train(work / "data", work / "run", budget="120", config=TrainConfig(warm_start=small))
 for words in ("doctor data", "gap data", "eval run data", "report run", "runs ."):
     name, *rest = words.split()

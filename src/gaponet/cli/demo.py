@@ -15,11 +15,12 @@ from gaponet.cli.gap import show_methods
 from gaponet.cli.identify import identify
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.report.verdict import verdict
 from gaponet.robot.spec import as_option, load_robot
 
-QUICK = WarmStartConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)  # many small rounds: minutes, not hours
+# Many small rounds: minutes, not hours.
+QUICK = PretrainingConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)
 
 
 @writes("demo")

@@ -15,7 +15,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.experiments.pool import RESULT, Cell, Tell, train_cell
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import choose
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import opened

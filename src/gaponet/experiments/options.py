@@ -8,14 +8,14 @@ from typing import Annotated
 import tyro
 
 from gaponet.base.executor import LOCAL
-from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
 
 # Small rounds, fitted until labels are (progress.jsonl: label_rmse); of 200 gradient steps a product has the advantage.
-TRAINING = TrainConfig(warm_start=WarmStartConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
+TRAINING = TrainConfig(warm_start=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
 MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")  # what a question compares where nothing is said
 BUDGET, SEEDS = "76800", 3  # control steps: 2 rounds
 # With --quick: teaches next to nothing, in seconds.
-QUICK_WARM_START = WarmStartConfig(
+QUICK_WARM_START = PretrainingConfig(
     rounds=2, num_envs=16, steps=80, gradient_steps=40, batch_size=256, sensor_states=256
 )
 QUICK_PPO = PPOConfig(num_envs=32, num_steps=16, epochs=1, critic_warmup=1)

@@ -25,7 +25,7 @@ from gaponet.base.progress import Running
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.experiments.kept import read_kept
 from gaponet.experiments.variant import Variant
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.spec import RobotSpec
@@ -128,9 +128,9 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
     import torch
 
     from gaponet.nn.artifact import GapModel
-    from gaponet.nn.deeponet import build_network
+    from gaponet.nn.networks import build_network
     from gaponet.nn.training.budget import Status
-    from gaponet.nn.training.run import Trainer
+    from gaponet.nn.training.trainer import Trainer
 
     torch.set_num_threads(cell.threads)
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)

@@ -17,10 +17,9 @@ from typing_extensions import TypedDict
 from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read_json, validated
-from gaponet.nn.backends import Network, OnnxNetwork
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.corrector import DeltaCorrector
-from gaponet.nn.loop import DeltaLoop
+from gaponet.nn.loop import DeltaCorrector, DeltaLoop
+from gaponet.nn.onnx_network import Network, OnnxNetwork
 from gaponet.robot.folder import keeper, keeps_robot, kept_robot
 from gaponet.robot.spec import RobotSpec
 

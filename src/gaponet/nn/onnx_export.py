@@ -18,9 +18,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.base.files import atomic_write, lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS
-from gaponet.nn.backends import TRUSTED, OnnxNetwork
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import CLAMP, DeltaNet
+from gaponet.nn.networks import build_network
+from gaponet.nn.onnx_network import TRUSTED, OnnxNetwork
 
 PARITY = 1e-5  # rad
 

@@ -1,7 +1,7 @@
 """Sensors: what the simulator answers to a fixed set of probing targets, from here.
 
 U_ξ(x) is the simulator advanced one control period from state ξ with target x held. Probes x_k = q + e_k ask it at m
-points; the oracle really steps the simulator, the predictor (nn/deeponet.py) learns to answer in its place.
+points; the oracle really steps the simulator, the predictor (nn/networks.py) learns to answer in its place.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from gaponet.data.split import RunSplit
 from gaponet.data.store import Dataset, Entry
 from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
-from gaponet.nn.corrector import DeltaCorrector
+from gaponet.nn.loop import DeltaCorrector
 from gaponet.report.methods import method
 from gaponet.robot.folder import KEPT, ORIGIN
 from gaponet.robot.spec import RobotSpec, load_robot

@@ -23,7 +23,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import Dataset
 from gaponet.deploy.transfer import TransferCorrector
 from gaponet.nn.adaptation import Adaptation
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, choose, is_robot
 from gaponet.report.methods import IDENTIFIED, title
 from gaponet.report.verdict import LEARNED

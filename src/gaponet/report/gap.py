@@ -18,7 +18,7 @@ from gaponet.data.repeatability import Repetitions
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
 from gaponet.data.store import Dataset
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import Candidate, choose
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import Run, metrics, runs, standard_error

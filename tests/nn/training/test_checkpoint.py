@@ -13,12 +13,12 @@ from gaponet.base.errors import ModelError, UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.trainer import Trainer
 
 TINY = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-    warm_start=WarmStartConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
+    warm_start=PretrainingConfig(rounds=2, num_envs=8, steps=30, gradient_steps=10, batch_size=64),
     ppo=PPOConfig(num_envs=8, num_steps=8, epochs=1, mini_batches=2, critic_warmup=1, explained=-1e9),
     episode_s=0.5,
     validate_every=2,
@@ -105,8 +105,8 @@ def test_a_shrunk_run_trains_on_with_all_of_its_correction(world, tmp_path, monk
         net.bounded.gain.fill_(0.5)
         return 0.5
 
-    monkeypatch.setattr("gaponet.nn.training.run.choose_gain", halve)
-    monkeypatch.setattr("gaponet.nn.training.run.Trainer.validate", better_each_time())
+    monkeypatch.setattr("gaponet.nn.training.trainer.choose_gain", halve)
+    monkeypatch.setattr("gaponet.nn.training.trainer.Trainer.validate", better_each_time())
     warm = replace(TINY, warm_start=replace(TINY.warm_start, rounds=4))
     card = Trainer(data, robot, tmp_path / "run", warm, Budget(steps=WARM)).run().card
     assert card["gain"] == 0.5

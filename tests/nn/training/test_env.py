@@ -9,10 +9,10 @@ from arm import recordings, write_arm
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
-from gaponet.nn.training.config import RewardConfig, WarmStartConfig
+from gaponet.nn.networks import build_network
+from gaponet.nn.training.config import PretrainingConfig, RewardConfig
 from gaponet.nn.training.env import AHEAD, DeltaEnv
-from gaponet.nn.training.warm_start import WarmStart
+from gaponet.nn.training.pretraining import Pretraining
 from gaponet.sim.batch import Condition
 from gaponet.sim.replay import replay
 
@@ -60,7 +60,7 @@ def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
     stands = lambda x, at: np.where(np.isnan(still), x, at)  # noqa: E731
     one = replace(one, meta=said, ctrl=stands(one.ctrl, 0.3), qpos=stands(one.qpos, 0.3), qvel=stands(one.qvel, 0.0))
     env = make(robot, [one, other])
-    warm = WarmStart(build_network(env.config, 2), env, np.ones((120, 2), np.float32), WarmStartConfig(steps=3), 0)
+    warm = Pretraining(build_network(env.config, 2), env, np.ones((120, 2), np.float32), PretrainingConfig(steps=3), 0)
     warm.collect(follow_labels=True)
     unknown = env.first == env.seq_first[0]
     assert 0 < unknown.sum() < len(unknown)
@@ -70,7 +70,7 @@ def test_a_joint_of_which_nothing_was_recorded_stands_and_counts_nowhere(robot):
     assert (reward[unknown, 1] == 0).all()
     assert (reward[:, 0] < 0).all()
     assert (reward[~unknown, 1] < 0).all()
-    fit = WarmStart(warm.net, env, warm.labels, WarmStartConfig(steps=3, gradient_steps=2), 0).round(lambda: 0.0)
+    fit = Pretraining(warm.net, env, warm.labels, PretrainingConfig(steps=3, gradient_steps=2), 0).round(lambda: 0.0)
     assert np.isfinite(fit["label_rmse"])
 
 

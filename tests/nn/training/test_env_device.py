@@ -12,9 +12,9 @@ from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.trainer import Trainer
 
 pytest.importorskip("mujoco_warp", reason="needs pip install 'gaponet[warp]'")
 
@@ -96,7 +96,7 @@ def test_a_run_on_the_device_learns_resumes_and_ships_for_the_cpu(tmp_path):
         dataset.append(sequence)
     small = TrainConfig(
         ModelConfig(history=2, num_probes=2, branch_hidden=(16,), trunk_hidden=(16,), sensor_hidden=(16,)),
-        warm_start=WarmStartConfig(
+        warm_start=PretrainingConfig(
             rounds=2, num_envs=16, steps=40, gradient_steps=80, batch_size=256, sensor_states=64
         ),
         ppo=PPOConfig(num_envs=16, num_steps=8, epochs=1, critic_warmup=0, explained=-1e9),

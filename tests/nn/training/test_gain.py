@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.training.validation import choose_gain
 
 

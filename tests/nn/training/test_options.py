@@ -9,11 +9,11 @@ from gaponet import api
 from gaponet.base.errors import UsageError
 from gaponet.cli.main import main
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.training.config import PAPER_PPO, PPOConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PAPER_PPO, PPOConfig, PretrainingConfig, TrainConfig
 
 CHANGED = TrainConfig(
     ModelConfig(kind="mlp", history=8, payload_input=False, mlp_hidden=(64, 32)),
-    warm_start=WarmStartConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
+    warm_start=PretrainingConfig(noise=0.1), ppo=PPOConfig(num_envs=7), seed=3, mixed_gains=True,
     rates=(50.0, 100.0),
 )  # fmt: skip
 

@@ -6,14 +6,14 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import PPOConfig, RewardConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.ppo import Learner
+from gaponet.nn.training.ppo import PPO
 from gaponet.nn.training.sensor_fit import fit_inputs
 
 MODEL = ModelConfig(history=2, num_probes=4, sensor_hidden=(16,), branch_hidden=(16,), trunk_hidden=(16,))
-PPO = PPOConfig(
+SETTINGS = PPOConfig(
     num_envs=16, num_steps=8, epochs=1, mini_batches=2, critic_warmup=0, explained=-1e9, critic_hidden=(32,)
 )
 
@@ -27,7 +27,7 @@ def env(tmp_path):
 def test_advantages_by_hand():
     reward, value = torch.tensor([1.0, 2.0, 4.0]).reshape(3, 1, 1), torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1)
     done = torch.tensor([0.0, 1.0, 0.0]).reshape(3, 1, 1)  # a motion ends after the second step
-    found = Learner.advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
+    found = PPO.advantages(reward, value, torch.full((1, 1), 8.0), done, gamma=0.5, lam=0.5).flatten()
     # δ = 1 + 0.5·1 − 0.5 = 1;  2 − 1 = 1;  4 + 0.5·8 − 2 = 6;  the first adds 0.25 of the second's, which adds nothing.
     assert found.tolist() == [1.25, 1.0, 6.0]
 
@@ -36,15 +36,13 @@ def test_the_actor_waits_for_a_critic_that_explains(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     before = {name: p.clone() for name, p in net.named_parameters()}
-    waiting = Learner(
-        env, net, PPOConfig(num_envs=16, num_steps=8, critic_warmup=2, explained=1.0, critic_hidden=(32,))
-    )
+    waiting = PPO(env, net, PPOConfig(num_envs=16, num_steps=8, critic_warmup=2, explained=1.0, critic_hidden=(32,)))
     for _ in range(4):
         found = waiting.update()
     assert all(torch.equal(p, before[name]) for name, p in net.named_parameters())
     assert found.explained_variance < 1
     assert found.learning_rate == 0.0
-    Learner(env, net, PPO).update()
+    PPO(env, net, SETTINGS).update()
     changed = {name.split(".")[0] for name, p in net.named_parameters() if not torch.equal(p, before[name])}
     assert changed == {"branch", "trunk", "bias"}
 
@@ -52,7 +50,7 @@ def test_the_actor_waits_for_a_critic_that_explains(env):
 def test_joints_that_do_not_explore_teach_nothing(env):
     """Without noise on a joint its ratio is 1 whatever its advantage: it must be left out, not averaged in."""
     torch.manual_seed(0)
-    learner = Learner(env, build_network(MODEL, 2), PPO)
+    learner = PPO(env, build_network(MODEL, 2), SETTINGS)
     batch = learner.collect()
     still = batch.explored == 0
     assert 0.2 < still.float().mean() < 0.8
@@ -63,20 +61,20 @@ def test_joints_that_do_not_explore_teach_nothing(env):
 
 def test_exploration_stays_correlated_and_as_wide_as_it_is_asked_to_be(env):
     torch.manual_seed(0)
-    learner = Learner(env, build_network(MODEL, 2), PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01))
+    learner = PPO(env, build_network(MODEL, 2), PPOConfig(num_envs=16, num_steps=32, noise_share=1.0, std=0.01))
     seen = []
     for _ in range(20):
         learner.collect()
         seen.append(learner.noise.clone())
     assert torch.stack(seen).std().item() == pytest.approx(0.01, rel=0.15)
-    assert learner.kept == pytest.approx(np.exp(-env.robot.dt / 0.2))
+    assert learner.noise_correlation == pytest.approx(np.exp(-env.robot.dt / 0.2))
 
 
 def test_it_learns_where_the_simulator_is_wrong(env):
     torch.manual_seed(0)
     net = build_network(MODEL, 2)
     fit_inputs(net, env, env.get_observations()["actor"], 64, seed=0)
-    learner = Learner(env, net, PPOConfig(num_envs=16, num_steps=32, epochs=5, std=0.01, explained=0.0, critic_warmup=2,
+    learner = PPO(env, net, PPOConfig(num_envs=16, num_steps=32, epochs=5, std=0.01, explained=0.0, critic_warmup=2,
                                           learning_rate=3e-4, critic_hidden=(32,)))  # fmt: skip
     rewards = [learner.update().reward for _ in range(40)]
     assert np.mean(rewards[-5:]) > 0.8 * np.mean(rewards[:3])

@@ -6,7 +6,7 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.training.config import RewardConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import fit_inputs

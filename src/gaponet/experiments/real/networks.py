@@ -16,8 +16,8 @@ from gaponet.experiments.real.rivals import LEFT_OUT, Answer, Method, fitted, id
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
+from gaponet.nn.training.trainer import Trainer
 from gaponet.report.verdict import Added
 
 BASES = {"": nominal, "identification + ": identified}
@@ -25,7 +25,7 @@ TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
 TRAINED = tuple((base, kind) for base in BASES for kind in ("shared_mlp", "gaponet"))
 WHOLE = 600_000  # control steps from which training is that of gaponet train
 # Fewer are one round of its supervised start.
-BRIEF = WarmStartConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
+BRIEF = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
 
 
 def networks(steps: int) -> dict[str, tuple[str, Method]]:
@@ -39,7 +39,7 @@ def networks(steps: int) -> dict[str, tuple[str, Method]]:
 
 def _recipe(steps: int) -> TrainConfig:
     """How a network is trained for so many control steps; a brief training labels no more rows than that."""
-    warm = WarmStartConfig()
+    warm = PretrainingConfig()
     if steps < WHOLE:
         warm = replace(BRIEF, steps=max(steps // BRIEF.num_envs, 1), rows=steps)
     return TrainConfig(warm_start=warm, mixed_gains=True)

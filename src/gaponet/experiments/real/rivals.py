@@ -11,7 +11,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
 from gaponet.experiments.real.questions import Question, recorded, rehearsal
-from gaponet.nn.baselines.delay_offset import DelayOffset
+from gaponet.nn.delay_offset import DelayOffset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import Corrector, replay

@@ -29,7 +29,7 @@ class RewardConfig:
 
 
 @dataclass(frozen=True)
-class WarmStartConfig:
+class PretrainingConfig:
     """Supervised start: regress the labels on states that they and the policy itself lead to."""
 
     rounds: Annotated[int, Interval(ge=0, le=100000)] = 3
@@ -113,7 +113,7 @@ class TrainConfig:
 
     model: ModelConfig = field(default_factory=ModelConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
-    warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
+    warm_start: PretrainingConfig = field(default_factory=PretrainingConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     seed: Annotated[int, Interval(ge=0, le=2**63)] = 0
     """Seed of everything random."""

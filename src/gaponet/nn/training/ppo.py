@@ -64,7 +64,7 @@ class Update:
     reward: float = float("nan")
 
 
-class Learner:
+class PPO:
     """A network, the environment it acts in, and a critic; `update` is one iteration."""
 
     def __init__(self, env: DeltaEnv, net: DeltaNet, config: PPOConfig) -> None:
@@ -80,7 +80,7 @@ class Learner:
         self.optimiser = torch.optim.Adam(self.trained, lr=config.learning_rate)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.critic_learning_rate)
         step = env.robot.dt * env.config.delta_hold
-        self.kept = math.exp(-step / config.noise_time) if config.noise_time else 0.0
+        self.noise_correlation = math.exp(-step / config.noise_time) if config.noise_time else 0.0
         self.noise = torch.zeros(env.num_envs, env.num_actions, device=seen.device)
         self.updates, self.ready, self.found = 0, False, Update()
 
@@ -90,7 +90,7 @@ class Learner:
         config = self.config
         halvings = self.updates / config.std_half_life if config.std_half_life else 0.0
         std = max(config.std * 0.5**halvings, min(config.std, config.std_end))
-        return std * math.sqrt(1 - self.kept**2)
+        return std * math.sqrt(1 - self.noise_correlation**2)
 
     def update(self) -> Update:
         """Run num_steps decisions in every environment, then learn from them."""
@@ -109,7 +109,7 @@ class Learner:
         with torch.no_grad():
             for _ in range(config.num_steps):
                 row = self.look()
-                known = self.kept * self.noise
+                known = self.noise_correlation * self.noise
                 self.noise = known + self.spread * explored * torch.randn_like(known)
                 delta = row["mean"] + self.noise
                 reward, done = (torch.as_tensor(x) for x in env.step(delta))
@@ -119,7 +119,7 @@ class Learner:
                 rows.append(row)
             seen = {name: torch.stack([r[name] for r in rows]) for name in rows[0]}
             last = self.look()["value"]
-            seen["advantage"] = Learner.advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
+            seen["advantage"] = PPO.advantages(seen["reward"], seen["value"], last, seen["done"], gamma, config.lam)
             seen["returns"] = seen["advantage"] + seen["value"]
             self._measure(seen)
         fields = _Batch.__dataclass_fields__

@@ -15,11 +15,11 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.nn.backends import OnnxNetwork
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.corrector import DeltaCorrector
 from gaponet.nn.layers import DeltaNet
+from gaponet.nn.loop import DeltaCorrector
 from gaponet.nn.onnx_export import onnx_content
+from gaponet.nn.onnx_network import OnnxNetwork
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay

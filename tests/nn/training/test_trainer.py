@@ -15,15 +15,15 @@ from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import PPOConfig, TrainConfig, WarmStartConfig
-from gaponet.nn.training.run import Trainer
+from gaponet.nn.training.config import PPOConfig, PretrainingConfig, TrainConfig
+from gaponet.nn.training.trainer import Trainer
 from gaponet.report.evaluate import ORDER, evaluate
 from gaponet.report.methods import METHODS
 from gaponet.report.verdict import LEARNED
 
 SMALL = TrainConfig(
     model=ModelConfig(history=2, num_probes=4, branch_hidden=(32,), trunk_hidden=(32,), sensor_hidden=(32,)),
-    warm_start=WarmStartConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
+    warm_start=PretrainingConfig(rounds=3, num_envs=16, steps=60, gradient_steps=80, batch_size=256),
     ppo=PPOConfig(num_envs=16, num_steps=16, epochs=1, critic_warmup=1, explained=-1e9),
     validate_every=4,
 )
@@ -199,7 +199,7 @@ def test_ppo_alone_has_statistics_of_its_inputs_and_sensors_that_answer(sensors,
     trainer = Trainer(data, robot, tmp_path / "run", config, Budget(steps=2 * 16 * 16))
     model = trainer.run()
     assert trainer.net.features.standardise.std.min() < 0.9
-    assert (trainer.kept.sensor_r2 is None) == (sensors == "off")
+    assert (trainer.state.sensor_r2 is None) == (sensors == "off")
     if sensors == "predicted":
         assert model.card["sensor_r2"]["mean"] > 0.3
 

@@ -8,15 +8,14 @@ import torch
 from arm import recordings, write_arm
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
-from gaponet.nn.training import warm_start
-from gaponet.nn.training.config import RewardConfig, TrainConfig, WarmStartConfig
+from gaponet.nn.networks import build_network
+from gaponet.nn.training.config import PretrainingConfig, RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.warm_start import WarmStart, recipe
+from gaponet.nn.training.pretraining import Pretraining, recipe
 
 
 def test_the_label_baseline_is_one_round():
-    warm = WarmStartConfig(rounds=4, gradient_steps=50)
+    warm = PretrainingConfig(rounds=4, gradient_steps=50)
     assert recipe(TrainConfig(warm_start=warm)) == warm
     once = recipe(TrainConfig(ModelConfig(kind="inverse"), warm_start=warm))
     assert (once.rounds, once.gradient_steps) == (1, 200)
@@ -29,8 +28,8 @@ def fitted(tmp_path_factory):
     config = ModelConfig(history=2, num_probes=4, sensor_hidden=(32,), branch_hidden=(16,), trunk_hidden=(16,))
     env = DeltaEnv(recordings(robot, 4), robot, config, 32, 10**9, RewardConfig(), nthread=1)
     net = build_network(config, 2)
-    settings = WarmStartConfig(num_envs=32, steps=64, gradient_steps=2)
-    warm = WarmStart(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
+    settings = PretrainingConfig(num_envs=32, steps=64, gradient_steps=2)
+    warm = Pretraining(net, env, np.zeros((len(env.qpos), 2), np.float32), settings, seed=0)
     warm.begin()
     return warm
 
@@ -47,7 +46,7 @@ def test_of_too_many_states_the_pool_keeps_a_part_of_every_environment(fitted, m
     env, rows = fitted.env, []
     fitted.config = replace(fitted.config, rounds=2, steps=6)
     for most in (10**6, 2 * 6 * 32 // 3):
-        monkeypatch.setattr(warm_start, "MOST", most)
+        monkeypatch.setattr("gaponet.nn.training.pretraining.MOST", most)
         fitted.pool_x.clear(), fitted.pool_y.clear()
         env.rng = np.random.default_rng(0)
         fitted.collect(follow_labels=True)

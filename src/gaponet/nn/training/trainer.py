@@ -33,22 +33,22 @@ from gaponet.data.pair import require_disjoint
 from gaponet.data.sequence import Sequence, SequenceMeta, require_same_gains
 from gaponet.data.split import parts_of, spread
 from gaponet.data.store import Dataset, dataset_hash
+from gaponet.nn import delay_offset
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.baselines import delay_offset
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import DeltaNet
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import export
 from gaponet.nn.training import ranks
 from gaponet.nn.training.budget import Budget, Status
+from gaponet.nn.training.checkpoint import Checkpoint, StateDict
 from gaponet.nn.training.config import TrainConfig, command
 from gaponet.nn.training.env import DeltaEnv
-from gaponet.nn.training.kept import Kept, StateDict
 from gaponet.nn.training.labels import trajectory_labels
 from gaponet.nn.training.loggers import Loggers
-from gaponet.nn.training.ppo import Learner, Update
+from gaponet.nn.training.ppo import PPO, Update
+from gaponet.nn.training.pretraining import Pretraining, recipe
 from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
 from gaponet.nn.training.validation import added, choose_gain, errors
-from gaponet.nn.training.warm_start import WarmStart, recipe
 from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
@@ -103,14 +103,14 @@ class Trainer:
         if ranks.rank():  # the same network, other noise
             torch.manual_seed(_seed(config.seed))
         self.untrained = copy.deepcopy(self.net.state_dict())
-        self.kept = Kept(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
+        self.state = Checkpoint(self.untrained, self.untrained, dataset=dataset_hash(dataset.entries))
         self.nominal, self.found, self.measured = float("nan"), Update(), dict[bytes, Array]()
         self.baseline: delay_offset.DelayOffset | None = None  # fitted at the start, unless it is known
         self.interrupted, self.stage = False, "start"
         self.began = time.monotonic()
         with ranks.on_first(lock_folder(out, "run")):
             if resume:
-                self.kept, self.rng = Kept.read(out, self.net, self.kept.dataset)
+                self.state, self.rng = Checkpoint.read(out, self.net, self.state.dataset)
             if not ranks.rank():
                 self._write_config(holdout_units, resume)
         self.net.to(config.network_device())
@@ -129,18 +129,18 @@ class Trainer:
         ranks.once(self._fit_baseline)
         self.nominal = float(self.validate(None, self.robot.nominal).mean())
         try:
-            if not np.isfinite(self.kept.best):  # the untrained network corrects nothing: nothing worse is ever kept
+            if not np.isfinite(self.state.best):  # the untrained network corrects nothing: nothing worse is ever kept
                 self.measured[self._key(self.net)] = self.validate(None)
                 self._consider()
-            if self.kept.learner is None and recipe(self.config).rounds > self.kept.rounds_done:
+            if self.state.learner is None and recipe(self.config).rounds > self.state.rounds_done:
                 self._warm_start()
-            elif not recipe(self.config).rounds and self.kept.learner is None:
+            elif not recipe(self.config).rounds and self.state.learner is None:
                 self._cold_start()
             self._ppo()
             self._shrink()
         except KeyboardInterrupt:
             self.interrupted = True
-        if not self.kept.steps:
+        if not self.state.steps:
             why = "interrupted" if self.interrupted else "the budget ended"
             raise ModelError(
                 f"{self.out}: {why} after {self.seconds():.0f} s, before the first step of training: nothing was "
@@ -166,21 +166,21 @@ class Trainer:
         labels = trajectory_labels(
             labelled, self.robot, 0.99 * self.config.model.delta_max, self.own.threads, self._tick
         )
-        warm = WarmStart(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
-        warm.report = self.kept.sensor_r2
-        if self.kept.rounds_done == 0:
+        warm = Pretraining(self.net, env, labels, config, _seed(self.config.seed), self.own.threads)
+        warm.report = self.state.sensor_r2
+        if self.state.rounds_done == 0:
             self.stage = "sensors" if self.net.predictor is not None else "inputs"
             self._tick()
             warm.begin()
         self.stage = "warm start"
-        if self.kept.warm is not None and self._spent() < 1:
-            warm.set_state(self.kept.warm)
+        if self.state.warm is not None and self._spent() < 1:
+            warm.set_state(self.state.warm)
             torch.set_rng_state(self.rng)
         while warm.done < config.rounds and self._spent() < 1:
             fit = warm.round(self._tick)
-            self.kept.sensor_r2 = warm.report
-            self.kept.rounds_done, self.kept.warm = warm.done, warm.state()
-            self.kept.steps += ranks.world() * config.num_envs * config.steps
+            self.state.sensor_r2 = warm.report
+            self.state.rounds_done, self.state.warm = warm.done, warm.state()
+            self.state.steps += ranks.world() * config.num_envs * config.steps
             self._consider(None, **fit)
 
     def _cold_start(self) -> None:
@@ -189,10 +189,10 @@ class Trainer:
         self._tick()
         env = self._env(self.own.warm_start.num_envs, 10**9, self.config.seed)
         x = env.get_observations()["actor"]
-        self.kept.sensor_r2 = fit_inputs(
+        self.state.sensor_r2 = fit_inputs(
             self.net, env, x, self.config.warm_start.sensor_states, self.config.seed, self.own.threads
         )
-        self.kept.trained_state = copy.deepcopy(self.net.state_dict())
+        self.state.trained_state = copy.deepcopy(self.net.state_dict())
 
     def _ppo(self) -> None:
         ppo = self.own.ppo
@@ -201,53 +201,53 @@ class Trainer:
         self.stage = "ppo"
         steps = round(self.config.episode_s / self.train_set[0].dt)
         env = self._env(ppo.num_envs, steps, self.config.seed + 1)
-        if self.kept.learner is None:
+        if self.state.learner is None:
             self.net.load_state_dict(self._ppo_start())
-        learner = Learner(env, self.net, ppo)
-        if self.kept.learner is not None and self.kept.env is not None:
-            learner.load(self.kept.learner)
-            env.set_state(self.kept.env)
+        learner = PPO(env, self.net, ppo)
+        if self.state.learner is not None and self.state.env is not None:
+            learner.load(self.state.learner)
+            env.set_state(self.state.env)
             torch.set_rng_state(self.rng)
-        self.kept.warm = None
+        self.state.warm = None
         while self._spent() < 1:
             self.found = learner.update()
-            self.kept.updates += 1
-            self.kept.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
-            if ppo.refit_sensors and self.kept.updates % ppo.refit_sensors == 0 and self.net.predictor is not None:
-                seed = self.config.seed + self.kept.updates
-                self.kept.sensor_r2 = refit_sensors(
+            self.state.updates += 1
+            self.state.steps += ranks.world() * ppo.num_envs * ppo.num_steps * self.config.model.delta_hold
+            if ppo.refit_sensors and self.state.updates % ppo.refit_sensors == 0 and self.net.predictor is not None:
+                seed = self.config.seed + self.state.updates
+                self.state.sensor_r2 = refit_sensors(
                     self.net, env, self.own.warm_start.sensor_states, seed, self.own.threads
                 )
             self._tick()
-            if self.kept.updates % self.config.validate_every == 0:
-                self.kept.learner, self.kept.env = learner.state(), env.state()
+            if self.state.updates % self.config.validate_every == 0:
+                self.state.learner, self.state.env = learner.state(), env.state()
                 self._consider()
-        self.kept.learner, self.kept.env = learner.state(), env.state()
+        self.state.learner, self.state.env = learner.state(), env.state()
         self._consider()
 
     def _ppo_start(self) -> StateDict:
         """The best of the warm start or, where that is worse than no correction, the untrained network beside it."""
-        best = self.kept.trained_state
-        self.kept.anew = bool(recipe(self.config).rounds) and self._in_vain()
-        if not self.kept.anew:
+        best = self.state.trained_state
+        self.state.anew = bool(recipe(self.config).rounds) and self._in_vain()
+        if not self.state.anew:
             return best
         trained = {name for name, _ in self.net.named_parameters() if not name.startswith("predictor.")}
         return {k: self.untrained[k] if k in trained else v for k, v in best.items()}
 
     def _in_vain(self) -> bool:
         """Whether nothing that was fitted is better than no correction."""
-        return self.kept.trained > self.kept.progress[0]["val_mpjae"]
+        return self.state.trained > self.state.progress[0]["val_mpjae"]
 
     def _shrink(self) -> None:
         """Less of the best correction where validation motions say so; a resumed run trains on with all of it."""
-        if not np.isfinite(self.kept.trained) or self.config.model.kind == "paper":  # which has no gain
+        if not np.isfinite(self.state.trained) or self.config.model.kind == "paper":  # which has no gain
             return
         self.stage = "gain"
         self._tick()
         with torch.random.fork_rng():
             net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.kept.trained_state)
-        if choose_gain(net, lambda: float(self.validate(net).mean()), self.kept.trained) < 1.0:
+        net.load_state_dict(self.state.trained_state)
+        if choose_gain(net, lambda: float(self.validate(net).mean()), self.state.trained) < 1.0:
             self._consider(net)
 
     def finish(self) -> GapModel:
@@ -255,7 +255,7 @@ class Trainer:
         self.stage = "export"
         self._tick()
         net = build_network(self.config.model, self.n)
-        net.load_state_dict(self.kept.best_state)
+        net.load_state_dict(self.state.best_state)
         net.eval()
         adds, error = added(self.val_set, self.validate(None), self.validate(net))
         ranks.once(lambda: self._export(net, {"added": adds} | ({} if np.isnan(error) else {"error": error})))
@@ -297,32 +297,32 @@ class Trainer:
     def _consider(self, shrunk: DeltaNet | None = None, **told: float) -> None:
         """Validate the present network, or a shrunk one; keep it if it is the best, write progress and checkpoint."""
         net = shrunk or self.net
-        self.kept.val = float(self.validate(net).mean())
-        if self.kept.val < self.kept.best:
-            self.kept.best, self.kept.best_state = self.kept.val, copy.deepcopy(net.state_dict())
-        if self.stage in ("warm start", "ppo") and self.kept.val < self.kept.trained:
-            self.kept.trained, self.kept.trained_state = self.kept.val, copy.deepcopy(net.state_dict())
+        self.state.val = float(self.validate(net).mean())
+        if self.state.val < self.state.best:
+            self.state.best, self.state.best_state = self.state.val, copy.deepcopy(net.state_dict())
+        if self.stage in ("warm start", "ppo") and self.state.val < self.state.trained:
+            self.state.trained, self.state.trained_state = self.state.val, copy.deepcopy(net.state_dict())
         line = {
-            "stage": self.stage, "steps": self.kept.steps, "seconds": round(self.seconds(), 1),
-            "val_mpjae": self.kept.val, "nominal_mpjae": self.nominal,
+            "stage": self.stage, "steps": self.state.steps, "seconds": round(self.seconds(), 1),
+            "val_mpjae": self.state.val, "nominal_mpjae": self.nominal,
         }  # fmt: skip
         line |= vars(self.found) if self.stage == "ppo" else told
-        self.kept.progress.append({k: v if v == v else None for k, v in line.items()})
+        self.state.progress.append({k: v if v == v else None for k, v in line.items()})
         self.loggers.write(line)
-        self.kept.seconds, self.began = self.seconds(), time.monotonic()
-        self.kept.write(self.out, self.net)
+        self.state.seconds, self.began = self.seconds(), time.monotonic()
+        self.state.write(self.out, self.net)
         self._tick()
 
     def seconds(self) -> float:
         """Trained so far, earlier parts of a resumed run included."""
-        return self.kept.seconds + time.monotonic() - self.began
+        return self.state.seconds + time.monotonic() - self.began
 
     def _spent(self) -> float:
-        return ranks.decided(self.budget.spent(self.seconds(), self.kept.steps))
+        return ranks.decided(self.budget.spent(self.seconds(), self.state.steps))
 
     def _tick(self) -> float:
         """Show where the run stands; returns the share of the budget spent."""
-        k, spent = self.kept, self._spent()
+        k, spent = self.state, self._spent()
         share = min(spent, 1.0)
         self.show(Status(self.stage, share, k.steps, self.seconds(), self.found.reward, k.val, k.best, self.nominal))
         return spent
@@ -341,7 +341,7 @@ class Trainer:
             save_robot(self.robot, kept)
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")
-        self.kept.write_progress(self.out)
+        self.state.write_progress(self.out)
 
     def _conditions(self) -> set[Condition]:
         return {Condition.of(s, self.robot) for s in self.train_set}
@@ -360,19 +360,19 @@ class Trainer:
             dataset_hash=dataset_hash(self.dataset.entries),
             hours=round(sum(s.duration for s in seen) / 3600, 3),
             motions={part: sorted({e.meta.motion for e in entries}) for part, entries in self.parts.items()},
-            val_mpjae={"model": self.kept.best, "nominal": self.nominal, "start": self.kept.progress[0]["val_mpjae"]}
+            val_mpjae={"model": self.state.best, "nominal": self.nominal, "start": self.state.progress[0]["val_mpjae"]}
             | worth,
-            sensor_r2=self.kept.sensor_r2,
+            sensor_r2=self.state.sensor_r2,
             seed=self.config.seed,
-            gain=self.kept.best_state["bounded.gain"].item(),
+            gain=self.state.best_state["bounded.gain"].item(),
             excess_delay=max(self.baseline.delay.values()),
-            steps=self.kept.steps,
+            steps=self.state.steps,
             seconds=round(self.seconds(), 1),
             interrupted=self.interrupted,
             stages={
-                "warm_start_rounds": [self.kept.rounds_done, recipe(self.config).rounds],
-                "ppo_updates": self.kept.updates,
-                "ppo_anew": self.kept.anew,
+                "warm_start_rounds": [self.state.rounds_done, recipe(self.config).rounds],
+                "ppo_updates": self.state.updates,
+                "ppo_anew": self.state.anew,
             },
             versions={p: version(p) for p in ("gaponet", "mujoco", "numpy", "torch")}
             | {"python": platform.python_version()},

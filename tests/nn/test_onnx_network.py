@@ -11,10 +11,10 @@ from arm import recordings, write_arm
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.export.program import export_program
 from gaponet.nn.artifact import GapModel, make_card
-from gaponet.nn.backends import OnnxNetwork
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 from gaponet.nn.onnx_export import drawn_states, export, onnx_content
+from gaponet.nn.onnx_network import OnnxNetwork
 
 SMALL = {"history": 2, "num_probes": 4, "branch_hidden": (16, 8), "trunk_hidden": (16,), "sensor_hidden": (16, 12)}
 

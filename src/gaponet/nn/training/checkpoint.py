@@ -23,7 +23,7 @@ SHARED = ("net", "optimiser", "critic", "critic_optimiser")  # equal on all rank
 
 
 @dataclass
-class Kept:
+class Checkpoint:
     """The best networks so far, what was done, and where the stages stand."""
 
     best_state: StateDict
@@ -67,7 +67,7 @@ class Kept:
         write_text(out / PROGRESS, "".join(json.dumps(line) + "\n" for line in self.progress))
 
     @classmethod
-    def read(cls, out: Path, net: DeltaNet, dataset: str) -> tuple[Kept, torch.Tensor]:
+    def read(cls, out: Path, net: DeltaNet, dataset: str) -> tuple[Checkpoint, torch.Tensor]:
         """Read a checkpoint: into the network, into torch's random numbers, and the rest.
 
         Args:

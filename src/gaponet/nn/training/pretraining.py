@@ -21,7 +21,7 @@ from torch.nn.functional import huber_loss
 from gaponet.base.arrays import Array, array_module
 from gaponet.nn.layers import DeltaNet
 from gaponet.nn.training import ranks
-from gaponet.nn.training.config import TrainConfig, WarmStartConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.sensor_fit import Report, fit_inputs
 
@@ -29,7 +29,7 @@ HUBER = 0.5  # of what labels usually are: beyond it a label counts as its dista
 MOST = 2_000_000  # states in the pool; where more are visited, some environments' are kept of each period, in turn
 
 
-def recipe(config: TrainConfig) -> WarmStartConfig:
+def recipe(config: TrainConfig) -> PretrainingConfig:
     """The warm start of a kind of model.
 
     The label baseline has one round, on recorded motions that the labels lead along, with the gradient steps of all
@@ -41,7 +41,7 @@ def recipe(config: TrainConfig) -> WarmStartConfig:
     return replace(warm, rounds=1, gradient_steps=warm.rounds * warm.gradient_steps)
 
 
-class WarmStart:
+class Pretraining:
     """The pool of visited states and the optimiser; `round` collects and fits once."""
 
     report: Report | None = None
@@ -52,7 +52,7 @@ class WarmStart:
         net: DeltaNet,
         env: DeltaEnv,
         labels: Array,
-        config: WarmStartConfig,
+        config: PretrainingConfig,
         seed: int,
         nthread: int = 0,
     ) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
+from gaponet.nn.networks import build_network
 
 
 def x(config, n, batch=7, scale=1.0):

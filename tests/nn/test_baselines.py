@@ -7,8 +7,8 @@ import torch
 
 from gaponet.base.errors import UsageError
 from gaponet.nn.config import ModelConfig
-from gaponet.nn.deeponet import build_network
 from gaponet.nn.layers import size
+from gaponet.nn.networks import build_network
 
 KINDS = ("mlp", "shared_mlp")
 
