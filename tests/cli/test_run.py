@@ -13,7 +13,7 @@ from runs import untrained
 
 from gaponet.cli.main import main
 from gaponet.cli.out import Out
-from gaponet.cli.run import Live, Reach, Request, listen
+from gaponet.cli.run import Connection, Live, RunArgs, listen
 from gaponet.data.store import Dataset
 from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.driver import State
@@ -147,9 +147,9 @@ def test_a_motion_or_live_targets_and_not_faster_than_time(arm, motion, capsys, 
 @pytest.mark.parametrize(("kind", "needs"), [("zmq", "zmq"), ("dds", "cyclonedds")])
 def test_live_targets_are_listened_for_where_it_says(arm, kind, needs, tmp_path):
     pytest.importorskip(needs)
-    asked = Request(targets=kind, live=Live(address=f"ipc://{tmp_path}/targets"), reach=Reach(domain=29))
+    asked = RunArgs(targets=kind, live=Live(address=f"ipc://{tmp_path}/targets"), connection=Connection(domain=29))
     targets = listen(Out(False), asked, arm, SimpleNamespace(commanded=arm.joint_names), SimulatedClock())
     said = targets(0, State(0.0, *np.zeros((4, 2))))
     assert isinstance(said, NotYet)
-    assert targets.wire.address in said.text
+    assert targets.transport.address in said.text
     targets.close("over")

@@ -10,7 +10,7 @@ import tyro
 from gaponet.base.errors import DatasetError, UsageError
 from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
-from gaponet.cli.run import Asked, Request, asked_robot, perform, tracking
+from gaponet.cli.run import ControlArgs, RunArgs, perform, resolve_robot, tracking
 
 
 @writes("dataset")
@@ -21,7 +21,7 @@ def record(
     unit_id: str = "",
     repetitions: int = 1,
     seed: int = 0,
-    asked: Annotated[Asked, tyro.conf.arg(name="")] = Asked(),  # noqa: B008
+    args: Annotated[ControlArgs, tyro.conf.arg(name="")] = ControlArgs(),  # noqa: B008
     json: Json = False,
 ) -> None:
     """Play a motion uncorrected and keep what the robot did.
@@ -33,7 +33,7 @@ def record(
         payload_mass: kg in each hand named by payload_side; 0 when empty.
         repetitions: How often each motion is played.
         seed: virtual: of the first recording's noise; later ones count on.
-        asked: Robot and loop.
+        args: Robot and loop.
     """
     from gaponet.data.importer import findings
     from gaponet.data.sequence import SequenceMeta, to_sequence
@@ -41,14 +41,14 @@ def record(
     from gaponet.robot.folder import MOVE_KEPT
     from gaponet.sim.kept import require_kept
 
-    reach, side = asked.reach, asked.payload_side
-    if asked.driver != "virtual" and not unit_id:
+    connection, side = args.connection, args.payload_side
+    if args.driver != "virtual" and not unit_id:
         raise UsageError("say which unit is recorded: --unit-id NAME")
     screen = Out(json)
-    if asked.driver == "virtual":
-        unit_id = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
-    request = Request(**vars(asked), payload_mass=payload_mass)
-    spec = asked_robot(request)
+    if args.driver == "virtual":
+        unit_id = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
+    request = RunArgs(**vars(args), payload_mass=payload_mass)
+    spec = resolve_robot(request)
     known = Dataset.peek(out, spec)
     if known is not None:  # before anything moves
         require_kept(out, spec, DatasetError, MOVE_KEPT)

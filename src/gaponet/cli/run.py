@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from gaponet.hw.control.driver import Driver
     from gaponet.hw.control.plan import Plan
     from gaponet.hw.control.recording import Event, Recording
-    from gaponet.hw.targets.live import LiveTargets, Wire
+    from gaponet.hw.targets.live import LiveTargets, Transport
     from gaponet.robot.spec import RobotSpec
     from gaponet.sysid.motion.feasible import Feasibility
     from gaponet.sysid.motion.motion import Motion
 
 
 @dataclass(frozen=True)
-class Reach:
+class Connection:
     """How to reach the robot."""
 
     topic: Literal["arm_sdk", "lowcmd"] = "arm_sdk"
@@ -59,7 +59,7 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class Asked:
+class ControlArgs:
     """What playing a motion may be told of robot and loop, as data: the docstrings are the command-line help."""
 
     driver: Literal["virtual", "unitree", "so101"] = "virtual"
@@ -75,7 +75,7 @@ class Asked:
     max_payload: float | None = None
     """kg in each hand that the motion must be possible with; default payload_mass, 0 without one. A motion of the
     library that several payloads shall play alike needs the heaviest of them here."""
-    reach: tyro.conf.OmitArgPrefixes[Reach] = Reach()
+    connection: tyro.conf.OmitArgPrefixes[Connection] = Connection()
     """How to reach the robot."""
     control: tyro.conf.OmitArgPrefixes[ControlConfig] = ControlConfig()  # noqa: RUF009
     """Timing."""
@@ -102,7 +102,7 @@ class Live(LiveConfig):
 
 
 @dataclass(frozen=True)
-class Request(Asked):
+class RunArgs(ControlArgs):
     """The same, with compensation between targets and commands, and live targets."""
 
     targets: Literal["zmq", "dds", "stdin"] | None = None
@@ -132,7 +132,7 @@ class Request(Asked):
 def run(
     motion: str | None = None,
     out: Path | None = None,
-    asked: Annotated[Request, tyro.conf.arg(name="")] = Request(),
+    args: Annotated[RunArgs, tyro.conf.arg(name="")] = RunArgs(),
     json: Json = False,
 ) -> None:
     """Play a motion or live targets on a robot; any key stops it.
@@ -142,12 +142,12 @@ def run(
     Args:
         motion: A motion's name (gaponet collect lists the forms) or a motion file (.txt, .csv, .npz); or --targets.
         out: Folder for the recording: MOTION.parquet for gaponet import, .json, .cycles.npy.
-        asked: Robot, loop and model.
+        args: Robot, loop and model.
     """
     screen = Out(json)
-    if asked.dry_run and out:
+    if args.dry_run and out:
         raise UsageError("a dry run moves nothing, so there is nothing to record; leave out --out")
-    recording, played, _ = perform(screen, motion, asked, folder=out)
+    recording, played, _ = perform(screen, motion, args, folder=out)
     if out:
         screen.say(f"written: {recording.save(out, played.name if played else 'live').with_suffix('.*')}")
     screen.result(recording.summary() | tracking(recording))
@@ -156,7 +156,7 @@ def run(
 
 
 def perform(
-    screen: Out, motion_name: str | None, asked: Request, seed: int = 0, folder: Path | None = None
+    screen: Out, motion_name: str | None, args: RunArgs, seed: int = 0, folder: Path | None = None
 ) -> tuple[Recording, Motion | None, RobotSpec]:
     """Make everything, ask, run, and say how it went; live targets are no motion. The seed is of a virtual robot."""
     from gaponet.hw.control.clock import MonotonicClock, SimulatedClock
@@ -165,31 +165,31 @@ def perform(
     from gaponet.hw.control.plan import Planner
     from gaponet.hw.drivers.dry import DryRun
 
-    if (motion_name is None) == (asked.targets is None):
+    if (motion_name is None) == (args.targets is None):
         raise UsageError("give either --motion, what to play, or --targets, where targets come from while it moves")
-    spec = identified = asked_robot(asked)
-    if asked.driver != "virtual":
-        spec = for_hardware(identified, known_robot(asked.driver, asked.limits_from))
-    fast = asked.reach.fast and asked.driver == "virtual"
-    if fast and asked.targets:
+    spec = identified = resolve_robot(args)
+    if args.driver != "virtual":
+        spec = for_hardware(identified, known_robot(args.driver, args.limits_from))
+    fast = args.connection.fast and args.driver == "virtual"
+    if fast and args.targets:
         raise UsageError("live targets come in real time; leave out --fast")
     clock = SimulatedClock() if fast else MonotonicClock()
-    asks = asked.driver != "virtual" and not asked.yes and not asked.dry_run
+    asks = args.driver != "virtual" and not args.yes and not args.dry_run
     if asks:
         require_terminal()
-    _require_shapes(screen, asked, spec)
-    _require_hung(asked)
-    motion, limits = find_motion(motion_name, asked, spec)
-    driver, facts = make_driver(asked, spec, clock, seed)
+    _require_shapes(screen, args, spec)
+    _require_hung(args)
+    motion, limits = find_motion(motion_name, args, spec)
+    driver, facts = make_driver(args, spec, clock, seed)
     if motion:
         _require_commanded(motion, spec, driver)
-    planner = Planner(spec, driver.commanded, asked.control, asked.safety, limits)
-    if asked.dry_run:
+    planner = Planner(spec, driver.commanded, args.control, args.safety, limits)
+    if args.dry_run:
         driver = DryRun(driver)
-    compensator, adapted = _compensator(screen, asked, identified, asked.unit_id or facts.get("unit_id", ""))
-    if compensator and asked.driver != "virtual":
+    compensator, adapted = _compensator(screen, args, identified, args.unit_id or facts.get("unit_id", ""))
+    if compensator and args.driver != "virtual":
         require_plausible(compensator.robot)
-    live = None if motion else listen(screen, asked, spec, driver, clock)
+    live = None if motion else listen(screen, args, spec, driver, clock)
 
     def met(robot: Driver) -> None:
         """The robot has answered and nothing was commanded: plan, show, ask."""
@@ -198,22 +198,22 @@ def perform(
         if motion:
             plan = planner.plan(motion, robot.read().qpos)
             if compensator:
-                stated = asked.payload_mass
+                stated = args.payload_mass
                 masses = compensator.masses[[0, -1]].tolist() if stated is None else [stated]
                 plan = planner.judge_commands(plan, compensator, tuple(sorted(set(masses))))
             controller.plan = plan
             _show(screen, plan, spec, robot, limits.max_payload)
         if asks:
-            how = f"as {asked.targets} says" if motion is None else "as planned"
+            how = f"as {args.targets} says" if motion is None else "as planned"
             require_consent(f"{robot.address} will move {len(robot.commanded)} joints {how}.")
 
     controller = Controller(
-        driver, spec, config=asked.control, safety=asked.safety, compensator=compensator, clock=clock,
-        payload_mass=asked.payload_mass, folder=folder, on_event=lambda event: _tell(screen, event), on_connect=met,
-        planner=None if asked.unchecked else planner, unchecked=asked.unchecked,
+        driver, spec, config=args.control, safety=args.safety, compensator=compensator, clock=clock,
+        payload_mass=args.payload_mass, folder=folder, on_event=lambda event: _tell(screen, event), on_connect=met,
+        planner=None if args.unchecked else planner, unchecked=args.unchecked,
         metadata={
-            "motion": motion.name if motion else "live", "payload_side": asked.payload_side,
-            "model": str(asked.model) if asked.model else None,
+            "motion": motion.name if motion else "live", "payload_side": args.payload_side,
+            "model": str(args.model) if args.model else None,
             "compensated_by": str(compensator.robot.folder) if compensator else None, "adapted": adapted,
             "limits_from": str(spec.folder), "robot_hash": robot_hash(spec),
         } | facts | ({"targets": live.counts} if live else {}),
@@ -224,48 +224,48 @@ def perform(
         if live:
             events = controller.recording.events
             live.close(events[-1].text if events else "nothing was commanded")
-    if asked.dry_run:
+    if args.dry_run:
         _report_dry(screen, recording, controller)
     else:
         _report(screen, recording)
     return recording, controller.plan.motion if controller.plan else None, identified
 
 
-def listen(screen: Out, asked: Request, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
-    """The wire of live targets, open."""
+def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: Clock) -> LiveTargets:
+    """Open the transport of live targets."""
     from gaponet.hw.targets.live import LiveTargets
 
-    wire: Wire
-    live = asked.live
-    if asked.targets == "zmq":
-        from gaponet.hw.targets.zeromq import ZeroMQWire
+    transport: Transport
+    live = args.live
+    if args.targets == "zmq":
+        from gaponet.hw.targets.zeromq import ZeroMQTransport
 
-        wire = ZeroMQWire(live.address)
-    elif asked.targets == "dds":
-        from gaponet.hw.targets.ros2 import ROS2Wire
+        transport = ZeroMQTransport(live.address)
+    elif args.targets == "dds":
+        from gaponet.hw.targets.ros2 import ROS2Transport
 
-        wire = ROS2Wire(asked.reach.domain, asked.reach.interface, live.topic, live.states)
+        transport = ROS2Transport(args.connection.domain, args.connection.interface, live.topic, live.states)
     else:
-        from gaponet.hw.targets.pipe import PipeWire
+        from gaponet.hw.targets.pipe import PipeTransport
 
-        wire = PipeWire()
-    screen.say(f"targets are expected on {wire.address}")
-    return LiveTargets(wire, robot, driver.commanded, clock, 1.0 / asked.control.rate, asked.safety.speed, live)
+        transport = PipeTransport()
+    screen.say(f"targets are expected on {transport.address}")
+    return LiveTargets(transport, robot, driver.commanded, clock, 1.0 / args.control.rate, args.safety.speed, live)
 
 
-def asked_robot(asked: Request) -> RobotSpec:
+def resolve_robot(args: RunArgs) -> RobotSpec:
     """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
     from gaponet.base.errors import ModelError
     from gaponet.robot.folder import keeps_robot, kept_robot
     from gaponet.robot.spec import load_robot
     from gaponet.sim.kept import require_kept
 
-    place = None if asked.model is None else asked.model.parent if asked.model.name == "model" else asked.model
-    if place is not None and asked.robot is not None:
-        return require_kept(place, load_robot(asked.robot), ModelError, "leave --robot out")
+    place = None if args.model is None else args.model.parent if args.model.name == "model" else args.model
+    if place is not None and args.robot is not None:
+        return require_kept(place, load_robot(args.robot), ModelError, "leave --robot out")
     if place is not None and keeps_robot(place):
         return kept_robot(place, "")
-    return load_robot(asked.robot or ("so101" if asked.driver == "so101" else "h1_2"))
+    return load_robot(args.robot or ("so101" if args.driver == "so101" else "h1_2"))
 
 
 def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None:
@@ -278,65 +278,65 @@ def _require_commanded(motion: Motion, robot: RobotSpec, driver: Driver) -> None
         )
 
 
-def _require_shapes(screen: Out, asked: Request, robot: RobotSpec) -> None:
+def _require_shapes(screen: Out, args: RunArgs, robot: RobotSpec) -> None:
     """Refuse a real robot of which nobody knows where its limbs are."""
-    if asked.unchecked or (robot.folder / "collision.toml").is_file():
+    if args.unchecked or (robot.folder / "collision.toml").is_file():
         return
     text = (
         f"{robot.name} has no collision.toml, so nobody would look whether it meets itself or what it stands on. Write "
         f"one into {robot.folder} (docs/new-robot.md has the fields), or say --unchecked"
     )
-    if asked.driver != "virtual":
+    if args.driver != "virtual":
         raise UsageError(text)
     screen.say(f"unchecked: {text}")
 
 
-def _require_hung(asked: Request) -> None:
+def _require_hung(args: RunArgs) -> None:
     """Refuse lowcmd for a robot of which nobody said that it hangs."""
-    if asked.driver != "unitree" or asked.reach.topic != "lowcmd" or asked.reach.hangs or asked.dry_run:
+    if args.driver != "unitree" or args.connection.topic != "lowcmd" or args.connection.hangs or args.dry_run:
         return
     words = {"arms": "legs and torso", "upper_body": "the legs", "all": "at the end of the run all motors"}
-    off = words[asked.reach.joints]
-    if asked.yes:
+    off = words[args.connection.joints]
+    if args.yes:
         raise UsageError(f"with --topic lowcmd {off} go off, and a robot that stands falls; say --hangs if it hangs")
     text = f"With --topic lowcmd {off} go off: a robot that stands falls."
     require_consent(text, "Does it hang?", "it hangs", "--hangs")
 
 
-def find_motion(name: str | None, asked: Request, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
+def find_motion(name: str | None, args: RunArgs, robot: RobotSpec) -> tuple[Motion | None, Feasibility]:
     """A motion file as it is, or a motion of the library, or None for live targets; and the limits it must keep."""
     from gaponet.sysid.motion.files import SUFFIXES, read_motion
     from gaponet.sysid.motion.library import Library
 
-    payload = asked.payload_mass or 0.0
-    heaviest = payload if asked.max_payload is None else asked.max_payload
+    payload = args.payload_mass or 0.0
+    heaviest = payload if args.max_payload is None else args.max_payload
     if heaviest < payload:
         raise UsageError(f"--max-payload {heaviest:g} is less than --payload-mass {payload:g}")
-    library = Library(robot, max_payload=heaviest, height=asked.plane, unchecked=asked.unchecked)
+    library = Library(robot, max_payload=heaviest, height=args.plane, unchecked=args.unchecked)
     if name is None:
         return None, library.limits
     return read_motion(name, robot) if name.endswith(SUFFIXES) else library.make(name), library.limits
 
 
-def make_driver(asked: Request, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
+def make_driver(args: RunArgs, robot: RobotSpec, clock: Any, seed: int) -> tuple[Driver, dict[str, Any]]:
     """The driver, and what is known about the unit behind it."""
     from gaponet.hw.drivers.open import open_driver
 
-    reach = asked.reach
-    if asked.driver == "unitree":
-        options: dict[str, Any] = {n: getattr(reach, n) for n in ("topic", "joints", "domain", "interface")}
-        return open_driver("unitree", robot, silent=asked.dry_run, **options), {}
-    if asked.driver == "so101":
-        return open_driver("so101", robot, port=reach.port, calibration=reach.calibration), {}
+    connection = args.connection
+    if args.driver == "unitree":
+        options: dict[str, Any] = {n: getattr(connection, n) for n in ("topic", "joints", "domain", "interface")}
+        return open_driver("unitree", robot, silent=args.dry_run, **options), {}
+    if args.driver == "so101":
+        return open_driver("so101", robot, port=connection.port, calibration=connection.calibration), {}
     from gaponet.testing.fleet import load_fleet
     from gaponet.testing.virtual_driver import VirtualDriver
 
     robot = robot.nominal or robot  # what identification found is the unit's, and that has its own
-    name = f"virtual-{reach.unit}" if reach.unit.isdigit() else reach.unit
-    side = asked.payload_side
-    physics = load_fleet(reach.fleet, robot).unit(name)
-    payload = (asked.payload_mass or 0.0, side)
-    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": reach.fleet}
+    name = f"virtual-{connection.unit}" if connection.unit.isdigit() else connection.unit
+    side = args.payload_side
+    physics = load_fleet(connection.fleet, robot).unit(name)
+    payload = (args.payload_mass or 0.0, side)
+    return VirtualDriver(robot, physics, clock, payload, name, seed=seed), {"unit_id": name, "fleet": connection.fleet}
 
 
 def tracking(recording: Recording) -> dict[str, Any]:
@@ -352,25 +352,25 @@ def tracking(recording: Recording) -> dict[str, Any]:
     return {"tracking_error_rad": {"mean": float(np.mean(list(joints.values()))) if joints else None} | joints}
 
 
-def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
+def _compensator(screen: Out, args: RunArgs, robot: RobotSpec, unit: str) -> tuple[Any, str | None]:
     """The compensator, or None; and the unit whose adaptation it uses."""
-    if asked.model is None and not asked.compensate:
+    if args.model is None and not args.compensate:
         return None, None
     from gaponet.deploy.compensator import Compensator
 
-    config, dt = asked.compensation, 1.0 / asked.control.rate
-    if asked.model is None:
-        config = replace(config, dynamics=config.dynamics or asked.targets is None)
-        made = Compensator(robot, None, config, dt, None, asked.payload_side, extrapolate=asked.extrapolate)
-        if asked.payload_mass is not None:
-            made.require_payload(asked.payload_mass)  # before anything is opened
+    config, dt = args.compensation, 1.0 / args.control.rate
+    if args.model is None:
+        config = replace(config, dynamics=config.dynamics or args.targets is None)
+        made = Compensator(robot, None, config, dt, None, args.payload_side, extrapolate=args.extrapolate)
+        if args.payload_mass is not None:
+            made.require_payload(args.payload_mass)  # before anything is opened
         if robot.nominal is None:
             screen.say(f"{robot.folder} is not identified: the feed-forward is the nominal robot's")
         return made, None
     from gaponet.nn.adaptation import Adaptation
     from gaponet.nn.artifact import GapModel
 
-    model = GapModel.load(asked.model)
+    model = GapModel.load(args.model)
     folder = model.path.parent if model.path.name == "model" else model.path
     known = Adaptation.load(folder, model.weights_hash())
     if unit in known:
@@ -379,11 +379,11 @@ def _compensator(screen: Out, asked: Request, robot: RobotSpec, unit: str) -> tu
         units = ", ".join(known)
         screen.say(f"the run holds adaptations of {units}, none of which is used: --unit-id says which unit this is")
     compensator = Compensator(
-        robot, model, config, dt, payload_side=asked.payload_side,
-        extrapolate=asked.extrapolate, adaptation=known.get(unit),
+        robot, model, config, dt, payload_side=args.payload_side,
+        extrapolate=args.extrapolate, adaptation=known.get(unit),
     )  # fmt: skip
-    if asked.payload_mass is not None:
-        compensator.require_payload(asked.payload_mass)
+    if args.payload_mass is not None:
+        compensator.require_payload(args.payload_mass)
     return compensator, unit if unit in known else None
 
 

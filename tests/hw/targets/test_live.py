@@ -14,7 +14,7 @@ from gaponet.hw.control.clock import SimulatedClock
 from gaponet.hw.control.controller import Controller
 from gaponet.hw.control.phases import ControlConfig
 from gaponet.hw.control.safety import Limits, SafetyConfig
-from gaponet.hw.targets.live import LARGEST, Heard, LiveConfig, LiveTargets, decode, follow
+from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, LiveConfig, LiveTargets, Message, decode, next_step
 from gaponet.hw.targets.policy import play
 from gaponet.sysid.motion.motion import Motion
 from gaponet.testing.fleet import load_fleet
@@ -63,14 +63,14 @@ def wave(t):
 
 
 def good(t, sender="a"):
-    return Heard(sender, 100.0 + t, wave(t))
+    return Message(sender, 100.0 + t, wave(t))
 
 
 def live(arm, say, seconds=2.6, config=LiveConfig(wait=3.0), **how):  # noqa: B008
     """Controller, wire and driver after a run; the sender ends after `seconds`."""
     clock = SimulatedClock()
     driver = Noted(arm, clock)
-    wire = Scripted(clock, lambda t: say(t) if t < seconds else [Heard("a", 100.0 + t, end=True)])
+    wire = Scripted(clock, lambda t: say(t) if t < seconds else [Message("a", 100.0 + t, end=True)])
     controller = Controller(driver, arm, config=QUICK, clock=clock, **how)
     targets = LiveTargets(wire, arm, driver.commanded, clock, DT, SafetyConfig().speed, config)
     controller.run(targets)
@@ -107,7 +107,7 @@ def test_a_stream_is_played_as_the_same_motion_from_a_file(arm):
         k = max(told["k"], 0)
         over = told["k"] >= len(rows)
         row = rows[min(k, len(rows) - 1)]
-        return [Heard("a", 100 + t, dict(zip(arm.joint_names, row.tolist(), strict=True)), over)]
+        return [Message("a", 100 + t, dict(zip(arm.joint_names, row.tolist(), strict=True)), over)]
 
     clock = SimulatedClock()
     wire_driver = Noted(arm, clock)
@@ -142,16 +142,16 @@ def test_a_run_that_its_sender_ends_goes_back_and_stops_without_fault(arm):
 
 WRONG = {  # from FAULT on, every message is of this kind
     "silent": (lambda t: [], ""),
-    "not a number": (lambda t: [Heard("a", 100 + t, {"shoulder": NAN, "elbow": 0.0})], "range"),
-    "infinite": (lambda t: [Heard("a", 100 + t, {"shoulder": -np.inf, "elbow": 0.0})], "range"),
-    "another joint": (lambda t: [Heard("a", 100 + t, wave(t) | {"wrist": 0.0})], "joints"),
-    "a joint fewer": (lambda t: [Heard("a", 100 + t, {"elbow": 0.0})], "joints"),
-    "a jump": (lambda t: [Heard("a", 100 + t, {"shoulder": -1.4, "elbow": 1.4})], "speed"),
-    "degrees": (lambda t: [Heard("a", 100 + t, {"shoulder": 30.0, "elbow": 4.0})], "range"),
-    "too fast": (lambda t: [Heard("a", 100 + t, {"shoulder": 1.4 * (-1) ** int(t / DT), "elbow": 0.0})], "speed"),
+    "not a number": (lambda t: [Message("a", 100 + t, {"shoulder": NAN, "elbow": 0.0})], "range"),
+    "infinite": (lambda t: [Message("a", 100 + t, {"shoulder": -np.inf, "elbow": 0.0})], "range"),
+    "another joint": (lambda t: [Message("a", 100 + t, wave(t) | {"wrist": 0.0})], "joints"),
+    "a joint fewer": (lambda t: [Message("a", 100 + t, {"elbow": 0.0})], "joints"),
+    "a jump": (lambda t: [Message("a", 100 + t, {"shoulder": -1.4, "elbow": 1.4})], "speed"),
+    "degrees": (lambda t: [Message("a", 100 + t, {"shoulder": 30.0, "elbow": 4.0})], "range"),
+    "too fast": (lambda t: [Message("a", 100 + t, {"shoulder": 1.4 * (-1) ** int(t / DT), "elbow": 0.0})], "speed"),
     "the same again": (lambda t: [good(FAULT - DT)], "order"),
     "backwards": (lambda t: [good(2 * FAULT - t - DT)], "order"),
-    "late": (lambda t: [Heard("a", 100 + t - 0.11, wave(t))] if t > FAULT + 0.11 else [], "late"),
+    "late": (lambda t: [Message("a", 100 + t - 0.11, wave(t))] if t > FAULT + 0.11 else [], "late"),
     "another sender": (lambda t: [good(t, "b")], "stranger"),
     "malformed": (lambda t: [decode("a", b'{"time": 3, "target": {"shoulder": "0.1"}}')], "malformed"),
 }
@@ -185,7 +185,7 @@ def test_a_burst_of_it_shorter_than_the_hold_is_survived(arm, what):
 
 
 def test_a_target_that_is_less_than_a_tenth_of_a_second_late_is_taken(arm):
-    recording, _, _, targets = live(arm, lambda t: [Heard("a", 100 + t - 0.09 * (t > FAULT), wave(t))])
+    recording, _, _, targets = live(arm, lambda t: [Message("a", 100 + t - 0.09 * (t > FAULT), wave(t))])
     assert recording.fault is None
     assert set(targets.counts["refused"]) <= {"order"}, "as far as newer ones came before"
 
@@ -197,7 +197,7 @@ def test_a_flood_is_read_to_its_newest_and_can_move_no_faster(arm):
         if t < FAULT:
             return [good(t)]
         start = wave(FAULT)
-        return [Heard("a", 100 + t + 1e-5 * i, start | {"shoulder": 0.02 * i + start["shoulder"]}) for i in range(50)]
+        return [Message("a", 100 + t + 1e-5 * i, start | {"shoulder": 0.02 * i + start["shoulder"]}) for i in range(50)]
 
     recording, _, _, targets = live(arm, say)
     shoulder = np.array([r.target[0] for r in recording.rows if r.target is not None and r.phase == "run"])
@@ -207,7 +207,7 @@ def test_a_flood_is_read_to_its_newest_and_can_move_no_faster(arm):
 
 
 def test_a_target_a_little_out_of_range_is_brought_into_it(arm):
-    recording, *_ = live(arm, lambda t: [Heard("a", 100 + t, {"shoulder": min(1.65, t), "elbow": 0.0})])
+    recording, *_ = live(arm, lambda t: [Message("a", 100 + t, {"shoulder": min(1.65, t), "elbow": 0.0})])
     assert recording.fault is None
     assert max(r.target[0] for r in recording.rows if r.target is not None) == 1.5
     judge(arm, recording)
@@ -221,7 +221,7 @@ def test_a_target_a_little_out_of_range_is_brought_into_it(arm):
 )
 def test_no_sender_makes_a_command_accelerate_beyond_the_limit(arm, shoulder, most):
     config = LiveConfig(hold=HOLD, wait=3.0, acceleration=most)
-    recording, *_ = live(arm, lambda t: [Heard("a", 100 + t, {"shoulder": shoulder(t), "elbow": 0.0})], config=config)
+    recording, *_ = live(arm, lambda t: [Message("a", 100 + t, {"shoulder": shoulder(t), "elbow": 0.0})], config=config)
     assert recording.fault is None
     at = np.array([r.ctrl[0] for r in recording.rows if r.phase == "run"])
     assert np.abs(np.diff(at, 2)).max() <= most * DT**2 * (1 + 1e-9)
@@ -235,7 +235,7 @@ def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as
     at = step = np.zeros(1)
     for k in range(200):
         target = np.array([rate * DT * min(k, 100)])
-        before, step = step, follow(step, target - at, fastest, change)
+        before, step = step, next_step(step, target - at, fastest, change)
         at = at + step
         assert at <= target + 1e-12
         assert np.abs(step - before) <= change + 1e-12
@@ -248,7 +248,7 @@ def test_a_target_is_reached_without_overshoot_and_a_ramp_is_followed_as_near_as
 
 def test_after_its_end_a_sender_moves_the_robot_no_more(arm):
     clock = SimulatedClock()
-    wire = Scripted(clock, lambda t: [Heard("a", 100 + t, {"shoulder": 2 * t}, end=t > 0.2)])
+    wire = Scripted(clock, lambda t: [Message("a", 100 + t, {"shoulder": 2 * t}, end=t > 0.2)])
     targets = LiveTargets(wire, arm, arm.joint_names, clock, DT, SafetyConfig().speed)
     state, out = SimpleNamespace(time=0.0, qpos=np.zeros(2), qvel=np.zeros(2), tau=np.zeros(2)), []
     for k in range(100):
@@ -262,7 +262,7 @@ def test_after_its_end_a_sender_moves_the_robot_no_more(arm):
 
 
 def test_joints_that_are_not_named_stay_where_they_were_found(arm):
-    recording, *_ = live(arm, lambda t: [Heard("a", 100 + t, {"elbow": wave(t)["elbow"]})])
+    recording, *_ = live(arm, lambda t: [Message("a", 100 + t, {"elbow": wave(t)["elbow"]})])
     assert recording.fault is None
     assert np.ptp([r.target[0] for r in recording.rows if r.target is not None]) < 0.01
 
@@ -273,7 +273,7 @@ def test_until_the_first_target_nothing_is_commanded_and_not_for_ever(arm):
     assert recording.fault.kind == "silence"
     assert "no target came on nowhere in 3 s" in recording.fault.text
     assert driver.sent == []
-    recording, driver, *_ = live(arm, lambda t: [good(t)] if t > 2.0 else [Heard("a", 99.0)], seconds=4.0)
+    recording, driver, *_ = live(arm, lambda t: [good(t)] if t > 2.0 else [Message("a", 99.0)], seconds=4.0)
     assert recording.fault is None, "patience for the robot begins anew while a target is waited for"
 
 
@@ -294,7 +294,7 @@ def test_a_sender_that_waits_for_states_survives_a_plan_that_took_long(so101):
             return said
 
         def publish(self, to, state):
-            self.said = [Heard("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]
+            self.said = [Message("a", self.clock.now(), dict.fromkeys(so101.joint_names, 0.0))]
 
     wire = Answering(clock, None)
     config = ControlConfig(blend=0.3, blend_speed=2.0, settle=0.1, damp=0.1)
@@ -324,11 +324,12 @@ def test_a_message_without_a_clock_is_taken_as_it_comes(arm):
     "data",
     [b"", b"null", b"[]", b"{}", b'{"time": NaN, "target": {}}', b'{"time": 1, "target": {"a": Infinity}}', b"\xff\xfe",
      b'{"time": 1, "target": [1, 2]}', b'{"time": 1, "targets": {}}', b'{"time": true}', b"[" * 10000,
-     b'{"time": 1' + b"0" * 10000 + b"}", b" " * (LARGEST + 1), b'{"time": 1, "target": {"a": ' + b"[" * 9000],
+     b'{"time": 1' + b"0" * 10000 + b"}", b" " * (MAX_MESSAGE_BYTES + 1),
+     b'{"time": 1, "target": {"a": ' + b"[" * 9000],
 )  # fmt: skip
 def test_what_is_no_message_says_so(data):
     heard = decode("a", data)
-    assert heard.wrong
+    assert heard.error
     assert heard.target is None
     assert not heard.end
 
@@ -343,5 +344,5 @@ def test_nothing_is_taken_apart_for_the_first_time_while_the_robot_moves(arm):
     _type_adapter.cache_clear()
     LiveTargets(SimpleNamespace(address="here"), arm, arm.joint_names, SimulatedClock(), DT, 5.0)
     made = _type_adapter.cache_info().misses
-    assert decode("a", b'{"time": 1.0, "target": {"shoulder": 0.1}}').wrong == ""
+    assert decode("a", b'{"time": 1.0, "target": {"shoulder": 0.1}}').error == ""
     assert made == _type_adapter.cache_info().misses == 1

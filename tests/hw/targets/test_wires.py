@@ -15,8 +15,8 @@ from environments import environment
 
 from gaponet.base.errors import UsageError
 from gaponet.hw.control.driver import DriverError
-from gaponet.hw.targets.live import LARGEST, Heard
-from gaponet.hw.targets.pipe import PipeWire
+from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message
+from gaponet.hw.targets.pipe import PipeTransport
 
 STATE = {"time": 7.0, "joint_names": ("a", "b"), "commanded": ("b",), "qpos": [0.1, 0.2], "qvel": [0, 0], "tau": [1, 2]}
 
@@ -33,7 +33,7 @@ def heard(wire, count, seconds=20.0):
 @pytest.fixture
 def listening():
     zeromq = pytest.importorskip("gaponet.hw.targets.zeromq")
-    wire = zeromq.ZeroMQWire("tcp://127.0.0.1:*")
+    wire = zeromq.ZeroMQTransport("tcp://127.0.0.1:*")
     wire.address = wire._socket.last_endpoint.decode()
     yield wire
     wire.close("over")
@@ -84,12 +84,12 @@ def test_a_stranger_who_says_too_much_is_cut_off_and_nobody_else(listening):
         for socket in (stranger, sender):
             socket.linger = 0
             socket.connect(listening.address)
-        stranger.send(b"x" * (LARGEST + 1))
+        stranger.send(b"x" * (MAX_MESSAGE_BYTES + 1))
         stranger.send_multipart([b"", b"\x80\x04pickle"])
         sender.send(json.dumps({"time": 1.0, "target": {"a": 0.5}}).encode())
         found = heard(listening, 1)
         found += heard(listening, 1, 0.5)
-        assert [m.target for m in found if not m.wrong] == [{"a": 0.5}]
+        assert [m.target for m in found if not m.error] == [{"a": 0.5}]
         assert len(listening.receive()) == 0
         listening.publish(b"nobody", STATE)
     finally:
@@ -117,29 +117,29 @@ def test_no_more_messages_are_taken_at_a_look_than_a_period_can_bear(listening):
 
 
 def test_two_cannot_listen_at_one_address(listening):
-    from gaponet.hw.targets.zeromq import ZeroMQWire
+    from gaponet.hw.targets.zeromq import ZeroMQTransport
 
     with pytest.raises(UsageError, match=r"cannot listen at .* is another run there"):
-        ZeroMQWire(listening.address)
+        ZeroMQTransport(listening.address)
 
 
 def test_lines_through_a_pipe_may_come_in_parts_be_too_long_and_cease():
     read, write = os.pipe()
-    wire = PipeWire(read)
+    wire = PipeTransport(read)
     assert wire.receive() == []
     line = b'{"time": 1, "target": {"a": 0.5}}\n'
     os.write(write, line[:7])
     assert wire.receive() == []
     os.write(write, line[7:] + line[:-1])
-    assert wire.receive() == [Heard("stdin", 1.0, {"a": 0.5})]
+    assert wire.receive() == [Message("stdin", 1.0, {"a": 0.5})]
     os.write(write, b"\n")
     assert len(wire.receive()) == 1
-    os.write(write, b"x" * (LARGEST + 1))
-    assert "has more than" in wire.receive()[0].wrong
+    os.write(write, b"x" * (MAX_MESSAGE_BYTES + 1))
+    assert "has more than" in wire.receive()[0].error
     os.write(write, b"x" * 100 + b'"time": 9}\n' + line)
     assert [m.target for m in wire.receive()] == [{"a": 0.5}]
     os.close(write)
-    assert "closed the pipe" in wire.receive()[0].wrong
+    assert "closed the pipe" in wire.receive()[0].error
     assert wire.receive() == []
     os.close(read)
 
@@ -170,7 +170,7 @@ def test_ros_messages_are_on_the_wire_as_another_library_has_them(ros2):
     data = trajectory(["left", "right_elbow"], [0.1, -0.2])
     said = ros2.decode(ros2.JointTrajectory, data[4:])
     assert ros2.encode(said) == data[4:]
-    assert ros2.heard("a", data[4:]) == Heard("a", 5 + 7e-9, {"left": 0.1, "right_elbow": -0.2})
+    assert ros2.to_message("a", data[4:]) == Message("a", 5 + 7e-9, {"left": 0.1, "right_elbow": -0.2})
     store = get_typestore(Stores.ROS2_HUMBLE)
     state = ros2.JointState(ros2.Header(ros2.Time(3, 4), ""), ["left", "b"], [0.1, 0.2], [1.0, 2.0], [])
     read = store.deserialize_cdr(data[:4] + ros2.encode(state), "sensor_msgs/msg/JointState")
@@ -179,25 +179,25 @@ def test_ros_messages_are_on_the_wire_as_another_library_has_them(ros2):
 
 
 def test_plans_and_what_is_no_trajectory_are_refused(ros2):
-    assert "a plan" in ros2.heard("a", trajectory("ab", [1, 2], points=2)[4:]).wrong
-    assert "a plan" in ros2.heard("a", trajectory("ab", [1, 2], due=900_000_000)[4:]).wrong
-    assert "1 positions for 2 joints" in ros2.heard("a", trajectory("ab", [1])[4:]).wrong
-    assert "2 positions for 1 joints" in ros2.heard("a", trajectory("aa", [1, 2])[4:]).wrong
-    assert ros2.heard("a", trajectory("ab", [1, 2], stamp=(0, 0))[4:]).time is None
-    assert ros2.heard("a", trajectory("ab", [], points=0)[4:]).end
+    assert "a plan" in ros2.to_message("a", trajectory("ab", [1, 2], points=2)[4:]).error
+    assert "a plan" in ros2.to_message("a", trajectory("ab", [1, 2], due=900_000_000)[4:]).error
+    assert "1 positions for 2 joints" in ros2.to_message("a", trajectory("ab", [1])[4:]).error
+    assert "2 positions for 1 joints" in ros2.to_message("a", trajectory("aa", [1, 2])[4:]).error
+    assert ros2.to_message("a", trajectory("ab", [1, 2], stamp=(0, 0))[4:]).time is None
+    assert ros2.to_message("a", trajectory("ab", [], points=0)[4:]).end
     whole = trajectory("ab", [1, 2])[4:]
-    assert "has more than" in ros2.heard("a", whole + bytes(LARGEST)).wrong
+    assert "has more than" in ros2.to_message("a", whole + bytes(MAX_MESSAGE_BYTES)).error
     rng = np.random.default_rng(0)
     for cut in range(len(whole)):
         broken = bytearray(whole[: cut + 1])
         broken[rng.integers(len(broken))] = rng.integers(256)
-        message = ros2.heard("a", bytes(broken))
-        assert message.wrong or message.end or message.target is not None
+        message = ros2.to_message("a", bytes(broken))
+        assert message.error or message.end or message.target is not None
 
 
-def meet(ros2, domain: int, peer: list, **environ: str) -> tuple[dict, list[Heard]]:
+def meet(ros2, domain: int, peer: list, **environ: str) -> tuple[dict, list[Message]]:
     """What a program at the other end of ROS 2's topics says it has heard, and what it told us."""
-    wire = ros2.ROS2Wire(domain)
+    wire = ros2.ROS2Transport(domain)
     other = subprocess.Popen(peer, stdout=subprocess.PIPE, text=True, env={**os.environ, **environ})
     try:
         found, deadline = [], time.monotonic() + 60
@@ -215,7 +215,7 @@ def meet(ros2, domain: int, peer: list, **environ: str) -> tuple[dict, list[Hear
         said.items()
         >= {"name": ["a", "b"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [1.0, 2.0]}.items()
     )
-    assert [m.wrong for m in found if m.wrong] == []
+    assert [m.error for m in found if m.error] == []
     assert {m.sender for m in found} == {found[0].sender}
     times = [m.time for m in found]
     assert times == sorted(times)

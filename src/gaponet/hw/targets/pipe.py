@@ -1,4 +1,4 @@
-"""Targets on standard input: a line of JSON each (live.Message), from a program at the other end of a pipe."""
+"""Targets on standard input: one line of JSON per message (live.MessageFields), from a program at the other end."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from collections.abc import Hashable
 from typing import Any
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.live import LARGEST, Heard, decode
+from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message, decode
 
-CHUNK = 1 << 16  # bytes taken at one look: some 40 messages of a humanoid
+READ_BYTES = 1 << 16  # per call: some 40 messages of a humanoid
 
 
-class PipeWire:
-    """A `Wire` that reads lines; it tells nobody anything."""
+class PipeTransport:
+    """A `Transport` that reads lines and sends nothing."""
 
     def __init__(self, descriptor: int | None = None) -> None:
         """
         Args:
-            descriptor: A pipe's; default standard input.
+            descriptor: The pipe; default standard input.
 
         Raises:
             UsageError: Standard input is a terminal, where any key stops a run.
@@ -29,28 +29,28 @@ class PipeWire:
             raise UsageError("targets on stdin come through a pipe: PROGRAM | gaponet run --targets stdin --yes …")
         self.address = "stdin"
         self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
-        self._rest = b""  # of a line that is not over
-        self._skipping = self._over = False
+        self._partial_line = b""
+        self._skipping = self._closed = False
 
-    def receive(self) -> list[Heard]:
-        """Whole lines since the last look."""
-        if self._over or not select.select([self._descriptor], [], [], 0)[0]:
+    def receive(self) -> list[Message]:
+        """Return the messages of all whole lines since the last call."""
+        if self._closed or not select.select([self._descriptor], [], [], 0)[0]:
             return []
-        data = os.read(self._descriptor, CHUNK)
+        data = os.read(self._descriptor, READ_BYTES)
         if not data:
-            self._over = True
-            return [Heard("stdin", wrong="the other end closed the pipe")]
-        *lines, self._rest = (self._rest + data).split(b"\n")
+            self._closed = True
+            return [Message("stdin", error="the other end closed the pipe")]
+        *lines, self._partial_line = (self._partial_line + data).split(b"\n")
         if self._skipping and lines:  # the end of a line that was too long
             lines, self._skipping = lines[1:], False
-        heard = [decode("stdin", line) for line in lines]
-        if len(self._rest) > LARGEST:
-            self._rest, self._skipping = b"", True
-            heard.append(decode("stdin", bytes(LARGEST + 1)))
-        return heard
+        messages = [decode("stdin", line) for line in lines]
+        if len(self._partial_line) > MAX_MESSAGE_BYTES:
+            self._partial_line, self._skipping = b"", True
+            messages.append(decode("stdin", bytes(MAX_MESSAGE_BYTES + 1)))
+        return messages
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
-        """Nobody listens."""
+        """Do nothing: a pipe has no way back."""
 
-    def close(self, why: str) -> None:
-        """Leave standard input alone."""
+    def close(self, reason: str) -> None:
+        """Leave standard input open."""

@@ -1,9 +1,10 @@
 # mypy: disable-error-code="misc, type-arg, valid-type, arg-type"
-"""Targets from a ROS 2 topic and states to another, over DDS, without ROS: what ros2_control's joint trajectory
-controller takes (trajectory_msgs/JointTrajectory) and its joint state broadcaster gives (sensor_msgs/JointState).
+"""Targets from a ROS 2 topic and states to another, over DDS, without ROS.
 
-Streams, not plans: one point per message, as MoveIt Servo and teleoperation send it, in force at once. A message
-without points ends the run. Types and names are those that ROS 2 puts on the bus (rt/…, …::msg::dds_::…_).
+Messages are those of ros2_control: its joint trajectory controller receives trajectory_msgs/JointTrajectory, its joint
+state broadcaster sends sensor_msgs/JointState. Each message has one point, as MoveIt Servo and teleoperation send it,
+and takes effect at once. A message without points ends the run. Types and topics have the names that ROS 2 uses on DDS
+(rt/…, …::msg::dds_::…_).
 """
 
 import struct
@@ -18,12 +19,12 @@ from cyclonedds.idl.types import float64, int32, sequence, uint32
 
 from gaponet.hw.drivers import dds
 from gaponet.hw.drivers.hg import HEADER
-from gaponet.hw.targets.live import LARGEST, Heard
+from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message
 
 TOPIC = "rt/joint_trajectory_controller/joint_trajectory"
-STATES = "rt/joint_states"
-QUEUE = 8  # messages kept between two looks: 0.1 ms each
-AHEAD = 0.2  # s after its stamp at which a point may be due; later ones belong to a plan
+STATES_TOPIC = "rt/joint_states"
+QUEUE_LENGTH = 8  # messages buffered between two calls; decoding one takes 0.1 ms
+MAX_TIME_FROM_START_S = 0.2  # later points belong to a planned trajectory
 
 
 @dataclass
@@ -82,15 +83,15 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
 
 
 def encode(message: Any) -> bytes:
-    """A message as plain CDR, little-endian, without its header."""
+    """Return a message as plain CDR, little-endian, without its header."""
     return message.__idl__.serialize(message)[len(HEADER) :]
 
 
 def decode(kind: Any, data: bytes) -> Any:
-    """A message of that kind from plain CDR without its header.
+    """Return a message of that type from plain CDR without its header.
 
     Raises:
-        ValueError: It is none.
+        ValueError: The bytes are not such a message.
     """
     try:
         return kind.__idl__.deserialize(HEADER + data, has_header=True)
@@ -98,54 +99,56 @@ def decode(kind: Any, data: bytes) -> Any:
         raise ValueError(f"not a {kind.__name__}: {error}") from None
 
 
-class ROS2Wire:
-    """A `Wire` on a DDS domain."""
+class ROS2Transport:
+    """A `Transport` on a DDS domain."""
 
-    def __init__(self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES) -> None:
+    def __init__(self, domain: int = 0, interface: str = "lo", topic: str = TOPIC, states: str = STATES_TOPIC) -> None:
         """
         Args:
             domain: ROS_DOMAIN_ID.
             interface: Network interface.
-            topic: The topic of JointTrajectory, with rt/ in front.
-            states: The topic of JointState, likewise.
+            topic: Topic of JointTrajectory, with the prefix rt/.
+            states: Topic of JointState, with the prefix rt/.
         """
         self.address = f"{topic}, domain {domain}, interface {interface}"
         self._bus = dds.Bus(domain, interface)
-        self._reader = self._bus.reader(topic, JointTrajectory, QUEUE)
+        self._reader = self._bus.reader(topic, JointTrajectory, QUEUE_LENGTH)
         self._writer = self._bus.writer(states, JointState)
-        point = JointTrajectoryPoint([0.0], [], [], [], Duration(0, 0))  # the first of its kind takes long
-        heard("", encode(JointTrajectory(Header(Time(0, 0), ""), ["joint"], [point])))
+        point = JointTrajectoryPoint([0.0], [], [], [], Duration(0, 0))  # decoding the first one takes long
+        to_message("", encode(JointTrajectory(Header(Time(0, 0), ""), ["joint"], [point])))
 
-    def receive(self) -> list[Heard]:
-        """Trajectories since the last look."""
-        return [heard(s.sample_info.publication_handle, bytes(s.data)) for s in dds.samples(self._reader, QUEUE)]
+    def receive(self) -> list[Message]:
+        """Return the messages since the last call."""
+        samples = dds.samples(self._reader, QUEUE_LENGTH)
+        return [to_message(sample.sample_info.publication_handle, bytes(sample.data)) for sample in samples]
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
-        """A JointState of all joints, stamped with the wall clock, as ROS does, for whoever listens."""
+        """Publish a JointState of all joints, stamped with the wall clock, as ROS does."""
         header = Header(Time(*divmod(time.time_ns(), 10**9)), "")
         message = JointState(header, list(state["joint_names"]), state["qpos"], state["qvel"], state["tau"])
         dds.send(self._writer, JointState, encode(message))
 
-    def close(self, why: str) -> None:
+    def close(self, reason: str) -> None:
         """Leave the bus."""
         self._bus = self._reader = self._writer = None  # type: ignore[assignment]
 
 
-def heard(sender: Hashable, data: bytes) -> Heard:
-    """What a JointTrajectory says."""
-    if len(data) > LARGEST:
-        return Heard(sender, wrong=f"has more than {LARGEST} bytes")
+def to_message(sender: Hashable, data: bytes) -> Message:
+    """Return the content of a JointTrajectory (plain CDR without its header)."""
+    if len(data) > MAX_MESSAGE_BYTES:
+        return Message(sender, error=f"has more than {MAX_MESSAGE_BYTES} bytes")
     try:
-        said = decode(JointTrajectory, data)
+        trajectory = decode(JointTrajectory, data)
     except ValueError as error:
-        return Heard(sender, wrong=str(error))
-    stamp, names = said.header.stamp, said.joint_names
-    at = stamp.sec + 1e-9 * stamp.nanosec or None  # 0: at once
-    if not said.points:
-        return Heard(sender, at, end=True)
-    point, due = said.points[0], said.points[-1].time_from_start
-    if len(said.points) > 1 or due.sec + 1e-9 * due.nanosec > AHEAD:
-        return Heard(sender, wrong=f"a plan; send one point per message, due within {AHEAD:g} s")
-    if len(point.positions) != len(names) or len(set(names)) != len(names):
-        return Heard(sender, wrong=f"{len(point.positions)} positions for {len(set(names))} joints")
-    return Heard(sender, at, dict(zip(names, point.positions, strict=True)))
+        return Message(sender, error=str(error))
+    stamp, names, points = trajectory.header.stamp, trajectory.joint_names, trajectory.points
+    time_s = stamp.sec + 1e-9 * stamp.nanosec or None  # 0: no clock
+    if not points:
+        return Message(sender, time_s, end=True)
+    due = points[-1].time_from_start
+    if len(points) > 1 or due.sec + 1e-9 * due.nanosec > MAX_TIME_FROM_START_S:
+        return Message(sender, error=f"a plan; send one point per message, due within {MAX_TIME_FROM_START_S:g} s")
+    positions = points[0].positions
+    if len(positions) != len(names) or len(set(names)) != len(names):
+        return Message(sender, error=f"{len(positions)} positions for {len(set(names))} joints")
+    return Message(sender, time_s, dict(zip(names, positions, strict=True)))

@@ -1,4 +1,7 @@
-"""Targets and states over ZeroMQ: a ROUTER here, one DEALER that commands (targets.client). JSON, see live.Message."""
+"""Targets and states over ZeroMQ: a ROUTER here, one DEALER that commands (targets.client).
+
+Messages are JSON: live.MessageFields.
+"""
 
 from __future__ import annotations
 
@@ -10,28 +13,29 @@ from typing import Any
 import zmq
 
 from gaponet.base.errors import UsageError
-from gaponet.hw.targets.live import LARGEST, Heard, decode
+from gaponet.hw.targets.live import MAX_MESSAGE_BYTES, Message, decode
 
 ADDRESS = "tcp://127.0.0.1:5555"
-QUEUE = 64  # messages taken at one look, and kept per connection between two
+QUEUE_LENGTH = 64  # messages read per call, and buffered per connection
 
 
-class ZeroMQWire:
-    """A `Wire` that others connect to."""
+class ZeroMQTransport:
+    """A `Transport` that senders connect to."""
 
     def __init__(self, address: str = ADDRESS) -> None:
         """
         Args:
-            address: tcp://HOST:PORT of this machine, or ipc://PATH. 127.0.0.1 is heard from this machine alone; nothing
-                is encrypted and nobody has to prove who he is.
+            address: tcp://HOST:PORT of this machine, or ipc://PATH. Only this machine reaches 127.0.0.1. Nothing is
+                encrypted or authenticated.
 
         Raises:
-            UsageError: It cannot be listened at.
+            UsageError: The address cannot be bound.
         """
         self.address = address
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
-        for option, value in ((zmq.LINGER, 200), (zmq.MAXMSGSIZE, LARGEST), (zmq.RCVHWM, QUEUE), (zmq.SNDHWM, QUEUE)):
+        lengths = ((zmq.RCVHWM, QUEUE_LENGTH), (zmq.SNDHWM, QUEUE_LENGTH))
+        for option, value in ((zmq.LINGER, 200), (zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES), *lengths):
             self._socket.setsockopt(option, value)
         try:
             self._socket.bind(address)
@@ -40,26 +44,23 @@ class ZeroMQWire:
             raise UsageError(f"cannot listen at {address} ({error}); is another run there?") from None
         self._sender: Hashable | None = None
 
-    def receive(self) -> list[Heard]:
-        """Messages since the last look; whoever said the first one well formed is told states from then on."""
-        heard: list[Heard] = []
+    def receive(self) -> list[Message]:
+        """Return the messages since the last call."""
+        messages: list[Message] = []
         with contextlib.suppress(zmq.Again):
-            while len(heard) < QUEUE:
+            while len(messages) < QUEUE_LENGTH:
                 sender, *parts = self._socket.recv_multipart(zmq.NOBLOCK)
-                heard.append(decode(sender, parts[-1] if parts else b""))
-        return heard
+                messages.append(decode(sender, parts[-1] if parts else b""))
+        return messages
 
     def publish(self, to: Hashable, state: dict[str, Any]) -> None:
-        """One JSON object to the sender; dropped if he does not read."""
-        self._say(to, state)
-
-    def _say(self, to: Hashable, message: dict[str, Any]) -> None:
+        """Send a JSON object to the sender; it is dropped if the sender does not read."""
         self._sender = to
         if to is not None:
-            with contextlib.suppress(zmq.ZMQError):  # he is gone
-                self._socket.send_multipart([to, json.dumps(message).encode()], zmq.NOBLOCK)  # type: ignore[list-item]
+            with contextlib.suppress(zmq.ZMQError):  # the sender is gone
+                self._socket.send_multipart([to, json.dumps(state).encode()], zmq.NOBLOCK)  # type: ignore[list-item]
 
-    def close(self, why: str) -> None:
-        """Tell the sender why it is over."""
-        self._say(self._sender, {"end": why})
+    def close(self, reason: str) -> None:
+        """Send the sender the reason, and close the socket."""
+        self.publish(self._sender, {"end": reason})
         self._context.destroy()
