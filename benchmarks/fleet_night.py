@@ -37,10 +37,10 @@ from gaponet.data.store import Dataset
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.axes import CLASSIC, Bounds
-from gaponet.sysid.evidence import known
+from gaponet.sysid.evidence import estimate_uncertainty
 from gaponet.sysid.fit import Clock, Fit
-from gaponet.sysid.free_runs import cut
-from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.robot_rollouts import cut
 from gaponet.testing.fleet import draw, load_fleet
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -74,12 +74,12 @@ def made(work: Path, robots: int) -> dict[str, str]:
 
 def _identified(robot: RobotSpec, train: list[Sequence], folder: Path) -> None:
     bounds = Bounds(robot, train)
-    fit = Fit(JointRuns(cut(train, 12), robot, nthread=1), robot, bounds)
+    fit = Fit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
     values = fit.search(CLASSIC, bounds.start, Clock(None, 0, no_progress), "")
     fit.uncertainty(values)
     save_robot(fit.robot(values), folder)
     mine = load_robot(folder)
-    known(mine, train[:6], train[6:], fit.covariance, nthread=1).save(folder)
+    estimate_uncertainty(mine, train[:6], train[6:], fit.covariance, nthread=1).save(folder)
 
 
 def _turned(s: Sequence) -> Sequence:

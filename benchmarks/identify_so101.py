@@ -28,7 +28,7 @@ from gaponet.sim.metrics import runs, standard_error, summary
 from gaponet.sim.replay import replay
 from gaponet.sysid.fit import Identified
 from gaponet.sysid.identify import identify
-from gaponet.sysid.touching import tip_heights
+from gaponet.sysid.table_contact import tip_heights
 
 KNOWN = {"kp": 15.0, "damping": 1.1, "frictionloss": 0.1, "armature": 0.028, "delay": 0.006, "stribeck": 0.1,
          "stribeck_speed": 0.08, "friction_motor": 0.1}  # fmt: skip

@@ -33,13 +33,13 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Bounds, first_values
 from gaponet.sysid.drift import drift
-from gaponet.sysid.evidence import WINDOWS, known
+from gaponet.sysid.evidence import WINDOWS, estimate_uncertainty
 from gaponet.sysid.fit import Clock, Fit
-from gaponet.sysid.free_runs import cut
 from gaponet.sysid.identify import identify
-from gaponet.sysid.joint_runs import JointRuns
-from gaponet.sysid.knowledge import Knowledge
-from gaponet.sysid.touching import tip_heights, touching_below
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.table_contact import tip_heights, touching_below
+from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.testing.fleet import draw, load_fleet
 from gaponet.testing.physics import Physics
 from gaponet.testing.unit import VirtualRobot
@@ -131,11 +131,11 @@ def _asked(robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another:
     """One arm identified and checked."""
     train, val, began = days[0], days[1][:3], time.monotonic()
     bounds = Bounds(robot, train)
-    fit = Fit(JointRuns(cut(train, 12), robot, nthread=1), robot, bounds)
+    fit = Fit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
     values = fit.search(CLASSIC, bounds.start, Clock(None, 0, no_progress), "")
     fit.uncertainty(values)
     right = fit.robot(values)
-    mine = known(right, train, val, fit.covariance, nthread=1)
+    mine = estimate_uncertainty(right, train, val, fit.covariance, nthread=1)
     op = robot.operated_index
     truth = {
         "kp": robot.kp[op] * unit.kp_scale * unit.kt_scale, "damping": 0.5 + unit.damping,
@@ -148,8 +148,8 @@ def _asked(robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another:
             z[f].append((at[f] - float(v[i])) / float(np.sqrt(cov[mine.fields.index(f), mine.fields.index(f)])))
     fresh = days[1][3:]
     error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(fresh, replay(fresh, right), strict=True)])
-    inside = [float((error[:, i] <= k.band).mean()) for i, k in enumerate(mine.joints.values())]
-    alone = [float((error[:, i] <= NORMAL_90 * k.predicted).mean()) for i, k in enumerate(mine.joints.values())]
+    inside = [float((error[:, i] <= k.residual_p90).mean()) for i, k in enumerate(mine.joints.values())]
+    alone = [float((error[:, i] <= NORMAL_90 * k.parameter_rms).mean()) for i, k in enumerate(mine.joints.values())]
     said = {}
     for what, logs in [*zip(DAYS[2:], days[2:], strict=True), (ANOTHER, another)]:
         found = drift(right, mine, logs, 1)
@@ -162,18 +162,18 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
     data, robot = Dataset(day), load_robot(folder)
     parts = split_entries(data, ())
     train, val, test = (data.sequences(parts[part]) for part in ("train", "val", "test"))
-    mine = Knowledge.load(robot) if (folder / "known.json").is_file() else None
+    mine = ParameterUncertainty.load(robot) if (folder / "uncertainty.json").is_file() else None
     if mine is None:
         save_robot(robot, work / "robot")
         robot = load_robot(work / "robot")
-        mine = known(robot, train, val)
+        mine = estimate_uncertainty(robot, train, val)
         mine.save(work / "robot")
     op, lines = robot.operated_index, []
     error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(test, replay(test, robot), strict=True)])
-    inside = {j: float((error[:, i] <= k.band).mean()) for i, (j, k) in enumerate(mine.joints.items())}
-    few = [NORMAL_90 * k.predicted for k in mine.joints.values()]
+    inside = {j: float((error[:, i] <= k.residual_p90).mean()) for i, (j, k) in enumerate(mine.joints.items())}
+    few = [NORMAL_90 * k.parameter_rms for k in mine.joints.values()]
     alone = {j: float((error[:, i] <= few[i]).mean()) for i, j in enumerate(mine.joints)}
-    all_of = {"every joint": float((error <= [k.band for k in mine.joints.values()]).mean())}
+    all_of = {"every joint": float((error <= [k.residual_p90 for k in mine.joints.values()]).mean())}
     there = Dataset(other)
     later = there.sequences(there.entries)
     asked = {f"first day, never fitted, half {i + 1}": (val + test)[i::2] for i in range(2)}
@@ -189,7 +189,8 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
         })  # fmt: skip
         print(lines[-1], flush=True)
     facts = {"inside": inside | all_of, "alone": alone, "drift": lines,
-             "joints": {j: (k.predicted, k.left, k.band) for j, k in mine.joints.items()}}  # fmt: skip
+             "joints": {j: (k.parameter_rms, k.residual_rms, k.residual_p90) for j, k in mine.joints.items()},
+             }  # fmt: skip
     (work / "real.json").write_text(json.dumps(facts, indent=1))
 
 
@@ -204,7 +205,7 @@ def halves(folder: Path, day: Path, other: Path, work: Path) -> None:
         fitted = identify(mine[::4] + mine[1::4] + mine[2::4], robot, mine[3::4], table=False, nthread=1)
         save_robot(fitted.robot, work / f"half{k}")
         half = load_robot(work / f"half{k}")
-        sure = known(half, mine[::4] + mine[1::4] + mine[2::4], mine[3::4], fitted.covariance, nthread=1)
+        sure = estimate_uncertainty(half, mine[::4] + mine[1::4] + mine[2::4], mine[3::4], fitted.covariance, nthread=1)
         sure.save(work / f"half{k}")
         op, twins = half.operated_index, replay(rest, half, nthread=1)
         error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(rest, twins, strict=True)])
@@ -219,8 +220,8 @@ def halves(folder: Path, day: Path, other: Path, work: Path) -> None:
             moved = [(m.joint, m.field, m.by, m.sigmas) for m in found.moved]
             said[what] = {"verdict": found.verdict, "moved": moved, "of": len(of)}
             said[what] |= {"aside": len(aside), "aside, of the other day": len(aside - mine_too)}
-        inside = (error <= [j.band for j in sure.joints.values()]).mean(axis=0)
-        alone = (error <= [NORMAL_90 * j.predicted for j in sure.joints.values()]).mean(axis=0)
+        inside = (error <= [j.residual_p90 for j in sure.joints.values()]).mean(axis=0)
+        alone = (error <= [NORMAL_90 * j.parameter_rms for j in sure.joints.values()]).mean(axis=0)
         lines.append({"inside": inside.tolist(), "alone": alone.tolist(), "said": said})
         file.write_text(json.dumps(lines, indent=1))
         print(lines[-1], flush=True)
@@ -257,10 +258,10 @@ def table(work: Path) -> None:
 def drawn(folder: Path, day: Path) -> None:
     """How far 100 units of today are from the robot's path in 40 windows of the training motions, RMS over each."""
     data, robot = Dataset(day), load_robot(folder)
-    train, mine = data.sequences(split_entries(data, ())["train"]), Knowledge.load(robot)
+    train, mine = data.sequences(split_entries(data, ())["train"]), ParameterUncertainty.load(robot)
     assert mine is not None
     below = touching_below(robot, tip_heights(train, robot))
-    runs, own = JointRuns(cut(train, WINDOWS), robot, below, 1), first_values(robot)
+    runs, own = JointRollouts(cut(train, WINDOWS), robot, below, 1), first_values(robot)
     units = ranges(robot, samples=100).units
     own = {f: np.repeat(own[f][None], 100, axis=0) for f in units}
     path = runs.errors({f: v[:1] for f, v in own.items()})
@@ -270,7 +271,7 @@ def drawn(folder: Path, day: Path) -> None:
             for v in (units, units | {"effort_limit": own["effort_limit"]})]  # fmt: skip
     for i, (joint, k) in enumerate(mine.joints.items()):
         shares = [*np.quantile(each[0][:, i], (0.5, 0.9, 1.0)), np.quantile(each[1][:, i], 0.9)]
-        print(f"| {joint} | {1e3 * k.left:.1f} | {' | '.join(f'{x:.1f}' for x in shares)} |")
+        print(f"| {joint} | {1e3 * k.residual_rms:.1f} | {' | '.join(f'{x:.1f}' for x in shares)} |")
 
 
 def main() -> None:

@@ -6,8 +6,8 @@
 
 A robot is known from 24 s. Then it is recorded further: chosen by gaponet excite --for's rule, at random from the same
 candidates, or by a plain rival, what is commanded farthest a second. All is fitted again from what was known. Errors to
-the truth (VIRTUAL), to the values of many more recordings (real) and of test motions; standard errors as known.json
-says them. A line of WORK/*.jsonl for each arm or draw; what is there is not done again.
+the truth (VIRTUAL), to the values of many more recordings (real) and of test motions; standard errors as
+uncertainty.json says them. A line of WORK/*.jsonl for each arm or draw; what is there is not done again.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
-from gaponet.sysid.evidence import known
+from gaponet.sysid.evidence import estimate_uncertainty
 from gaponet.sysid.fit import Clock, Fit
-from gaponet.sysid.free_runs import FreeRuns, cut
-from gaponet.sysid.joint_runs import JointRuns
-from gaponet.sysid.knowledge import Knowledge, seen
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
 from gaponet.sysid.motion.library import Library
 from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.telling import Telling, candidates, expected, open_gains
-from gaponet.sysid.touching import tip_heights, touching_below
+from gaponet.sysid.robot_rollouts import RobotRollouts, cut
+from gaponet.sysid.table_contact import tip_heights, touching_below
+from gaponet.sysid.uncertainty import ParameterUncertainty, to_axes
 from gaponet.testing.fleet import draw, load_fleet
 from gaponet.testing.physics import Physics
 from gaponet.testing.unit import VirtualRobot
@@ -51,7 +51,9 @@ from arm import TOML, XML, write_arm
 NORMAL_90 = 1.645
 HELD, NOISE = 0.3, 4e-4  # kg of the known payload, rad of the encoder
 FIRST_ARM = 2001  # of the fleet's units: of no other benchmark
-Found = tuple[RobotSpec, Knowledge, Telling, list[int]]  # fitted, how sure, what the candidates were to tell, picked
+Found = tuple[
+    RobotSpec, ParameterUncertainty, ExperimentDesign, list[int]
+]  # fitted, how sure, what the candidates were to tell, picked
 BASE = "at random, 32 s"
 TOGETHER = (3,)  # iterations of all joints
 POOL, MANY, JUDGES = 90, 40, 40  # windows of a real arm: to pick among, that the values come from, that judge
@@ -63,24 +65,24 @@ SETS = {
 
 def fitted(
     robot: RobotSpec, start: RobotSpec, logs: list[Sequence], below: float = -np.inf
-) -> tuple[RobotSpec, Knowledge]:
+) -> tuple[RobotSpec, ParameterUncertainty]:
     """As gaponet identify does without terms: every joint on its own, then together, of all windows; and how sure that
     is. Rows with a tip lower than `below` are passed over."""
     bounds, own, clock = Bounds(robot, logs), Bounds(start, logs), Clock(None, 0, no_progress)
-    fit = Fit(JointRuns(cut(logs, 10**6), robot, below, nthread=1), robot, bounds)
+    fit = Fit(JointRollouts(cut(logs, 10**6), robot, below, nthread=1), robot, bounds)
     begin = bounds.start if start is robot else {f: own.first[f] for f in CLASSIC}
     alone = fit.search(CLASSIC, begin, clock, "")
     fit.learn_lasting(alone)
-    whole = Fit(fit.runs, robot, bounds, FreeRuns(fit.runs.parts, robot, 1, touch=fit.runs.touch))
+    whole = Fit(fit.runs, robot, bounds, RobotRollouts(fit.runs.parts, robot, 1, touch=fit.runs.touch))
     whole.noise, whole.lasts = fit.noise, fit.lasts
     first = Axes(whole.bounds, CLASSIC, bounds.start).of(alone)[None]
     values = whole.descend(CLASSIC, bounds.start, first, TOGETHER, clock, "")
     whole.uncertainty(values)
     found = fit.robot(values)
-    return found, known(found, logs, (), whole.covariance, nthread=1)
+    return found, estimate_uncertainty(found, logs, (), whole.covariance, nthread=1)
 
 
-def errors(mine: Knowledge) -> list[list[float]]:
+def errors(mine: ParameterUncertainty) -> list[list[float]]:
     """Standard errors on the axes, joints by numbers."""
     return [np.sqrt(np.diag(mine.array(j, "covariance"))).tolist() for j in mine.joints]
 
@@ -102,7 +104,7 @@ def compared(
     rng: np.random.Generator,
     place: Path,
     below: float = -np.inf,
-) -> tuple[dict[str, Found], Telling, Knowledge]:  # fmt: skip
+) -> tuple[dict[str, Found], ExperimentDesign, ParameterUncertainty]:  # fmt: skip
     """A robot fitted before and after each set of further recordings; record(picks) makes those."""
     first, mine = fitted(robot, robot, before, below)
     save_robot(first, place)
@@ -110,7 +112,7 @@ def compared(
     own = expected(first, expect, 0.0, 1) if isinstance(expect[0], Motion) else [
         replace(s, qpos=t.qpos, qvel=t.qvel) for s, t in zip(expect, replay(expect, first, nthread=1), strict=True)
     ]  # fmt: skip
-    told = Telling.of(first, mine, own, 1)
+    told = ExperimentDesign.from_recordings(first, mine, own, 1)
     found: dict[str, Found] = {"nothing more": (first, mine, told, [])}
     far = np.array([np.abs(np.diff(s.ctrl[:, robot.operated_index], axis=0)).sum() / s.duration for s in own])
     for name, limit in list(SETS.items())[1:]:
@@ -122,17 +124,17 @@ def compared(
 
 def judge(logs: list[Sequence], robot: RobotSpec, below: float = -np.inf) -> Callable[[RobotSpec], np.ndarray]:
     """The function that gives a robot's errors of recordings, windows of 8 s, (joints, rows) rad."""
-    runs = JointRuns(cut(logs, 10**6), robot, below, nthread=1)
-    whole = FreeRuns(runs.parts, robot, 1, touch=runs.touch)
+    runs = JointRollouts(cut(logs, 10**6), robot, below, nthread=1)
+    whole = RobotRollouts(runs.parts, robot, 1, touch=runs.touch)
     return lambda of: whole.run({f: v[None] for f, v in first_values(of).items() if f in CLASSIC})[0]
 
 
 def judged(
     true: RobotSpec, best: np.ndarray, wrong: Callable[[RobotSpec], np.ndarray],
-    after: RobotSpec, sure: Knowledge, told: Telling, picks: list[int],
+    after: RobotSpec, sure: ParameterUncertainty, told: ExperimentDesign, picks: list[int],
 ) -> dict[str, Any]:  # fmt: skip
     """What a fit leaves beside the true robot, whose own errors are `best`."""
-    at, now, error = seen(true, CLASSIC), seen(after, CLASSIC), wrong(after)
+    at, now, error = to_axes(true, CLASSIC), to_axes(after, CLASSIC), wrong(after)
     return {
         "errors": errors(sure), "off": [(now[j] - at[j]).tolist() for j in true.operated],
         "seconds": float(told.seconds[picks].sum()),
@@ -194,7 +196,9 @@ def virtual(work: Path, arms: int, form: str, joints: str) -> None:
         first = load_robot(work / "robot")
         line = {"said": open_gains(first, mine, told, rest, (0.0,))}
         if joints == "free":  # the same motions with a known mass
-            own = Telling.of(first, mine, expected(first, rest, 0.0, 1) + expected(first, rest, HELD, 1), 1)
+            own = ExperimentDesign.from_recordings(
+                first, mine, expected(first, rest, 0.0, 1) + expected(first, rest, HELD, 1), 1
+            )
             picks = own.choose(32.0)
             logs = [
                 s for i in picks for s in played(robot, unit, [rest[i % len(rest)]], HELD * (i >= len(rest)), 7 * i)

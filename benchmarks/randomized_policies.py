@@ -59,7 +59,7 @@ def identified(work: Path, robot: str, fleet: str, quick: bool) -> list[Path]:
     budget = ["--budget", "2s", "--terms", "--windows", "6"] if quick else ["--budget", "90s"]
     for unit in units:
         asked = ["identify", str(data), "--units", unit, "--threads", "1", "--out", str(work / unit), *budget]
-        if not (work / unit / "known.json").is_file() and gaponet(asked):
+        if not (work / unit / "uncertainty.json").is_file() and gaponet(asked):
             raise SystemExit(2)
     return [work / unit for unit in units]
 

@@ -62,7 +62,7 @@ def pace(parts: list[Sequence]) -> tuple[RobotSpec, list[float]]:
     robot = load_robot("so101")
     n = len(robot.operated)
     low, high = (np.r_[np.repeat([b[k] for b in BOUNDS.values()], n), [0.0, DELAY * robot.timestep][k]] for k in (0, 1))
-    cost = FreeRuns(parts, robot, high[-1])
+    cost = RobotRollouts(parts, robot, high[-1])
     search = CMA(np.zeros(len(low)), SIGMA, np.tile([-1.0, 1.0], (len(low), 1)), seed=0, population_size=POPULATION)
     history = []
     for generation in range(GENERATIONS):
@@ -79,7 +79,7 @@ def pace(parts: list[Sequence]) -> tuple[RobotSpec, list[float]]:
     return robot.with_servos(servos), history
 
 
-class FreeRuns:
+class RobotRollouts:
     """Mean squared error of many arms beside the same recordings, in one batch."""
 
     def __init__(self, parts: list[Sequence], robot: RobotSpec, latest: float) -> None:

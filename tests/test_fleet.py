@@ -12,8 +12,8 @@ from gaponet.data.store import Dataset
 from gaponet.fleet import history, since
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.evidence import known
-from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 
 def played(robot, unit, first, count, kp):
@@ -36,9 +36,9 @@ def site(tmp_path_factory):
     for k, unit in enumerate(("a1", "a2", "a3")):
         save_robot(robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "robots" / unit)
         mine = load_robot(place / "robots" / unit)
-        known(mine, played(robot, unit, 50 * k, 6, 0.8), played(robot, unit, 500 + k, 2, 0.8), nthread=1).save(
-            mine.folder
-        )
+        estimate_uncertainty(
+            mine, played(robot, unit, 50 * k, 6, 0.8), played(robot, unit, 500 + k, 2, 0.8), nthread=1
+        ).save(mine.folder)
         logs(robot, place / "night1", unit, 1000 + 10 * k)
         if unit != "a3":
             logs(robot, place / "night2", unit, 2000 + 10 * k, 0.7 if unit == "a2" else 0.8)
@@ -64,8 +64,8 @@ def test_two_nights_of_three_arms(site, capsys):
     assert {tuple(number) for number in second["a2"]["numbers"]} == {("shoulder", "kp"), ("elbow", "kp")}
     before, after = second["a2"]["adapted"]
     assert after < 0.5 * before
-    today = Knowledge.load(load_robot(site / "out" / "adapted" / "a2"))
-    assert [s["made_by"] for s in today.sources][-1] == "adapt"
+    today = ParameterUncertainty.load(load_robot(site / "out" / "calibrated" / "a2"))
+    assert [s["made_by"] for s in today.sources][-1] == "calibrate"
     assert since(history(site / "out" / "a2.json")) == "night2"
     page = (site / "out" / "fleet.html").read_text(encoding="utf-8")
     assert "3 robots: 1 same, 1 drifted, 1 not asked" in page

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from gaponet.nn.training.config import TrainConfig
     from gaponet.report.evaluate import Evaluation
     from gaponet.sysid.fit import Covariance, Identified
-    from gaponet.sysid.knowledge import Knowledge
+    from gaponet.sysid.uncertainty import ParameterUncertainty
 
 Place = str | Path
 
@@ -64,12 +64,11 @@ def import_logs(
     """
     from gaponet.data.importer import import_logs as run
     from gaponet.sim.dynamics import gravity_of
-    from gaponet.sim.kept import require_kept
-    from gaponet.sim.model import model_hash
+    from gaponet.sim.model import model_hash, require_stored_robot
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if Dataset.peek(out, spec) is not None:
-        require_kept(Path(out), spec, DatasetError, MOVE_KEPT)
+        require_stored_robot(Path(out), spec, DatasetError, MOVE_KEPT)
     with progress_bar("importing") as update:
         return run(
             src, spec, unit_id, payload_mass, out,
@@ -275,15 +274,16 @@ def identify(
 
 
 def _keep_known(
-    folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance, before: Knowledge | None,
-    judged: RobotSpec | None = None,
+    folder: Path, sequences: list[Sequence], judges: list[Sequence], covariance: Covariance,
+    before: ParameterUncertainty | None, judged: RobotSpec | None = None,
 ) -> None:  # fmt: skip
     """Write how sure a robot folder's values are."""
-    from gaponet.robot.folder import KNOWN
-    from gaponet.sysid.evidence import known
+    from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, UNCERTAINTY_FILE
+    from gaponet.sysid.evidence import estimate_uncertainty
 
-    (folder / KNOWN).unlink(missing_ok=True)
-    known(load_robot(folder), sequences, judges, covariance, before, judged).save(folder)
+    for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE):
+        (folder / name).unlink(missing_ok=True)
+    estimate_uncertainty(load_robot(folder), sequences, judges, covariance, before, judged).save(folder)
 
 
 def train(
@@ -481,11 +481,11 @@ def adapt_robot(
     from gaponet.robot.folder import ORIGIN, save_robot
     from gaponet.sim.replay import whole_errors
     from gaponet.sysid.fit import BETTER
-    from gaponet.sysid.knowledge import Knowledge
     from gaponet.sysid.refit import refit
+    from gaponet.sysid.uncertainty import ParameterUncertainty
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(Path(robot) if "/" in str(robot) else robot)
-    before_known = Knowledge.load(spec)
+    before_known = ParameterUncertainty.load(spec)
     with (
         lock_folder(Path(out), "robot"),
         unit_recordings(source, spec, unit, motions, payload_mass) as (unit, sequences),

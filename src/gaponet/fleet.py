@@ -23,8 +23,8 @@ from gaponet.base.structure import read_json
 from gaponet.report.page import element, page, table
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.drift import drift
-from gaponet.sysid.knowledge import Knowledge
-from gaponet.sysid.table import change
+from gaponet.sysid.uncertainty import ParameterUncertainty
+from gaponet.sysid.uncertainty_table import format_change
 
 KIND = "fleet"
 SAME, FAILED = "same", "not asked"
@@ -63,9 +63,7 @@ class Job:
 def ask(job: Job) -> Night:
     """One robot's night."""
     began, spec = time.process_time(), load_robot(job.robot)
-    known = Knowledge.load(spec)
-    if known is None:
-        raise RobotError(f"{job.robot}: keeps only values (no known.json); identify or adapt it again")
+    known = ParameterUncertainty.require(spec, RobotError)
     with unit_recordings(job.logs, spec, job.unit, (), job.payload_mass) as (_, sequences):
         found = drift(spec, known, sequences, 1)
     adapted, advice = None, found.advice
@@ -79,7 +77,8 @@ def ask(job: Job) -> Night:
     return {
         "night": job.night, "verdict": found.verdict, "advice": advice, "recordings": len(sequences),
         "moved": [
-            f"{m.joint} {m.field} {change(m.field, m.by, known, m.joint)} ({m.sigmas:+.0f} σ)" for m in found.moved
+            f"{m.joint} {m.field} {format_change(m.field, m.by, known, m.joint)} ({m.sigmas:+.0f} σ)"
+            for m in found.moved
         ],
         "numbers": [(m.joint, m.field) for m in found.moved], "seconds": found.seconds,
         "adapted": adapted, "took": time.process_time() - began,

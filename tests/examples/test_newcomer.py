@@ -26,12 +26,12 @@ import sys; sys.path.insert(0, sys.argv[1])
 import numpy as np
 from pathlib import Path
 from arm import recordings, write_arm
-from gaponet.sysid import joint_runs
+from gaponet.sysid import joint_rollouts
 robot = write_arm(Path(sys.argv[2]))
 values = {"kp": 20, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "stribeck": 0.3, "stribeck_speed": 0.1}
-runs = joint_runs.JointRuns(recordings(robot, 1, rows=100), robot)
+runs = joint_rollouts.JointRollouts(recordings(robot, 1, rows=100), robot)
 values = {f: np.full((1, 2), float(values.get(f, 0))) for f in (*values, "offset", "delay")}
-print(np.abs(runs.errors(values)).mean(), np.abs(runs._arrays(values) * runs.counted).mean(), joint_runs.advance)
+print(np.abs(runs.errors(values)).mean(), np.abs(runs._arrays(values) * runs.counted).mean(), joint_rollouts.advance)
 """
 
 

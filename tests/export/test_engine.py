@@ -32,7 +32,7 @@ from gaponet.export.scene_facts import require_scene
 from gaponet.export.step import delta_step
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.identity import lines
-from gaponet.robot.spec import LAW, load_robot
+from gaponet.robot.spec import SERVO_TERMS, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
 from gaponet.sim.servo import friction_limit, servo_torque
@@ -249,7 +249,7 @@ def test_an_action_term_corrects_what_was_processed_in_the_present_state(place):
 
 
 def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
-    rng, law = np.random.default_rng(0), dict(zip(LAW, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02), strict=True))
+    rng, law = np.random.default_rng(0), dict(zip(SERVO_TERMS, (0.1, 0.2, 0.05, 0.08, 0.3, 0.02), strict=True))
     robot = write_arm(tmp_path / "arm").with_servos({"elbow": law | {"offset": 0.1}, "shoulder": {"kp": 11.0}})
     scene = mujoco.MjModel.from_xml_string(re.sub('="(shoulder|elbow)"', r'="robot/\1"', mjcf_text(robot, robot.dt)))
     q, v, torque, load, ctrl = rng.uniform(-0.2, 0.2, (5, 20, 2))
@@ -261,7 +261,7 @@ def test_a_servos_law_in_torch_is_the_simulators(tmp_path):
     found = ServoLaw(sim, entity, "robot", ["shoulder", "elbow"], simulator_facts(robot, robot.dt))
     entity.update(0.005)
     found.before(torch.tensor(ctrl).float())
-    terms, kp = {name: getattr(robot, name) for name in LAW}, robot.kp
+    terms, kp = {name: getattr(robot, name) for name in SERVO_TERMS}, robot.kp
     friction = friction_limit(terms, np.full(2, 0.05), v, torque, load)
     np.testing.assert_allclose(model.dof_frictionloss, friction, atol=1e-6)
     asked = servo_torque(terms, kp, ctrl + robot.offset, q)

@@ -18,7 +18,7 @@ from gaponet.export.facts import simulator_facts
 from gaponet.export.folder import export_robot
 from gaponet.export.forms import left, own_motions, plain_form
 from gaponet.export.mujoco_servos import delay_weights, play
-from gaponet.robot.spec import LAW
+from gaponet.robot.spec import SERVO_TERMS
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 
@@ -96,7 +96,9 @@ def mine(tmp_path):
 def quick(monkeypatch, robot):
     """The form without the law is not searched for: that is identification's, and tried below."""
     monkeypatch.setattr(
-        exporting, "plain_form", lambda r, *a, **k: r.with_servos({j: dict.fromkeys(LAW, 0.0) for j in FOUND})
+        exporting,
+        "plain_form",
+        lambda r, *a, **k: r.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND}),
     )
 
 
@@ -254,9 +256,9 @@ def test_a_delay_buffer_of_five_lines_is_mujocos_own_delay(robot, tmp_path):
 
 def test_the_nearest_servos_without_a_law_are_nearer_than_those_with_the_law_struck_out(lawful):
     motions = own_motions(lawful, count=4)
-    struck = lawful.with_servos({j: dict.fromkeys(LAW, 0.0) for j in FOUND})
+    struck = lawful.with_servos({j: dict.fromkeys(SERVO_TERMS, 0.0) for j in FOUND})
     plain = plain_form(lawful, motions[:2])
-    assert not plain.has_law
+    assert not plain.has_servo_model
     assert left(motions[2:], plain) < 0.8 * left(motions[2:], struck)
     assert plain_form(struck, motions) is struck
 

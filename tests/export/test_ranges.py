@@ -12,7 +12,7 @@ from arm import XML, write_arm
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.knowledge import JointKnown, Knowledge, seen
+from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, to_axes
 
 FIELDS = ("kp", "damping", "frictionloss", "armature", "offset", "delay")
 SERVO = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
@@ -29,18 +29,18 @@ def written(arm, folder, servo=SERVO, errors=ERRORS, sources=1):
     """A robot folder that knows its values; friction and damping err together."""
     save_robot(arm.with_servos(dict.fromkeys(arm.joint_names, servo)), folder)
     robot = load_robot(folder)
-    values = seen(robot, FIELDS)
+    values = to_axes(robot, FIELDS)
     like = np.eye(6)
     like[1, 2] = like[2, 1] = -0.9
     covariance = like * np.outer(errors, errors)
     none = tuple(np.zeros(7))
     joints = {
-        j: JointKnown(tuple(v), tuple(map(tuple, covariance)), none, (none,) * 7, none, 1e-3, 2e-3, 3e-3)
+        j: JointUncertainty(tuple(v), tuple(map(tuple, covariance)), none, (none,) * 7, none, 1e-3, 2e-3, 3e-3)
         for j, v in values.items()
     }
     days = [{j: v + k * np.array([0.0, 0.0, 5e-4, 0.0, 0.0, 0.0]) for j, v in values.items()} for k in range(sources)]
     said = tuple(source(v, days=(f"2026-11-{20 + k}",)) for k, v in enumerate(days[::-1]))
-    Knowledge(FIELDS, joints, said, 24, True).save(folder)
+    ParameterUncertainty(FIELDS, joints, said, 24, True).save(folder)
     return folder
 
 

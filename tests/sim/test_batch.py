@@ -8,7 +8,7 @@ import pytest
 from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import LAW, SERVO, STOPS
+from gaponet.robot.spec import SERVO, SERVO_TERMS, STOPS
 from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 
@@ -171,7 +171,7 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     """One joint's value changes; the other joint keeps the robot's own."""
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
     base = {"damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "kd": 0.3}
-    base |= {"delay": 0.02} if field == "delay" else dict.fromkeys(LAW, 0.02) if field in LAW else {}
+    base |= {"delay": 0.02} if field == "delay" else dict.fromkeys(SERVO_TERMS, 0.02) if field in SERVO_TERMS else {}
     robot = robot.with_servos(dict.fromkeys(robot.joint_names, base))
     other, one = robot.with_servos({"elbow": {field: OTHER[field]}}), (0.0, "both", 0.02)
     sims = {name: BatchSim(r, [one]) for name, r in (("own", robot), ("set", robot), ("made", other))}
@@ -187,7 +187,7 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     np.testing.assert_allclose(path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12)
 
 
-@pytest.mark.parametrize("field", [*STOPS, "delay", *LAW])
+@pytest.mark.parametrize("field", [*STOPS, "delay", *SERVO_TERMS])
 def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
     robot = write_arm(tmp_path)
     values = {f: np.full((1, 1), 0.1) for f in ("kp", "damping", "frictionloss", "armature", "offset", field)}

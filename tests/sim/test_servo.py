@@ -41,7 +41,7 @@ def test_a_loaded_motor_has_more_friction(tmp_path):
         sim.step(home)
     rest = sim.qpos[0].copy()
     held = -0.2 * 9.81 * 0.1  # N·m: the fore arm's weight
-    assert abs(sim.law.torque[0, 1]) == pytest.approx(abs(held) / 1.2, rel=0.05)  # friction carries the rest
+    assert abs(sim.servo_model.torque[0, 1]) == pytest.approx(abs(held) / 1.2, rel=0.05)  # friction carries the rest
     # What friction may take there, it takes: a small push moves nothing.
     sim.batch.bind("qfrc_applied")[1] = [0.0, 0.2 * held]
     for _ in range(100):
@@ -73,7 +73,7 @@ def test_a_least_torque_overcomes_friction_at_small_errors(arm):
 
 
 def test_a_law_of_zeros_is_no_law_bit_for_bit(arm):
-    sims = [BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, law=with_law) for with_law in (False, True)]
+    sims = [BatchSim(arm, [(0.5, "both", 0.02)] * 3, 1, servo_model=with_model) for with_model in (False, True)]
     rng = np.random.default_rng(0)
     for sim in sims:
         sim.reset(slice(None), np.full((3, 2), 0.1), np.zeros((3, 2)))

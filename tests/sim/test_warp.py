@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.robot.spec import LAW, available, load_robot
+from gaponet.robot.spec import SERVO_TERMS, available, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 
 pytest.importorskip("torch")
@@ -113,7 +113,7 @@ def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
     robot = replace(write_arm(tmp_path), delay=[delay, 0.0], encoder_step=1e-3, min_torque=0.02, **law)
     robot = robot.with_servos({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", dt) for dt in rates], 1)
-    for x in ours.law.values.values():
+    for x in ours.servo_model.values.values():
         x *= np.array([[1.0], [0.5], [2.0]])
     theirs, apart, still = WarpSim(ours, "warp-cpu"), 0.0, 0.0
     plain = BatchSim(replace(robot, encoder_step=0.0, min_torque=0.0, **dict.fromkeys(law, 0.0)), [(0.0, "both", 0.02)])
@@ -140,13 +140,13 @@ def test_servos_with_a_law_are_c_mujocos(tmp_path, rates, delay):
         assert theirs.state()[name].shape == x.shape
 
 
-@pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("min_torque",), LAW])
+@pytest.mark.parametrize("parts", [("stribeck", "stribeck_speed"), ("encoder_step",), ("min_torque",), SERVO_TERMS])
 def test_the_law_of_a_physics_step_is_c_mujocos_but_for_rounding(tmp_path, parts):
-    law = dict(zip(LAW, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3), strict=True))
+    law = dict(zip(SERVO_TERMS, (0.05, 0.2, 0.1, 0.2, 0.02, 1e-3), strict=True))
     robot = replace(write_arm(tmp_path), timestep=0.02, **{name: law[name] for name in parts})
     robot = robot.with_servos({"elbow": {"offset": 0.1}})
     ours = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * 3, 1)
-    for x in ours.law.values.values():
+    for x in ours.servo_model.values.values():
         x[:, 0] *= [0.0, 1.0, 2.0]
     ours.batch.expand("actuator_forcerange")[:] *= np.array([1.0, 0.5, 0.1])[:, None, None]
     theirs, rng = WarpSim(ours, "warp-cpu"), np.random.default_rng(0)
@@ -159,7 +159,7 @@ def test_the_law_of_a_physics_step_is_c_mujocos_but_for_rounding(tmp_path, parts
         for name, x in ours.state().items():
             np.testing.assert_allclose(theirs.state()[name], x, rtol=1e-5, atol=1e-6)
         ours.ctrl[:] = target
-        ours.law.before()
+        ours.servo_model.before()
         theirs.step(target)
         for name in ("actuator_biasprm", "dof_frictionloss"):
             np.testing.assert_allclose(getattr(model, name).numpy(), ours.batch.expanded(name), rtol=1e-5, atol=1e-5)

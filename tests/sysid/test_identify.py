@@ -10,8 +10,8 @@ from gaponet.base.errors import UsageError
 from gaponet.robot.spec import load_robot
 from gaponet.sysid.axes import Bounds
 from gaponet.sysid.fit import Tried, _Judge, _Limbs, with_stops
-from gaponet.sysid.free_runs import cut
 from gaponet.sysid.identify import identify
+from gaponet.sysid.robot_rollouts import cut
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ import pytest
 from arm import TOML, commands, recordings, write_arm
 
 from gaponet.base.progress import no_progress
-from gaponet.robot.spec import LAW, Table
+from gaponet.robot.spec import SERVO_TERMS, Table
 from gaponet.sim.replay import replay
-from gaponet.sysid import touching
+from gaponet.sysid import table_contact
 from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.fit import Clock, Fit
 from gaponet.sysid.identify import identify
-from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.joint_rollouts import JointRollouts
 
 SERVO = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.06, "offset": 0.0, "delay": 0.0}
 
@@ -37,8 +37,8 @@ def played(robot, acting, count, rows):
 def test_a_term_of_the_law_comes_back(tmp_path, law):
     robot = write_arm(tmp_path / "arm")
     parts = played(robot, robot.with_servos(dict.fromkeys(robot.joint_names, SERVO | law)), 3, 120)
-    fit = Fit(JointRuns(parts, robot), robot, Bounds(robot, parts))
-    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in LAW if f in law}
+    fit = Fit(JointRollouts(parts, robot), robot, Bounds(robot, parts))
+    start = {f: np.full(2, v) for f, v in SERVO.items()} | {f: fit.bounds.guess[f] for f in SERVO_TERMS if f in law}
     found = fit.search(tuple(law), start, Clock(None, 0, no_progress), "law")
     assert set(CLASSIC) < set(found)
     std, _ = fit.uncertainty(found)
@@ -78,19 +78,19 @@ TIP = '[[tip]]\nbody = "fore"\npos = [0.2, 0.0, 0.0]\n'
 def test_a_table_comes_back(tmp_path):
     robot = write_arm(tmp_path / "arm", toml=TOML + TIP)
     parts = played(robot, replace(robot, table=Table(-0.02, 0.3, 2000.0)), 3, 100)
-    heights = touching.tip_heights(parts, robot)
-    found = touching.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
+    heights = table_contact.tip_heights(parts, robot)
+    found = table_contact.fit_table(parts, robot, min(h.min() for h in heights), 1, lambda error: None)
     assert found.kept
     assert found.after.mean() < 0.2 * found.before.mean()
     assert found.robot.table.height == pytest.approx(-0.02, abs=0.004)
     assert np.abs(found.robot.zero).max() < 0.02
     free = played(robot, robot, 2, 100)
-    assert not touching.fit_table(free, robot, -0.1, 1, lambda error: None).kept
+    assert not table_contact.fit_table(free, robot, -0.1, 1, lambda error: None).kept
 
 
 def test_an_arm_that_stays_within_a_hand_of_its_lowest_point_keeps_rows_to_fit(tmp_path):
     robot = write_arm(tmp_path, toml=TOML + TIP)
     heights = [np.linspace(0.30, 0.33, 50), np.full(40, 0.32)]
-    below = touching.touching_below(robot, heights)
+    below = table_contact.touching_below(robot, heights)
     assert np.mean(np.concatenate(heights) >= below) >= 0.5
-    assert touching.touching_below(robot, [np.r_[0.0, np.full(50, 0.4)]]) == touching.CLEARANCE
+    assert table_contact.touching_below(robot, [np.r_[0.0, np.full(50, 0.4)]]) == table_contact.CLEARANCE

@@ -77,20 +77,18 @@ def _next(
 ) -> tuple[Plan, dict[str, Any]]:
     """Motions that tell most beside the logs, and what they would."""
     from gaponet.base.progress import progress_bar
-    from gaponet.sysid.knowledge import Knowledge
+    from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
     from gaponet.sysid.motion.library import Library
     from gaponet.sysid.motion.plan import Plan
-    from gaponet.sysid.motion.telling import Telling, candidates, expected, open_gains
+    from gaponet.sysid.uncertainty import ParameterUncertainty
 
-    mine = Knowledge.load(spec)
-    if mine is None:
-        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or adapt it again")
+    mine = ParameterUncertainty.require(spec)
     if payloads[0] < 0 or (payloads[-1] > 0 and not spec.payload_mounts):
         raise UsageError(f"--payloads {payloads}: give kg ≥ 0; {spec.name} has {len(spec.payload_mounts)} mounts")
     with progress_bar("looking for motions") as update:
         motions = candidates(Library(spec, seed, payloads[-1]), update)
     pairs = [(mass, motion) for mass in payloads for motion in motions]
-    told = Telling.of(spec, mine, [s for mass in payloads for s in expected(spec, motions, mass)])
+    told = ExperimentDesign.from_recordings(spec, mine, [s for mass in payloads for s in expected(spec, motions, mass)])
     picks = sorted(told.choose(seconds), key=lambda i: pairs[i][0])
     if not picks:
         raise UsageError(f"--minutes {seconds / 60:g}: no motion is so short; give {told.seconds.min() / 60:.2f}")

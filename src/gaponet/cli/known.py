@@ -13,7 +13,7 @@ from gaponet.base.errors import UsageError
 from gaponet.cli.options import Folder, Json, Motions, Unit
 from gaponet.cli.out import Out
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
     from gaponet.sysid.drift import Moved
@@ -24,7 +24,6 @@ Logs = Annotated[
     tyro.conf.arg(help="Dataset folder or address, or logs that gaponet import reads.", metavar="LOGS"),
 ]
 WIDE = 4  # columns of a table
-MEND = "identify or adapt it again with this gaponet, which keeps it"
 
 
 def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
@@ -34,16 +33,16 @@ def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
         out: Picture to write, .png or .svg.
     """
     from gaponet.report.figures.uncertainty import picture
-    from gaponet.sysid.table import SHOWN, certainty, rows, sentences
+    from gaponet.sysid.uncertainty_table import FIELD_UNITS, sentences, summarize, table_rows
 
     screen = Out(json)
     spec, known = _opened(robot)
-    sure = {j: certainty(known, j) for j in known.joints}
+    sure = {j: summarize(known, j) for j in known.joints}
     fields = tuple(f for f in known.fields if any(c.values[f] for c in sure.values()))
     for start in range(0, len(fields), WIDE):
         part = fields[start : start + WIDE]
         title = f"{spec.name}, ± standard error" if start == 0 else "The same"
-        screen.table(title, ["joint", *(SHOWN[f][0] for f in part)], rows(known, part))
+        screen.table(title, ["joint", *(FIELD_UNITS[f][0] for f in part)], table_rows(known, part))
     for line in sentences(known):
         screen.say(line)
     if out is not None:
@@ -55,12 +54,13 @@ def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
             picture(known, f"{spec.name}: what is known").savefig(temporary, format=out.suffix[1:], dpi=200)
         screen.say(f"picture: {out}")
     screen.result({
-        "robot": spec.name, "sources": known.sources, "held": known.held,
+        "robot": spec.name, "sources": known.sources, "held": known.validated,
         "joints": {
             j: {
-                "values": c.values, "standard_errors": c.errors, "together": c.sets, "left": known.joints[j].left,
-                "band_90": known.joints[j].band, "predicted": known.joints[j].predicted,
-                "scale": known.joints[j].left / max(known.joints[j].predicted, 1e-12),
+                "values": c.values, "standard_errors": c.errors, "together": c.sets,
+                "left": known.joints[j].residual_rms, "band_90": known.joints[j].residual_p90,
+                "predicted": known.joints[j].parameter_rms,
+                "scale": known.joints[j].residual_rms / max(known.joints[j].parameter_rms, 1e-12),
             }
             for j, c in sure.items()
         },
@@ -68,15 +68,12 @@ def show(robot: Known, out: Path | None = None, json: Json = False) -> None:
     })  # fmt: skip
 
 
-def _opened(folder: Path) -> tuple[RobotSpec, Knowledge]:
+def _opened(folder: Path) -> tuple[RobotSpec, ParameterUncertainty]:
     """A robot folder, and what is known of it."""
     if not (folder / "robot.toml").is_file():
         raise UsageError(f"{folder}: is no robot folder (no robot.toml); give what gaponet identify wrote")
     spec = load_robot(folder)
-    known = Knowledge.load(spec)
-    if known is None:
-        raise UsageError(f"{folder}: keeps only values (no known.json); {MEND}")
-    return spec, known
+    return spec, ParameterUncertainty.require(spec)
 
 
 def check(
@@ -174,12 +171,12 @@ def fleet(
         raise SystemExit(1)
 
 
-def _row(m: Moved, known: Knowledge, counts: bool) -> list[str]:
-    from gaponet.sysid.table import change
+def _row(m: Moved, known: ParameterUncertainty, counts: bool) -> list[str]:
+    from gaponet.sysid.uncertainty_table import format_change
 
-    mine = [k.left for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
+    mine = [k.residual_rms for j, k in known.joints.items() if m.joint == j or m.joint not in known.joints]
     left = sum(mine) / len(mine)
-    by = change(m.field, m.by, known, m.joint)
+    by = format_change(m.field, m.by, known, m.joint)
     return [m.joint, m.field, by, f"{m.sigmas:+.1f}", f"{1e3 * m.moves:.2f}", f"{1e3 * left:.2f}",
             "moved" if counts else ""]  # fmt: skip
 

@@ -39,7 +39,7 @@ def record(
     from gaponet.data.sequence import SequenceMeta, to_sequence
     from gaponet.data.store import Dataset
     from gaponet.robot.folder import MOVE_KEPT
-    from gaponet.sim.kept import require_kept
+    from gaponet.sim.model import require_stored_robot
 
     connection, side = args.connection, args.payload_side
     if args.driver != "virtual" and not unit_id:
@@ -51,7 +51,7 @@ def record(
     spec = resolve_robot(request)
     known = Dataset.peek(out, spec)
     if known is not None:  # before anything moves
-        require_kept(out, spec, DatasetError, MOVE_KEPT)
+        require_stored_robot(out, spec, DatasetError, MOVE_KEPT)
     written: list[str] = []
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):

@@ -15,7 +15,7 @@ from gaponet.cli.options import Json, Logs
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 if TYPE_CHECKING:
     from gaponet.export.rollout import Answer
@@ -76,7 +76,7 @@ def _known(screen: Out, folder: Path, data: str | None, robot: RobotSpec) -> tup
     from gaponet.export.forms import recordings_of
     from gaponet.export.rollout import drawn_robots, validation_error
 
-    kept, recordings = Knowledge.load(robot), recordings_of(folder, data, robot)
+    kept, recordings = ParameterUncertainty.load(robot), recordings_of(folder, data, robot)
     drawn = drawn_robots(robot) if kept is not None else []
     if recordings is not None:
         return validation_error(robot, recordings[1]), drawn
@@ -85,7 +85,7 @@ def _known(screen: Out, folder: Path, data: str | None, robot: RobotSpec) -> tup
     screen.say(
         "  its recordings are gone: the band is what they left when it was identified; or --data", "note", "cyan"
     )
-    return np.array([kept.joints[j].band for j in robot.operated]), drawn
+    return np.array([kept.joints[j].residual_p90 for j in robot.operated]), drawn
 
 
 def _tell(screen: Out, robot: Path, count: int, joints: dict[str, dict[str, Any]], differ: list[str]) -> None:

@@ -258,11 +258,11 @@ def resolve_robot(args: RunArgs) -> RobotSpec:
     from gaponet.base.errors import ModelError
     from gaponet.robot.folder import keeps_robot, kept_robot
     from gaponet.robot.spec import load_robot
-    from gaponet.sim.kept import require_kept
+    from gaponet.sim.model import require_stored_robot
 
     place = None if args.model is None else args.model.parent if args.model.name == "model" else args.model
     if place is not None and args.robot is not None:
-        return require_kept(place, load_robot(args.robot), ModelError, "leave --robot out")
+        return require_stored_robot(place, load_robot(args.robot), ModelError, "leave --robot out")
     if place is not None and keeps_robot(place):
         return kept_robot(place, "")
     return load_robot(args.robot or ("so101" if args.driver == "so101" else "h1_2"))

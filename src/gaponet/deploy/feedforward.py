@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.batch import BatchSim
 from gaponet.sim.inverse import Inertia
 from gaponet.sim.servo import friction_limit, present
@@ -34,7 +34,8 @@ class Feedforward:
         model, op = next(iter(sim.models.values())), robot.operated_index
         self.dt, self.share = dt, min(1.0, dt / max(acceleration_time, dt))
         self.damping = robot.kd[op] + model.dof_damping[at]
-        self.friction, self.law = model.dof_frictionloss[at], present({name: getattr(robot, name)[op] for name in LAW})
+        self.friction = model.dof_frictionloss[at]
+        self.law = present({name: getattr(robot, name)[op] for name in SERVO_TERMS})
         self.inertia = Inertia(sim.batch, model, at)
 
     def reset(self, target: Array) -> None:

@@ -116,7 +116,7 @@ class MujocoAligner:
         inverse: ClosedForm | Probed
         if how == "closed":
             inverse = _of_scene(scene, joints, told.dt)
-            as_is = periods_of(model, told.dt) == 1 if isinstance(model, GapModel) else not robot.has_law
+            as_is = periods_of(model, told.dt) == 1 if isinstance(model, GapModel) else not robot.has_servo_model
             if as_is and inverse.alike(ClosedForm.of(reference), reference.range):
                 return
             self._stand = inverse.stand

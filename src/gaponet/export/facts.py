@@ -13,7 +13,7 @@ from gaponet.export.scene_facts import joint_fields, solver_options
 from gaponet.robot.bare import bare_text, put
 from gaponet.robot.identity import lines
 from gaponet.robot.mjcf import compiled
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.model import STIFF_MOBILITY, build_model, build_spec, model_hash
 
 UNITS = {
@@ -52,7 +52,7 @@ def simulator_facts(
         "format": 2, "robot": robot.name, "simulator": model_hash(robot), "units": UNITS, "meaning": MEANING,
         "versions": {"mujoco": mujoco.__version__}, "dt": dt, "decimation": robot.steps_per(dt),
         "payload_mass": payload_mass, "corrected": list(robot.operated), "options": solver_options(model),
-        "dof_invweight0_factor": STIFF_MOBILITY, "law": [term for term in LAW if getattr(robot, term).any()],
+        "dof_invweight0_factor": STIFF_MOBILITY, "law": [term for term in SERVO_TERMS if getattr(robot, term).any()],
         "joints": {name: _joint(robot, model, i) for i, name in enumerate(robot.joint_names)},
         "plain": {name: _numbers(plain or robot, other, i) for i, name in enumerate(robot.joint_names)},
     }  # fmt: skip
@@ -96,7 +96,7 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
 
 
 def _joint(robot: RobotSpec, model: mujoco.MjModel, i: int) -> dict[str, Any]:
-    law = {term: float(getattr(robot, term)[i]) for term in LAW} if robot.has_law else {}
+    law = {term: float(getattr(robot, term)[i]) for term in SERVO_TERMS} if robot.has_servo_model else {}
     return _numbers(robot, model, i) | {"mujoco": joint_fields(model, robot.joint_names[i])} | law
 
 

@@ -104,7 +104,7 @@ def export_robot(
         UsageError: No recording was made with this payload and the robot's gains.
     """
     if recordings is None:
-        made = own_motions(robot, payload_mass, 24 if robot.has_law else 2)
+        made = own_motions(robot, payload_mass, 24 if robot.has_servo_model else 2)
         recordings = made[::2], made[1::2] or made
     train, judging = recordings[0], comparable(recordings[1], robot, payload_mass)
     if not judging:
@@ -115,7 +115,7 @@ def export_robot(
     facts |= {"file": ROBOT, "prefix": prefix, "virtual": judging[0].meta.virtual}
     facts["left_mrad"] = {"joints": 1e3 * left(motions, robot), "plain": 1e3 * left(motions, plain)}
     prices = {"in gaponet": left(judging, robot)}
-    if robot.has_law:
+    if robot.has_servo_model:
         prices["in gaponet, fitted without the law"] = left(judging, plain)
     with lock_folder(out, KIND):
         file, told, more = _write_form(robot, plain, to, out, facts, judging, source, prefix, payload_mass)
@@ -146,7 +146,7 @@ def _write_form(
         facts["file"] = str(file.relative_to(out))
         write_text(out / "changes.diff", changes)
         for form, what in (("joints", "with servo_law.py"), ("plain", "alone")):
-            if form == "plain" or robot.has_law:
+            if form == "plain" or robot.has_servo_model:
                 left_there[f"{file.name} {what}"] = _played(file, facts, judging, robot, form)
         units = f"targets of {', '.join(other)} were not in rad before (degrees?): now they are; ctrl of keyframes not"
         return file, (units,) * bool(other), left_there

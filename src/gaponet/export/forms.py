@@ -13,7 +13,7 @@ import numpy as np
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.report.candidate import read_origin
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.share.reading import opened
 from gaponet.sim.batch import Condition, ramped
 from gaponet.sim.replay import replay
@@ -59,9 +59,9 @@ def plain_form(
         windows: Free runs of 8 s, as in identification.
         progress: The same as identification's.
     """
-    if not robot.has_law:
+    if not robot.has_servo_model:
         return robot
-    none: dict[str, Any] = dict.fromkeys(LAW, np.array(0.0))
+    none: dict[str, Any] = dict.fromkeys(SERVO_TERMS, np.array(0.0))
     start = replace(robot, **none)
     return identify(recordings, start, terms=(), table=False, progress=progress).robot
 

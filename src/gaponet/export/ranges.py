@@ -21,7 +21,7 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import lock_folder, write_json, write_text
 from gaponet.export import unit_of_mujoco
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sysid.knowledge import Knowledge, believed, seen, values_of
+from gaponet.sysid.uncertainty import ParameterUncertainty, from_axes, prior_std, to_axes
 
 Scope = Literal["today", "any-day", "any-robot"]
 Engine = Literal["json", "mujoco", "mjlab", "isaaclab"]
@@ -63,7 +63,7 @@ def ranges(
         UsageError: What the scope needs is not there; the message says what is missing.
     """
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    known = _known(spec)
+    known = ParameterUncertainty.require(spec)
     fields, joints = known.fields, spec.operated
     now = np.stack([known.array(j, "values") for j in joints])
     covariance = np.stack([known.array(j, "covariance") for j in joints])
@@ -74,7 +74,7 @@ def ranges(
         apart = (each - middle) * np.sqrt((1 + 1 / len(each)) / (len(each) - 1))
         what = "days" if scope == "any-day" else "robots"
         notes.append(f"from {len(each)} {what}: how far they differ is known to a factor of {_factor(len(each)):.1f}")
-    lost = np.sqrt(np.einsum("njj->nj", covariance)) > LOST * believed(fields, now)
+    lost = np.sqrt(np.einsum("njj->nj", covariance)) > LOST * prior_std(fields, now)
     rng, count, alone = np.random.default_rng(seed), max(DRAWN, samples), _alone(apart)
     x = middle + np.sqrt(1 - alone) * np.einsum("sd,dnp->snp", rng.standard_normal((count, len(apart))), apart)
     x = x + np.sqrt(alone * np.square(apart).sum(axis=0)) * rng.standard_normal(x.shape)
@@ -85,7 +85,7 @@ def ranges(
         limit[:, i] *= np.exp(error[:, fields.index("kp")])
     bounded = [f not in SIGNED and f not in ("kp", "stribeck_speed") for f in fields]
     x = np.where(bounded, np.maximum(x, 0.0), x)
-    drawn, value = values_of(fields, x), values_of(fields, middle)
+    drawn, value = from_axes(fields, x), from_axes(fields, middle)
     found = {
         j: {
             f: (float(low), float(value[f][i]), float(high))
@@ -99,14 +99,7 @@ def ranges(
     return Ranges(spec.name, scope, units, found, unknown, tuple(notes))
 
 
-def _known(spec: RobotSpec) -> Knowledge:
-    known = Knowledge.load(spec)
-    if known is None:
-        raise UsageError(f"{spec.folder}: keeps only values (no known.json); identify or adapt it again")
-    return known
-
-
-def _days(known: Knowledge, joints: tuple[str, ...]) -> Array:
+def _days(known: ParameterUncertainty, joints: tuple[str, ...]) -> Array:
     """What each session found, (days, n, P); the last of those that name the same day."""
     units = {s["unit"] for s in known.sources}
     if len(units) > 1:
@@ -134,7 +127,7 @@ def _robots(spec: RobotSpec, fields: tuple[str, ...], others: ListOf[Path]) -> A
     for one in found:
         if one.operated != spec.operated:
             raise UsageError(f"{one.folder}: operates {', '.join(one.operated)}; this robot {', '.join(spec.operated)}")
-    return np.stack([np.stack(list(seen(one, fields).values())) for one in found])
+    return np.stack([np.stack(list(to_axes(one, fields).values())) for one in found])
 
 
 def _alone(apart: Array) -> float:

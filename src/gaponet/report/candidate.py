@@ -19,7 +19,7 @@ from gaponet.nn.loop import DeltaCorrector
 from gaponet.report.methods import method
 from gaponet.robot.folder import KEPT, ORIGIN
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.kept import require_kept, require_same
+from gaponet.sim.model import require_same_robot, require_stored_robot
 
 DATA = "data of the robot that the run was trained for"
 
@@ -61,7 +61,7 @@ class Candidate:
         """
         if not is_robot(folder):
             return cls(folder, corrected_robot(folder, robot), GapModel.load(folder))
-        own = require_same(load_robot(folder), robot, folder, RobotError, "data of this robot")
+        own = require_same_robot(load_robot(folder), robot, folder, RobotError, "data of this robot")
         if own.nominal is None:
             raise UsageError(
                 f"{folder}: nothing was identified of this robot; gaponet identify DATASET --out FOLDER does"
@@ -98,7 +98,7 @@ def corrected_robot(run: Path, robot: RobotSpec) -> RobotSpec:
     Raises:
         ModelError: They differ before identification: errors would be told against another baseline.
     """
-    return require_kept(run, robot, ModelError, DATA)
+    return require_stored_robot(run, robot, ModelError, DATA)
 
 
 def choose(

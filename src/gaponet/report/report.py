@@ -28,7 +28,7 @@ from gaponet.report.tables import by_group, mrad, totals
 from gaponet.report.verdict import added, verdict
 from gaponet.robot.folder import keeps_robot, kept_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.sim.kept import require_kept
+from gaponet.sim.model import require_stored_robot
 
 Picture = Callable[[RobotSpec, SequenceMeta, float, dict[str, Array]], bytes]
 OPEN = 3  # motions shown without a click
@@ -53,7 +53,7 @@ def write_report(
         picture: Draws the robot (view.portrait); left out where it can draw nothing.
     """
     model = None if is_robot(run) else GapModel.load(run)
-    asked = None if robot is None else require_kept(run, load_robot(robot), ModelError, "leave --robot out")
+    asked = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
     spec = load_robot(run) if model is None else asked or kept_robot(run, model.card["robot"])
     if dataset is not None or also or not (run / "trajectories.npz").is_file():
         _evaluate(run, dataset, also, asked, progress)

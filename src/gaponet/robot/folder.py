@@ -9,13 +9,14 @@ import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_text
-from gaponet.robot.spec import BUILTIN, LAW, SERVO, RobotSpec, available, load_robot
+from gaponet.robot.spec import BUILTIN, SERVO, SERVO_TERMS, RobotSpec, available, load_robot
 
 KEPT = "robot"  # folder of a run or a dataset
 MOVE_KEPT = "move that folder away to keep the other robot from now on"
 ORIGIN = "identified.json"  # what a robot was identified from (report/candidate.py)
-KNOWN = "known.json"  # how sure its values are (sysid/knowledge.py)
-BESIDE = ("collision.toml", "look.toml", ORIGIN, KNOWN)
+UNCERTAINTY_FILE = "uncertainty.json"  # of its values (sysid/uncertainty.py)
+OLD_UNCERTAINTY_FILE = "known.json"  # the same in folders that older versions wrote
+BESIDE = ("collision.toml", "look.toml", ORIGIN, UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE)
 IDENTIFIED_MARK = "# Identified from logs by gaponet identify; remove what follows for the nominal robot."
 IDENTIFIED_TABLES = re.compile(r"^\[identified[._].*?(?=^\[(?!identified[._])|\Z)", re.MULTILINE | re.DOTALL)
 FILES = re.compile(r"<include\b|\bfile\s*=|\b(mesh|texture|asset)dir\s*=")
@@ -98,7 +99,7 @@ def keeper(artifact: Path) -> Path:
 def _servo(robot: RobotSpec, joint: str) -> str:
     i = robot.joint_names.index(joint)
     values = {name: float(getattr(robot, name)[i]) for name in SERVO}
-    none = (*LAW, "target_speed")  # where they are 0
+    none = (*SERVO_TERMS, "target_speed")  # where they are 0
     told = {name: value for name, value in values.items() if np.isfinite(value) and (value or name not in none)}
     lines = [f"{name} = {value!r}\n" for name, value in told.items()]
     return f'[identified."{joint}"]\n' + "".join(lines)

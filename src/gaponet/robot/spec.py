@@ -31,8 +31,8 @@ BUILTIN = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
 STOPS = ("stop_low", "stop_high")
 MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
-LAW = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
-FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *LAW)
+SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
+FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *SERVO_TERMS)
 MAX_SUGGESTIONS = 3  # similar joints that an error lists
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
 SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
@@ -164,9 +164,9 @@ class RobotSpec:
         return max(1, round(dt / self.timestep))
 
     @property
-    def has_law(self) -> bool:
+    def has_servo_model(self) -> bool:
         """Whether a servo does more than MuJoCo's position actuator (sim/servo.py)."""
-        return any(getattr(self, name).any() for name in LAW)
+        return any(getattr(self, name).any() for name in SERVO_TERMS)
 
     @property
     def before_identification(self) -> RobotSpec:

@@ -13,9 +13,9 @@ import numpy as np
 from gaponet.base.arrays import array_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import LAW, STOPS, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, STOPS, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
-from gaponet.sim.servo import ServoLaw, present
+from gaponet.sim.servo import ServoModel, present
 
 Array = np.ndarray
 
@@ -136,11 +136,11 @@ class BatchSim:
         conditions: list[Condition],
         nthread: int = 0,
         locked: tuple[str, ...] = (),
-        law: bool = False,
+        servo_model: bool = False,
     ) -> None:
         """Make a simulation for each of `conditions`; nthread 0 uses all cores; n counts joints that are not locked.
 
-        With `law` the servo's law is there to be written to, though the robot has none.
+        With `servo_model` its terms may be written, also if the robot has none.
         """
         self.robot = robot
         self.joint_names = tuple(name for name in robot.joint_names if name not in locked)
@@ -162,7 +162,7 @@ class BatchSim:
         self.ctrl: Array = self.batch.bind("ctrl")
         self.torque: Array = self.batch.bind("actuator_force")
         self._warmstart: Array = self.batch.bind("qacc_warmstart")
-        self.law = ServoLaw(self.batch, first) if robot.has_law or law else None
+        self.servo_model = ServoModel(self.batch, first) if robot.has_servo_model or servo_model else None
         late = [self.batch.bind(name) for name in ("history", "time")] if first.nhistory else []
         self._late = CommandHistory(late[0], late[1], first) if late else None
         # Physics steps per control period, and their length in s, of each simulation.
@@ -196,9 +196,9 @@ class BatchSim:
             if past is None:
                 raise UsageError(f"{self.robot.name} has late servos: give the targets of the periods before as `past`")
             self._late.fill(ids, past, self.nstep[ids], self.timestep[ids])
-        if self.law is not None:
-            rows, self.law.active = np.arange(self.num_envs)[ids], present(self.law.values)
-            self.law.reset(rows, self.qpos[rows] if past is None else past[:, 0])
+        if self.servo_model is not None:
+            rows, self.servo_model.active = np.arange(self.num_envs)[ids], present(self.servo_model.values)
+            self.servo_model.reset(rows, self.qpos[rows] if past is None else past[:, 0])
 
     def step(self, ctrl: Array, ids: Array | None = None) -> None:
         """Hold position targets for one control period.
@@ -219,13 +219,13 @@ class BatchSim:
             self._advance(moving[self.nstep[moving] == n], int(n))
 
     def _advance(self, ids: Array | None, count: int) -> None:
-        if self.law is None:
+        if self.servo_model is None:
             self.batch.step(ids, nstep=count)
             return
         for _ in range(count):
-            self.law.before()
+            self.servo_model.before()
             self.batch.step(ids, nstep=1)
-            self.law.after(ids)
+            self.servo_model.after(ids)
 
     def set_servos(self, joints: tuple[str, ...], values: dict[str, Array]) -> None:
         """Give every simulation servos of its own.
@@ -233,14 +233,14 @@ class BatchSim:
         Args:
             joints: k names.
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, and any of kd, effort_limit,
-                zero, target_speed, delay (up to the robot's) and LAW, each (num_envs, k). A damping below zero takes
-                from the servo's own kd.
+                zero, target_speed, delay (up to the robot's) and SERVO_TERMS, each (num_envs, k). A damping below zero
+                is taken from the servo's own kd.
 
         Raises:
             UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
         """
         model, batch = next(iter(self.models.values())), self.batch
-        fixed = STOPS + ("delay",) * (not model.nhistory) + LAW * (self.law is None)
+        fixed = STOPS + ("delay",) * (not model.nhistory) + SERVO_TERMS * (self.servo_model is None)
         if refused := [f for f in fixed if f in values and np.any(values[f])]:
             raise UsageError(f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them "
                              "to the robot (with_servos) that BatchSim is made with")  # fmt: skip
@@ -266,10 +266,10 @@ class BatchSim:
             speed = np.tile(self.robot.target_speed[self.robot.index(self.joint_names)], (self.num_envs, 1))
             speed[:, at] = values["target_speed"]
             self.most = self._farthest(speed)
-        if self.law is not None:
-            self.law.bias[:, at], self.law.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
-            for name in LAW:
-                self.law.values[name][:, at] = values.get(name, 0.0)
+        if self.servo_model is not None:
+            self.servo_model.bias[:, at], self.servo_model.frictionloss[:, at] = bias[:, at, 0], values["frictionloss"]
+            for name in SERVO_TERMS:
+                self.servo_model.values[name][:, at] = values.get(name, 0.0)
 
     def _farthest(self, speed: Array) -> Array:
         """Most that targets move in a period at `speed`, (…, n) rad/s, 0 for no ramp: (num_envs, n) rad."""
@@ -286,7 +286,11 @@ class BatchSim:
 
     def _state(self) -> dict[str, Array]:
         late = {} if self._late is None else {"history": self._late.buffer, "time": self._late.time}
-        servo = {} if self.law is None else {"servo_torque": self.law.torque, "servo_load": self.law.load}
+        servo = (
+            {}
+            if self.servo_model is None
+            else {"servo_torque": self.servo_model.torque, "servo_load": self.servo_model.load}
+        )
         aim = {} if self.most is None else {"ctrl": self.ctrl}
         return {"qpos": self.qpos, "qvel": self.qvel, "warmstart": self._warmstart} | late | servo | aim
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import LAW
+from gaponet.robot.spec import SERVO_TERMS
 from gaponet.sim.batch import Batch, BatchSim
 from gaponet.sim.servo import friction_limit, present
 
@@ -103,8 +103,12 @@ class ClosedForm:
         self.offset, self.delay = bias[..., 0] / self.kp, model.actuator_delay[act]
         self.low, self.high = _most_torque(model, joints, act)
         self.frictionloss, self.damping = model.dof_frictionloss[self.dof], model.dof_damping[self.dof]
-        user = model.actuator_user[act].T if model.nuser_actuator == len(LAW) else np.zeros((len(LAW), len(act)))
-        self.law = present(dict(zip(LAW, user, strict=True)))
+        user = (
+            model.actuator_user[act].T
+            if model.nuser_actuator == len(SERVO_TERMS)
+            else np.zeros((len(SERVO_TERMS), len(act)))
+        )
+        self.law = present(dict(zip(SERVO_TERMS, user, strict=True)))
         self.explicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER  # kd takes the speed before the step
         self.h, self.dt = timestep[:, None], (nstep * timestep)[:, None]
         self.ahead = int(np.ceil((self.delay / self.dt).max() - 1e-9))

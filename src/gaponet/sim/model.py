@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from gaponet.base.errors import RobotError, UsageError
+from gaponet.base.errors import GAPONetError, RobotError, UsageError
+from gaponet.robot.folder import KEPT, keeps_robot, kept_robot
 from gaponet.robot.freeze import freeze, units_per_si
 from gaponet.robot.identity import lines
 from gaponet.robot.mjcf import compiled, read_mjcf
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.table import add_table, soften_table
-
-if TYPE_CHECKING:
-    pass
 
 # Joint friction loss is a soft constraint in MuJoCo: a joint that should stick creeps by (1 − d)·w·f/b rad/s, f the
 # torque it holds, b ≤ 500 1/s of solref, d ≤ 0.9999 of solimp and w the joint's mobility, dof_invweight0. A tenth of w
@@ -156,6 +154,34 @@ def model_hash(robot: RobotSpec) -> str:
     return str(vars(robot)["_model_hash"])
 
 
+def require_stored_robot(holder: Path, robot: RobotSpec, error: type[GAPONetError], hint: str) -> RobotSpec:
+    """Return the robot stored in a run or dataset; refuse `robot` if the nominal simulators differ, whatever the names.
+
+    Args:
+        holder: Run or dataset; `robot` itself is returned for one of a version that stored none.
+        robot: The robot that is to be used with it.
+        error: Raised if the robots differ.
+        hint: What to do about it.
+    """
+    if not keeps_robot(holder):
+        return robot
+    use = f"--robot {holder / KEPT} where that is the right one, or {hint}"
+    return require_same_robot(kept_robot(holder, robot.name), robot, holder, error, use)
+
+
+def require_same_robot(
+    own: RobotSpec, robot: RobotSpec, folder: Path, error: type[GAPONetError], use: str
+) -> RobotSpec:
+    """Return `own`, the robot in a folder, or raise `error` if it differs from `robot` before identification."""
+    ours, theirs = model_hash(own.before_identification), model_hash(robot.before_identification)
+    if ours != theirs:
+        raise error(
+            f"{folder}: its nominal simulator is {ours}, that of {robot.folder} is {theirs}: another robot, or other "
+            f"gains or inertias. Use {use}"
+        )
+    return own
+
+
 def _read(robot: RobotSpec) -> mujoco.MjSpec:
     spec = read_mjcf(robot.mjcf)
     known = {j.name for j in spec.joints}
@@ -204,8 +230,8 @@ def _remove_standing(spec: mujoco.MjSpec, body: mujoco.MjsBody, keep: set[str]) 
 def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...]) -> None:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
-    if robot.has_law:
-        spec.nuser_actuator = len(LAW)
+    if robot.has_servo_model:
+        spec.nuser_actuator = len(SERVO_TERMS)
     # One buffer length at all control periods, so that models of one robot share a layout; none where nothing is late.
     shortest = min(0.75 * robot.timestep, spec.option.timestep)
     samples = math.ceil(robot.delay.max() / shortest - 1e-9) + 1 if robot.delay.any() else 0
@@ -218,8 +244,8 @@ def _add_actuators(spec: mujoco.MjSpec, robot: RobotSpec, locked: tuple[str, ...
         actuator.biasprm[0] = kp * robot.offset[i]
         actuator.forcelimited = True
         actuator.forcerange = (-limit, limit)
-        if robot.has_law:
-            actuator.userdata = [getattr(robot, term)[i] for term in LAW]
+        if robot.has_servo_model:
+            actuator.userdata = [getattr(robot, term)[i] for term in SERVO_TERMS]
         if samples:
             actuator.nsample, actuator.interp, actuator.delay = samples, 1, robot.delay[i]
 

@@ -3,7 +3,7 @@
 The encoder counts in steps; a motor that is told to turn at all turns with a least torque (minimum PWM); friction is
 larger at rest (Stribeck) and grows with what the gear transmits (load-dependent as in BAM, Duclusaud et al. 2024).
 MuJoCo integrates: these laws only move the actuator's bias and the limit of friction, so friction sticks as MuJoCo's
-does. The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_runs.py) compute with
+does. The two terms of friction stand here once: numpy, torch and numba (`advance`, for joint_rollouts.py) compute with
 them; sim/warp.py has this law as a kernel. A model's actuator_user carries the numbers; without, nothing here runs.
 """
 
@@ -15,9 +15,9 @@ import mujoco
 import numpy as np
 
 from gaponet.base.arrays import Array, array_module
-from gaponet.robot.spec import LAW
+from gaponet.robot.spec import SERVO_TERMS
 
-Law = dict[str, Any]  # name of LAW → values that broadcast to the simulations' joints, numpy or torch
+Law = dict[str, Any]  # name of SERVO_TERMS → values that broadcast to the simulations' joints, numpy or torch
 
 SLOWEST = 1e-3  # rad/s: of stribeck_speed
 FINEST = 1e-9  # rad: of encoder_step
@@ -68,7 +68,7 @@ def advance(
     first: int, last: int, values: Any, law: bool, tables: Any, ctrl: Any, qpos: Any, qvel: Any, touch: Any,
     lengths: Any, stiffer: Any, kd: Any, stops: Any, periods: Any, count: int, thin: int, out: Any,
 ) -> None:  # fmt: skip
-    """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRuns keeps them.
+    """Fill out[:, first:last] (k, n·windows, rows) with q_sim − q_real; arrays as JointRollouts keeps them.
 
     Candidates take each step side by side: none waits for its own last one. numba compiles this; it stands here since a
     compiled function is made anew when its own file changes, and no other.
@@ -120,11 +120,11 @@ def advance(
                 out[:, item, (t + 1) // thin] = q - qpos[j, p, t + 1]
 
 
-class ServoLaw:
+class ServoModel:
     """The servos of every simulation in a batch, whose actuators stand in the order of its joints.
 
     Attributes:
-        values: Name of LAW → (nsim, nu); may be written.
+        values: Name of SERVO_TERMS → (nsim, nu); may be written.
         active: What of them is present, as of the simulations' last reset.
         frictionloss, bias: The model's, without what is added here, (nsim, nu) N·m; may be written.
         torque, load: The actuators' torque in the last physics step, and what gravity and Coriolis forces take from it,
@@ -134,12 +134,12 @@ class ServoLaw:
     def __init__(self, batch: Any, model: mujoco.MjModel) -> None:
         """Take the model's numbers for all simulations of a mujoco.batch.Batch, or of what has its bind and expand."""
         self.batch, self.model = batch, model
-        user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(LAW)))
+        user = model.actuator_user if model.nuser_actuator else np.zeros((model.nu, len(SERVO_TERMS)))
         self._qpos, self._qvel, self._ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
         self._force, self._passing = batch.bind("actuator_force"), batch.bind("qfrc_bias")
         self._gain, self._bias = batch.expand("actuator_gainprm"), batch.expand("actuator_biasprm")
         self._limit = batch.expand("dof_frictionloss")
-        self.values: Law = {name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(LAW)}
+        self.values: Law = {name: np.tile(user[:, i], (len(self._qpos), 1)) for i, name in enumerate(SERVO_TERMS)}
         self.frictionloss, self.bias = self._limit.copy(), self._bias[:, :, 0].copy()
         self.torque, self.load = (np.zeros(self._force.shape) for _ in range(2))
         self.active = present(self.values)

@@ -18,7 +18,7 @@ from mujoco.batch import MODEL_FIELDS
 from torch import Tensor
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import LAW
+from gaponet.robot.spec import SERVO_TERMS
 from gaponet.sim import servo
 from gaponet.sim.batch import UNDER_WAY, BatchSim, CommandHistory
 
@@ -29,7 +29,7 @@ SERVO = {"actuator_force": "servo_torque", "qfrc_bias": "servo_load"}
 AIM = {"ctrl": "ctrl"}
 
 _Floats: Any = warp.array2d(dtype=float)
-_Numbers: Any = warp.array2d(dtype=warp.types.vector(len(LAW), float))  # in the order of LAW
+_Numbers: Any = warp.array2d(dtype=warp.types.vector(len(SERVO_TERMS), float))  # in the order of SERVO_TERMS
 _Parameters: Any = warp.array2d(dtype=warp.types.vector(10, float))  # of an actuator's gain or bias
 _passing = warp.func(servo.passing_friction)
 
@@ -39,7 +39,7 @@ def _set_servos(
     law: _Numbers, dead: float, offset: _Floats, dry: _Floats, gain: _Parameters, ctrl: _Floats, qpos: _Floats,
     qvel: _Floats, torque: _Floats, load: _Floats, bias: _Parameters, limit: _Floats,
 ) -> None:  # fmt: skip
-    """ServoLaw.before: bias and friction of servo j of world i for the next physics step."""
+    """ServoModel.before: bias and friction of servo j of world i for the next physics step."""
     i, j = warp.tid()
     own, kp, q = law[i, j], gain[i, j][0], qpos[i, j]
     resting = own[0] * warp.exp(-abs(qvel[i, j]) / max(own[1], servo.SLOWEST))
@@ -72,18 +72,26 @@ class _Worlds:
             self.data = mujoco_warp.put_data(model, mujoco.MjData(model), len(rows), touching or None, njmax=most)
             self.model.opt.timestep = warp.array(timestep, dtype=float)
             self.model.opt.tolerance = warp.array([model.opt.tolerance], dtype=float)  # put_model's is 1e-6 at least
-            self._law = None if sim.law is None else self._inputs(sim.law, rows)
+            self._law = None if sim.servo_model is None else self._inputs(sim.servo_model, rows)
         for name, x in own.items():
             view = warp.to_torch(getattr(self.model, name))
             view.copy_(torch.tensor(x).reshape(view.shape))
 
-    def _inputs(self, law: servo.ServoLaw, rows: np.ndarray) -> list[Any]:
+    def _inputs(self, servos: servo.ServoModel, rows: np.ndarray) -> list[Any]:
         """What _set_servos is given."""
-        m, d, dead = self.model, self.data, 0.5 * law.values["min_torque"].any()
-        stated = warp.array(np.stack([law.values[name][rows] for name in LAW], axis=-1), dtype=_Numbers.dtype)
-        own = [warp.array(x[rows], dtype=float) for x in (law.bias, law.frictionloss)]
+        m, d, dead = self.model, self.data, 0.5 * servos.values["min_torque"].any()
+        stated = np.stack([servos.values[name][rows] for name in SERVO_TERMS], axis=-1)
+        own = [warp.array(x[rows], dtype=float) for x in (servos.bias, servos.frictionloss)]
         state = [d.ctrl, d.qpos, d.qvel, d.actuator_force, d.qfrc_bias]
-        return [stated, dead, *own, m.actuator_gainprm, *state, m.actuator_biasprm, m.dof_frictionloss]
+        return [
+            warp.array(stated, dtype=_Numbers.dtype),
+            dead,
+            *own,
+            m.actuator_gainprm,
+            *state,
+            m.actuator_biasprm,
+            m.dof_frictionloss,
+        ]
 
     def bind(self, name: str) -> Tensor:
         """A live view of a field of all worlds, (nworld, …)."""
@@ -151,7 +159,7 @@ class WarpSim:
         rates = [np.flatnonzero(sim.nstep == n) for n in np.unique(sim.nstep)]
         self._worlds = [_Worlds(sim, rows, device) for rows in rates]
         self._late = next(iter(sim.models.values())).nhistory > 0
-        self._kept = STATE | (LATE if self._late else {}) | (SERVO if sim.law else {})
+        self._kept = STATE | (LATE if self._late else {}) | (SERVO if sim.servo_model else {})
         self._kept |= {} if sim.most is None else AIM
         names = [*self._kept, "ctrl", "actuator_force"]
         self._views = [{name: worlds.bind(name) for name in names} for worlds in self._worlds]
@@ -164,9 +172,9 @@ class WarpSim:
         self._ids = [self.array(rows) for rows in rates]
         self._low, self._high = self.array(self.range.T)
         self._most = None if sim.most is None else self.array(sim.most)
-        if sim.law:
-            limits = np.moveaxis(np.array(sim.law.force_range), -1, 0)
-            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.law.bias, *limits
+        if sim.servo_model:
+            limits = np.moveaxis(np.array(sim.servo_model.force_range), -1, 0)
+            told = sim.batch.expand("actuator_gainprm")[..., 0], sim.servo_model.bias, *limits
             self._gain, self._bias, *self._limits = map(self.array, told)
         self.nstep, self.timestep = self.array(sim.nstep), self.array(sim.timestep)
         if self._late:

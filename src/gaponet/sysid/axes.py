@@ -14,7 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import encoder_step
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.model import build_model
 
 Values = dict[str, Array]  # field → (…, n) of the operated joints
@@ -34,7 +34,7 @@ def first_values(robot: RobotSpec) -> Values:
     model, op = build_model(replace(robot, table=None)), robot.operated_index
     dof = np.array([model.joint(j).dofadr[0] for j in robot.operated])
     passive = {f: np.array(getattr(model, f"dof_{f}")[dof]) for f in ("damping", "frictionloss", "armature")}
-    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *LAW)}
+    return passive | {f: getattr(robot, f)[op] for f in ("kp", "offset", "delay", "effort_limit", *SERVO_TERMS)}
 
 
 class Bounds:
@@ -66,7 +66,7 @@ class Bounds:
             "armature": np.maximum(np.maximum(self.first["armature"], 1e-6 * kp), resolved),
         }
         self.start |= {f: np.where(self.still, self.first[f], self.start[f]) for f in ("delay", "armature")}
-        self.start |= {f: self.first[f] for f in LAW if self.first[f].any()}
+        self.start |= {f: self.first[f] for f in SERVO_TERMS if self.first[f].any()}
         counts = np.array([encoder_step([s.qpos[:, j] for s in sequences]) for j in op])
         one, heavy = np.ones(self.n), np.maximum(self.start["armature"] / kp, 1e-6)
         self.limits: dict[str, tuple[Array, Array, Array]] = {

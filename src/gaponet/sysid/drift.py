@@ -20,8 +20,8 @@ from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.axes import OVER_KP
 from gaponet.sysid.evidence import PLAY, Evidence, evidence, inverted, spread_of
-from gaponet.sysid.joint_runs import SOFT
-from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.joint_rollouts import SOFT
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 ALARM = 0.003  # of a robot that did not change: how often any of its numbers is said to have moved
 AGAINST = 1e-4  # the same of a recording that is said to contradict the others
@@ -44,7 +44,7 @@ class Moved:
 
     Attributes:
         field: The servo's field, or play (rad).
-        by, error: Change on the axes of sysid/knowledge.py and its standard error.
+        by, error: Change on the axes of sysid/uncertainty.py and its standard error.
         moves: How far that moves the joint along these recordings, RMS, rad.
     """
 
@@ -86,7 +86,7 @@ class Drift:
     far: Mapping[str, float]
 
 
-def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
+def drift(robot: RobotSpec, known: ParameterUncertainty, sequences: ListOf[Sequence], nthread: int = 0) -> Drift:
     """Compare recordings with what is known of a robot.
 
     Args:
@@ -100,9 +100,11 @@ def drift(robot: RobotSpec, known: Knowledge, sequences: ListOf[Sequence], nthre
     if not says.rows.any():
         raise UsageError("no recording moves an operated joint away from what it may touch; record gaponet excite's")
     fields, joints = (*known.fields, PLAY), robot.operated
-    times = {j: float(np.median(e)) / max(known.joints[j].left, 1e-9) for j, e in zip(joints, says.left, strict=True)}
+    times = {
+        j: float(np.median(e)) / max(known.joints[j].residual_rms, 1e-9) for j, e in zip(joints, says.left, strict=True)
+    }
     far = {j: by for j, by in times.items() if by > FAR}
-    scatter = np.stack([np.maximum(known.array(j, "scatter"), 1.0) for j in joints])
+    scatter = np.stack([np.maximum(known.array(j, "overdispersion"), 1.0) for j in joints])
     against = _contradictions(says.by_recording(), scatter, known, joints, fields)
     aside = {a.recording for a in against}
     contradictory = len(aside) > MINORITY * len(says.names)
@@ -137,7 +139,7 @@ def widened(normal: Array, scatter: Array) -> Array:
     return np.asarray(root[..., :, None] * normal * root[..., None, :])
 
 
-def directions(known: Knowledge, joint: str) -> Array:
+def directions(known: ParameterUncertainty, joint: str) -> Array:
     """How the axes and play move when one number alone does, in SI: column by column, (Q, Q). A softer motor has the
     friction that it had, so over its gain it has more."""
     found = np.eye(len(known.fields) + 1)
@@ -164,19 +166,23 @@ class _Joint:
         cls,
         joint: str,
         fields: tuple[str, ...],
-        known: Knowledge,
+        known: ParameterUncertainty,
         normal: Array,
         pulls: Array,
         spread: Array,
         rows: int,
     ) -> _Joint:
         """What is left of the pulls that the robot had when it was identified."""
-        step, about, way = known.array(joint, "step"), known.array(joint, "step_covariance"), directions(known, joint)
+        step, about, way = (
+            known.array(joint, "gauss_newton_step"),
+            known.array(joint, "gauss_newton_covariance"),
+            directions(known, joint),
+        )
         variance = spread + normal @ about @ normal
         size = np.sqrt(np.maximum(np.diag(variance), 1e-30))
         weight = np.linalg.inv(variance / np.outer(size, size) + 1e-9 * np.eye(len(size))) / np.outer(size, size)
         length = SOFT * np.sqrt(np.maximum(np.diag(way.T @ normal @ way), 0.0) / max(rows, 1))
-        felt = FELT * known.joints[joint].left
+        felt = FELT * known.joints[joint].residual_rms
         return cls(joint, fields, -pulls - normal @ step, normal @ way, weight, length, felt)
 
     def explained(self, threshold: float) -> tuple[list[Moved], Moved | None]:
@@ -225,7 +231,7 @@ def _solved(columns: Array, weight: Array, pull: Array) -> tuple[Array, Array]:
 
 
 def _contradictions(
-    says: Evidence, scatter: Array, known: Knowledge, joints: ListOf[str], fields: ListOf[str]
+    says: Evidence, scatter: Array, known: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
 ) -> tuple[Against, ...]:
     """Recordings that differ from the rest of them by more than recordings do, the farthest first, which is then left
     out of the rest; of each its farthest number."""
@@ -237,7 +243,7 @@ def _contradictions(
 
 
 def _farthest(
-    says: Evidence, scatter: Array, known: Knowledge, joints: ListOf[str], fields: ListOf[str]
+    says: Evidence, scatter: Array, known: ParameterUncertainty, joints: ListOf[str], fields: ListOf[str]
 ) -> Against | None:
     count, worst = len(says.names), None
     limit = float(student.isf(AGAINST / (count * len(joints) * len(fields)) / 2, min(known.clusters, TRUSTED)))
@@ -255,7 +261,10 @@ def _farthest(
                 by, error = _solved(mine[:, [k]], weight, left)
                 sigmas = float(by[0] / error[0])
                 felt = SOFT * abs(by[0]) * np.sqrt(mine[k, k] * count / max(float(says.rows[i]), 1))
-                if abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0) and felt > known.joints[joint].left:
+                if (
+                    abs(sigmas) > max(limit, abs(worst.sigmas) if worst else 0)
+                    and felt > known.joints[joint].residual_rms
+                ):
                     worst = Against(says.names[r], joint, fields[k], float(by[0]), sigmas)
     return worst
 

@@ -12,16 +12,16 @@ from scipy.special import stdtrit
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
 from gaponet.sysid.axes import CLASSIC, Axes, Bounds, first_values
 from gaponet.sysid.fit import SURE
-from gaponet.sysid.free_runs import cut
-from gaponet.sysid.joint_runs import SOFT, JointRuns
-from gaponet.sysid.knowledge import JointKnown, Knowledge, Source, believed, seen
-from gaponet.sysid.multistart import slopes
-from gaponet.sysid.touching import tip_heights, touching_below
+from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sysid.least_squares import slopes
+from gaponet.sysid.robot_rollouts import cut
+from gaponet.sysid.table_contact import tip_heights, touching_below
+from gaponet.sysid.uncertainty import JointUncertainty, ParameterUncertainty, Provenance, prior_std, to_axes
 
 WINDOWS, CLUSTERS = (
     40,
@@ -109,7 +109,7 @@ def evidence(
     """Free runs of windows of recordings, every joint on its own beside them, at the robot's own values."""
     below = touching_below(robot, tip_heights(sequences, robot))
     parts = cut(sequences, windows)
-    runs, bounds = JointRuns(parts, robot, below, nthread), Bounds(robot, sequences)
+    runs, bounds = JointRollouts(parts, robot, below, nthread), Bounds(robot, sequences)
     axes = Axes(bounds, fields, bounds.first)
     x = axes.of(bounds.first)
     flat = lambda xs: runs.errors(axes.values(xs)).reshape(len(xs), bounds.n, -1) / np.float32(SOFT)  # noqa: E731
@@ -133,15 +133,15 @@ def evidence(
     return Evidence(pulls, normals, runs.rows, of[window], tuple(own), far)
 
 
-def known(
+def estimate_uncertainty(
     robot: RobotSpec,
     sequences: ListOf[Sequence],
     judges: ListOf[Sequence],
     covariances: Mapping[str, tuple[list[str], Array]] = {},
-    before: Knowledge | None = None,
+    before: ParameterUncertainty | None = None,
     judged: RobotSpec | None = None,
     nthread: int = 0,
-) -> Knowledge:
+) -> ParameterUncertainty:
     """What is known of a robot after it was fitted to recordings.
 
     Args:
@@ -156,12 +156,12 @@ def known(
         nthread: Threads, 0 for all cores.
     """
     first = first_values(robot)
-    fields = before.fields if before else (*CLASSIC, *(f for f in LAW[:-1] if first[f].any()))
-    says, values = evidence(robot, sequences, fields, nthread=nthread), seen(robot, fields)
+    fields = before.fields if before else (*CLASSIC, *(f for f in SERVO_TERMS[:-1] if first[f].any()))
+    says, values = evidence(robot, sequences, fields, nthread=nthread), to_axes(robot, fields)
     grouped = says.by_recording() if len(says.names) >= CLUSTERS // 4 else says
     scatter, clusters = grouped.scatter(), grouped.pulls.shape[1]
     if before:
-        old = np.stack([before.array(j, "scatter") for j in robot.operated])
+        old = np.stack([before.array(j, "overdispersion") for j in robot.operated])
         scatter = (before.clusters * old + clusters * scatter) / (before.clusters + clusters)
     step, step_covariance = says.step(np.maximum(scatter, 1.0))
     left, joints = _left(judges or sequences, judged or robot, nthread), {}
@@ -176,17 +176,17 @@ def known(
             at = np.array([names.index(f) for f in fields])
             own = whole[np.ix_(at, at)]
         if not before:
-            own = inverted(inverted(own) + np.diag(believed(fields, values[joint]) ** -2))
+            own = inverted(inverted(own) + np.diag(prior_std(fields, values[joint]) ** -2))
         normal = says.normals[i].sum(axis=0)[:-1, :-1]
         predicted = SOFT * float(np.sqrt(max(np.trace(own @ normal), 0.0) / max(says.rows[i], 1)))
         error = np.concatenate(left[joint])
         rest = before and not judges and before.joints[joint]
-        joints[joint] = JointKnown(
+        joints[joint] = JointUncertainty(
             _plain(values[joint]), _plain(own), _plain(step[i]), _plain(step_covariance[i]), _plain(scatter[i]),
-            predicted, max(float(np.sqrt(np.mean(error**2))), rest.left if rest else 0.0),
-            max(_band(left[joint]), rest.band if rest else 0.0),
+            predicted, max(float(np.sqrt(np.mean(error**2))), rest.residual_rms if rest else 0.0),
+            max(_band(left[joint]), rest.residual_p90 if rest else 0.0),
         )  # fmt: skip
-    source: Source = {
+    source: Provenance = {
         "made_by": "identify" if judges or covariances else "adapt",
         "days": tuple(sorted({s.meta.recorded_at[:10] for s in sequences} - {""})),
         "unit": ", ".join(sorted({s.meta.unit_id for s in sequences})),
@@ -194,7 +194,7 @@ def known(
         "seconds": float(sum(s.duration for s in sequences)),
         "values": {j: joints[j].values for j in joints}, "covariance": {j: joints[j].covariance for j in joints},
     }  # fmt: skip
-    return Knowledge(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
+    return ParameterUncertainty(fields, joints, (*(before.sources if before else ()), source), clusters, bool(judges))
 
 
 def _left(sequences: ListOf[Sequence], robot: RobotSpec, nthread: int) -> dict[str, list[Array]]:

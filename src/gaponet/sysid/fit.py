@@ -1,11 +1,11 @@
 """System identification: the servo parameters with which the simulator, running free, follows the recordings best.
 
 Per operated joint: kp, total damping, dry friction, armature, zero offset, command delay; then, each only where it
-lowers the error of recordings that are not fitted, the terms of the servo's law (sim/servo.py). First every joint on
-its own beside the recording (sysid/joint_runs.py), from several starts; then all of them together in the simulator of
-the whole robot (sysid/free_runs.py), from there and from the robot's file: least squares both times
-(sysid/multistart.py). Validation motions choose among the given robot and what was found on the way; then comes what
-the robot touches (sysid/touching.py); then a fit that begins with recorded torque is a rival to all that
+lowers the error of recordings that are not fitted, the terms of the servo model (sim/servo.py). First every joint on
+its own beside the recording (sysid/joint_rollouts.py), from several starts; then all of them together in the simulator
+of the whole robot (sysid/robot_rollouts.py), from there and from the robot's file: least squares both times
+(sysid/least_squares.py). Validation motions choose among the given robot and what was found on the way; then comes what
+the robot touches (sysid/table_contact.py); then a fit that begins with recorded torque is a rival to all that
 (gaponet/sysid/torque.py).
 """
 
@@ -21,15 +21,15 @@ from scipy.special import stdtrit
 
 from gaponet.base.text import format_uncertainty
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.model import build_model
 from gaponet.sysid.axes import CLASSIC, OVER_KP, STILL, Axes, Bounds, Values
-from gaponet.sysid.free_runs import FreeRuns, cut
-from gaponet.sysid.joint_runs import SOFT, JointRuns
-from gaponet.sysid.multistart import agreed_slopes, better_half, descend
-from gaponet.sysid.shared import far_from_published, same_servos, share
-from gaponet.sysid.touching import Touch, fit_table, low_windows, tip_heights, touching_below
+from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sysid.least_squares import agreed_slopes, better_half, descend
+from gaponet.sysid.robot_rollouts import RobotRollouts, cut
+from gaponet.sysid.shared_servo import far_from_published, same_servos, share
+from gaponet.sysid.table_contact import Touch, fit_table, low_windows, tip_heights, touching_below
 
 Array = np.ndarray
 Std = dict[str, dict[str, float]]  # joint → field → standard error
@@ -115,7 +115,7 @@ class Identified:
         touch: What was found about the table; None where nothing may touch.
         shared: Type of servo whose joints were given one law, with the errors before and after.
         by_joint: Joint → mean |error| before and after, rad.
-        covariance: Joint → of its fields on the axes of sysid/knowledge.py; none of a shared law.
+        covariance: Joint → of its fields on the axes of sysid/uncertainty.py; none of a shared law.
         judged: The robot that the validation motions judged, where `robot` was fitted to them, too, afterwards.
     """
 
@@ -198,7 +198,7 @@ def fit_robot(
     given, robot = robot, with_stops(robot, sequences)  # for the fit; what nobody confirmed is taken back in the end
     heights = tip_heights(sequences, robot)
     below, parts = touching_below(robot, heights), cut(sequences, windows)
-    fit = Fit(JointRuns(parts, robot, below, nthread), robot, Bounds(robot, sequences))
+    fit = Fit(JointRollouts(parts, robot, below, nthread), robot, Bounds(robot, sequences))
     judge, first = _Judge(list(validation) or parts, robot, below, nthread), fit.bounds.first
     whole, candidates = _classic(fit, clock, nthread)
     chosen, values = judge.best(candidates)
@@ -269,7 +269,7 @@ class _Judge:
     """Motions that were not fitted, whole, in the whole robot's simulator; repetitions count as one."""
 
     def __init__(self, sequences: list[Sequence], robot: RobotSpec, below: float, nthread: int) -> None:
-        self.runs = FreeRuns(sequences, robot, nthread, touch=_touching_rows(sequences, robot, below))
+        self.runs = RobotRollouts(sequences, robot, nthread, touch=_touching_rows(sequences, robot, below))
         # Repetitions and gains of what one unit plays with one payload are one judge.
         of = [(s.meta.motion, s.meta.unit_id, s.meta.payload_mass, s.meta.payload_side) for s in sequences]
         each = [np.array([one == key for one in of])[self.runs.window] for key in dict.fromkeys(of)]
@@ -345,7 +345,9 @@ class _Limbs:
 class Fit:
     """Windows of recordings, joints on their own or the whole robot, and what a parameter may be."""
 
-    def __init__(self, runs: JointRuns, robot: RobotSpec, bounds: Bounds, whole: FreeRuns | None = None) -> None:
+    def __init__(
+        self, runs: JointRollouts, robot: RobotSpec, bounds: Bounds, whole: RobotRollouts | None = None
+    ) -> None:
         self.runs, self.base, self.bounds, self.company = runs, robot, bounds, whole
         self.n = len(robot.operated)
         self.noise = np.full(self.n, 1e-3)  # rad: what the best fit of each joint leaves, by then
@@ -357,14 +359,14 @@ class Fit:
         """The same in the simulator of the whole robot, with fewer windows; it begins to move where this one ended."""
         parts = self.runs.parts
         some = np.unique(np.arange(WHOLE) * len(parts) // WHOLE)
-        runs = FreeRuns([parts[i] for i in some], self.base, nthread, touch=self.runs.touch[some])
+        runs = RobotRollouts([parts[i] for i in some], self.base, nthread, touch=self.runs.touch[some])
         fit = Fit(self.runs, self.base, self.bounds, runs)
         fit.noise, fit.lasts = self.noise, self.lasts
         return fit
 
     def fields_of(self, values: Values) -> list[str]:
         """Names that the whole robot can be searched for, classic ones first."""
-        return [f for f in (*CLASSIC, *LAW) if f in values and f not in ALONE]
+        return [f for f in (*CLASSIC, *SERVO_TERMS) if f in values and f not in ALONE]
 
     def balanced(self) -> list[Values]:
         """What balances the recorded accelerations, by itself and with the file's kp."""
@@ -382,7 +384,7 @@ class Fit:
     ) -> Values:
         """Fit the classic fields, those of the law that `start` has and these, every joint on its own, from a start,
         from at most two others, and from some beside the first, STARTS in all."""
-        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in start or f in fields]
+        names = [f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in start or f in fields]
         axes = Axes(self.bounds, names, start)
         rng = np.random.default_rng(0)
         x = np.repeat(axes.of(start)[None], STARTS, axis=0)
@@ -441,9 +443,9 @@ class Fit:
         alike *= np.cumprod(alike > FAINT, axis=1)
         self.lasts = np.maximum(self.runs.dt * self.runs.thin * (2 * alike.sum(axis=1) - 1), LASTS[0])
 
-    def errors(self, values: Values, runs: JointRuns | FreeRuns) -> Array:
+    def errors(self, values: Values, runs: JointRollouts | RobotRollouts) -> Array:
         """Errors of (k, n) values, (k, n, rows), in SOFT; two more: how far kp and armature are from the file's."""
-        if isinstance(runs, JointRuns):
+        if isinstance(runs, JointRollouts):
             found = runs.errors(values)
             found = found.reshape(*found.shape[:2], -1)
         else:
@@ -467,7 +469,7 @@ class Fit:
     def uncertainty(self, values: Values) -> tuple[Std, Std]:
         """Standard errors, joint → field, of the values and of those that are searched over kp: from slopes,
         windows that pull against each other, how wide a belief is that holds a value, and how far a step more goes."""
-        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        names = [f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in values and f != "encoder_step"]
         axes, runs = Axes(self.bounds, names, values), self.runs if self.company is None else self.company
         x = axes.of(values)
         asked = agreed_slopes(x[None], axes.low, axes.high, lambda xs: self.errors(axes.values(xs), runs))
@@ -512,7 +514,7 @@ class Fit:
 
     def bounds_met(self, values: Values) -> tuple[str, ...]:
         """Every parameter at a bound, with what to check; no friction, armature or delay at all are ordinary."""
-        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        names = [f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in values and f != "encoder_step"]
         axes, found = Axes(self.bounds, names, values), []
         x = axes.of(values)
         for i, joint in enumerate(self.base.operated):
@@ -535,7 +537,7 @@ class Fit:
     def undetermined(self, values: Values, std: Std, over_kp: Std) -> dict[str, tuple[tuple[str, ...], str]]:
         """Joints that stood, and parameters whose standard error is as large as what they may mean: joint → fields, and
         what is to be said."""
-        names = [f for f in (*CLASSIC, "effort_limit", *LAW) if f in values and f != "encoder_step"]
+        names = [f for f in (*CLASSIC, "effort_limit", *SERVO_TERMS) if f in values and f != "encoder_step"]
         found: dict[str, tuple[tuple[str, ...], str]] = {}
         axes = Axes(self.bounds, names, values)
         x = axes.of(values)

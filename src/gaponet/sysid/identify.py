@@ -1,5 +1,5 @@
 """Identification: the fit to positions (fit.py), and what competes with it on validation motions: the ramps of servos
-that move their targets themselves (ramps.py), and recorded torque (torque.py)."""
+that move their targets themselves (target_speed.py), and recorded torque (torque.py)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence as ListOf
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.fit import DEFAULT_TERMS, WINDOWS, Identified, Progress, fit_robot
-from gaponet.sysid.ramps import with_ramps
+from gaponet.sysid.target_speed import with_ramps
 from gaponet.sysid.torque import rival
 
 

@@ -20,9 +20,9 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import Corrector, whole_errors
 from gaponet.sysid.axes import MAX_DELAY, SLOW, WIDE_KP, ZERO, Bounds, Values
-from gaponet.sysid.free_runs import WINDOW, FreeRuns, cut
-from gaponet.sysid.joint_runs import SOFT
-from gaponet.sysid.multistart import STEP, Errors, descend
+from gaponet.sysid.joint_rollouts import SOFT
+from gaponet.sysid.least_squares import STEP, Errors, descend
+from gaponet.sysid.robot_rollouts import WINDOW, RobotRollouts, cut
 
 Field = Literal["kp", "damping", "frictionloss", "offset", "delay"]
 FIELDS: tuple[Field, ...] = get_args(Field)
@@ -96,7 +96,7 @@ def refit(
     if len(less):
         kept = float(less.mean()) > np.nan_to_num(standard_error(less))
         parts = [parts[i] for turns in _turns(parts) for turn in turns for i in turn]
-    runs = FreeRuns(parts, robot, corrector=corrector)
+    runs = RobotRollouts(parts, robot, corrector=corrector)
     spare = np.zeros(runs.n) if believed else robot.kd[runs.op]
     problem = _Problem(runs, Bounds(robot, sequences).first, unknown_payload, spare)
     done = 0
@@ -149,7 +149,7 @@ class _Problem:
     simulations for all slopes, however many joints. A payload loads all of them.
     """
 
-    def __init__(self, runs: FreeRuns, first: Values, unknown_payload: bool, spare: Array) -> None:
+    def __init__(self, runs: RobotRollouts, first: Values, unknown_payload: bool, spare: Array) -> None:
         self.runs, self.unknown, self.first, self.n = runs, unknown_payload, first, runs.n
         self.size, kp, one = int(runs.rows.sum()), first["kp"], np.ones(runs.n)
         self.scale = {
@@ -210,7 +210,7 @@ class _Problem:
         return np.concatenate([own, xs[:, 0] @ self.prior.T], axis=1)[:, None]
 
     def slopes(self, x: Array, high: Array, errors: Errors) -> tuple[Array, Array]:
-        """The same as multistart.slopes, for one start."""
+        """The same as least_squares.slopes, for one start."""
         here, count = x[0, 0], len(FIELDS) + self.unknown
         field = np.append(np.tile(np.arange(len(FIELDS)), self.n), [count - 1] * self.unknown).astype(int)
         step = np.where(here + STEP > high[0], -STEP, STEP)

@@ -26,10 +26,10 @@ from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay, whole_errors
 from gaponet.sysid.axes import CLASSIC, MAX_DELAY, Bounds
 from gaponet.sysid.fit import Fit, Identified, Tried
-from gaponet.sysid.free_runs import cut
-from gaponet.sysid.joint_runs import SOFT, JointRuns
-from gaponet.sysid.multistart import descend
+from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sysid.least_squares import descend
 from gaponet.sysid.refit import PRIOR
+from gaponet.sysid.robot_rollouts import cut
 
 WINDOWS = 80  # at most, since they may be short
 EVERY, MOST = 5, 6000  # rows between those that tell where a payload hangs, and how many
@@ -71,7 +71,7 @@ def rival(
     again = bool(said.errors(validation, robot).mean() <= after.mean())
     robot = robot if again else judged
     bounds = Bounds(robot, every)
-    fit = Fit(JointRuns(cut(every, WINDOWS), robot, nthread=nthread), robot, bounds).whole(nthread)
+    fit = Fit(JointRollouts(cut(every, WINDOWS), robot, nthread=nthread), robot, bounds).whole(nthread)
     values = {f: bounds.first[f] for f in CLASSIC}
     std, over_kp = fit.uncertainty(values)
     unknown = fit.undetermined(values, std, over_kp)
@@ -231,7 +231,7 @@ class TorqueFit:
     def fit(self, how: How) -> RobotSpec:
         """The robot with what torque says, and near that with what positions say."""
         start = self.hanging(how[1]) if how[0] else self.robot
-        alone = JointRuns(cut(self.sequences, WINDOWS), start)
+        alone = JointRollouts(cut(self.sequences, WINDOWS), start)
         first = Bounds(start, alone.parts).first
         kp, one = first["kp"], np.ones(len(first["kp"]))
         scale = {

@@ -25,7 +25,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
 from gaponet.robot.folder import MOVE_KEPT
 from gaponet.robot.spec import RobotSpec
-from gaponet.sim.kept import require_kept
+from gaponet.sim.model import require_stored_robot
 from gaponet.sim.replay import pair_dataset, replay
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.recipe import Recipe, Take, load_recipe, takes
@@ -88,7 +88,7 @@ def collect(
     wanted = takes(recipe, library(robot, seed, recipe, files).names(recipe.variants))
     with lock_folder(Path(out), KIND):
         dataset = Dataset.create(out, robot)
-        require_kept(dataset.path, robot, DatasetError, MOVE_KEPT)
+        require_stored_robot(dataset.path, robot, DatasetError, MOVE_KEPT)
         _claim(dataset, robot, fleet, recipe, seed)
         present = {
             _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition) for e in dataset.entries

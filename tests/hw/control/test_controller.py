@@ -26,7 +26,7 @@ from gaponet.hw.control.safety import SafetyConfig
 from gaponet.hw.targets.policy import play
 from gaponet.robot.spec import RobotSpec
 from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.way import Way
+from gaponet.sysid.motion.path_planner import Trajectory
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.virtual_driver import VirtualDriver
 
@@ -519,7 +519,7 @@ def test_a_plan_counts_only_where_the_robot_still_is_where_it_was_found(arm, mov
     driver.connect()
     controller = Controller(driver, arm, config=QUICK, clock=driver.clock)
     found = driver.read().qpos + np.array([0.0, moved])
-    controller.plan = Plan(found, Way.along(np.stack([found, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION)
+    controller.plan = Plan(found, Trajectory.minimum_jerk(np.stack([found, MOTION.ctrl[0]]), 4.0, 50.0, 0.3), MOTION)
     recording = controller.run()
     assert (recording.fault.kind if recording.fault else None) == kind, recording.fault
     if kind:

@@ -21,7 +21,7 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.motion import Motion
-from gaponet.sysid.motion.way import Way, ended, find_points
+from gaponet.sysid.motion.path_planner import Trajectory, find_points, finish_search
 from gaponet.testing.fleet import load_fleet
 from gaponet.testing.virtual_driver import VirtualDriver
 
@@ -60,12 +60,12 @@ def test_a_way_around_is_found_where_there_is_one():
     wall = lambda rows: bool(((np.abs(rows[:, 0]) > 0.2) | (rows[:, 1] > 0.6)).all())  # noqa: E731
     ends = np.array([[-1.0, -0.5, 0.3], [1.0, -0.5, 0.3]])
     low, high = np.array([-1.5, -1.0, 0.3]), np.array([1.5, 1.0, 0.3])
-    points = ended(find_points(wall, *ends, low, high, home=np.zeros(3)))
+    points = finish_search(find_points(wall, *ends, low, high, home=np.zeros(3)))
     np.testing.assert_array_equal(points[[0, -1]], ends)
     assert wall(np.concatenate([np.linspace(a, b, 200) for a, b in itertools.pairwise(points)]))
     assert (points[:, 2] == 0.3).all(), "a joint that may not move does not"
     shut = lambda rows: bool((np.abs(rows[:, 0]) > 0.2).all())  # noqa: E731
-    assert ended(find_points(shut, *ends, low, high, home=np.zeros(3))) is None
+    assert finish_search(find_points(shut, *ends, low, high, home=np.zeros(3))) is None
 
 
 def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
@@ -75,11 +75,11 @@ def test_what_cannot_be_is_refused_with_what_is_in_the_way(so101, planner):
     with pytest.raises(UsageError, match=r"'swing' begins with .* and the plane at 0 m .* into each other"):
         planner.plan(motion(so101, under), FOLDED)
     with pytest.raises(UsageError, match=r"the first target brings .* and the plane at 0 m"):
-        ended(planner.begin(under, FOLDED))
+        finish_search(planner.begin(under, FOLDED))
 
 
 def test_a_way_begins_and_ends_at_rest_and_keeps_its_speed():
-    way = Way.along(np.array([[0.0, 0.0], [1.0, 0.2], [0.4, 0.2]]), 0.5, 50.0, 2.0)
+    way = Trajectory.minimum_jerk(np.array([[0.0, 0.0], [1.0, 0.2], [0.4, 0.2]]), 0.5, 50.0, 2.0)
     rows = way.rows(0.01)
     speed = np.diff(rows, axis=0) / (way.duration / (len(rows) - 1))
     assert np.abs(speed).max() <= 0.5 + 1e-6
@@ -156,7 +156,7 @@ def test_a_plan_is_judged_as_a_whole_whatever_was_found_on_the_way(so101, monkey
     found, far = robot.qpos_home.copy(), robot.qpos_home.copy()
     found[robot.index(robot.operated)], far[robot.index(robot.operated)] = HERE, ACROSS
     with pytest.raises(UsageError, match=r"the plan brings .* cm into each other; 3 cm are kept"):
-        ended(Planner(robot, robot.operated).begin(far, found))
+        finish_search(Planner(robot, robot.operated).begin(far, found))
     hasty = ControlConfig(blend=0.01, blend_speed=1e3), SafetyConfig(acceleration=1e5)
     with pytest.raises(UsageError, match=r"the plan asks \w+ for [\d.]+ of the torque that may be used"):
         Planner(so101, so101.joint_names, *hasty).plan(motion(so101, OVER), so101.qpos_home)
@@ -179,13 +179,15 @@ def test_when_targets_end_it_stands_until_a_clear_way_back_is_found_or_ends_ther
     driver.read, controller.watch.noisy = read, False
     assert judge.along(np.stack([far, found]), 0.02)[0] > 0.1
     legs = [found, robot.qpos_home, far]
-    rows = np.concatenate([Way.along(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)])
+    rows = np.concatenate(
+        [Trajectory.minimum_jerk(np.stack(leg), 2.0, 50.0, 0.3).rows(0.02) for leg in itertools.pairwise(legs)]
+    )
 
     def search(*given):  # each step takes a millisecond, and where there is no way it takes a few to find that out
         for _ in find_points(*given) if way == "by way of home" else range(50):
             controller.clock._now += 0.001
             yield
-        return ended(find_points(*given)) if way == "by way of home" else None
+        return finish_search(find_points(*given)) if way == "by way of home" else None
 
     def policy(k, state):
         if k:

@@ -23,7 +23,7 @@ from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import static_torque
 from gaponet.sysid.motion.feasible import STILL_SHARE, Feasibility, stretch
 from gaponet.sysid.motion.motion import GRID, Motion
-from gaponet.sysid.motion.way import Search, Way, ended, find_points
+from gaponet.sysid.motion.path_planner import Search, Trajectory, find_points, finish_search
 
 _T = TypeVar("_T")
 
@@ -68,9 +68,9 @@ class Plan:
     """
 
     found: Array
-    into: Way
+    into: Trajectory
     motion: Motion | None = None
-    back: Way | None = None
+    back: Trajectory | None = None
     clearance: float = np.inf
     nearest: str = ""
     torque: float = 0.0
@@ -136,9 +136,9 @@ class Planner:
         fitted = self._calm(self.limits.fit(wanted, need=need))
         columns = robot.index(named)
         place = "where the robot is (bring it nearer by hand, or name more joints)"
-        into = ended(self._way(found, fitted.ctrl[0], columns, near, f"to the motion's begin from {place}"))
+        into = finish_search(self._way(found, fitted.ctrl[0], columns, near, f"to the motion's begin from {place}"))
         way = self._way(fitted.ctrl[-1], found, columns, near, f"back to {place}")
-        back = ended(way) if self.config.blend_out else None
+        back = finish_search(way) if self.config.blend_out else None
         return self._judged(Plan(found, into, fitted, back, changed=_changes(wanted, fitted)), near)
 
     def begin(self, first: Array, found: Array) -> Search[Plan]:
@@ -222,7 +222,7 @@ class Planner:
         near = f"{100 * at:.1f} cm from each other" if at > 0 else f"{-100 * at:.1f} cm into each other"
         return f"{self.collision.nearest(free)} {near}; {100 * self.collision.clearance:g} cm are kept"
 
-    def back(self, start: Array, found: Array) -> Search[Way]:
+    def back(self, start: Array, found: Array) -> Search[Trajectory]:
         """The way from where targets ended to where the robot was found, both (n,) rad; looks for it step by step.
 
         Raises:
@@ -231,7 +231,7 @@ class Planner:
         near = np.minimum(self._near(found), self.collision.along(start[None]) - 1e-9)
         return self._way(start, found, self.robot.index(self.commanded), near, "back to where it was found")
 
-    def _way(self, start: Array, goal: Array, columns: Array, near: Array, what: str) -> Search[Way]:
+    def _way(self, start: Array, goal: Array, columns: Array, near: Array, what: str) -> Search[Trajectory]:
         """From a posture (n,) rad to another by moving these joints."""
         low, high = start.copy(), start.copy()
         low[columns], high[columns] = self.limits.low[columns], self.limits.high[columns]
@@ -248,7 +248,7 @@ class Planner:
         if points is None:
             straight = self.collision.along(np.linspace(start, goal, 200))
             raise UsageError(f"no clear way was found {what}: the straight one brings {self._said(straight)}")
-        return Way.along(points, self.config.blend_speed, self.safety.acceleration, self.config.blend)
+        return Trajectory.minimum_jerk(points, self.config.blend_speed, self.safety.acceleration, self.config.blend)
 
     def _judged(self, plan: Plan, near: Array) -> Plan:
         """The plan with what it asks for; whatever was found on the way, this is the last word."""

@@ -15,7 +15,7 @@ from gaponet.hw.control.phases import Phase, Trigger
 from gaponet.hw.control.plan import MOVED, SLOW, Fence, Plan, advance
 from gaponet.hw.targets.policy import NotYet, Policy
 from gaponet.sysid.motion.minjerk import blend
-from gaponet.sysid.motion.way import Search, Way
+from gaponet.sysid.motion.path_planner import Search, Trajectory
 
 GOOD_STATES = 5  # periods in a row without a fault before anything is commanded
 PATIENCE_S = 5.0  # for them
@@ -117,7 +117,7 @@ class TargetGenerator:
         self.way = plan.into if plan else self._straight(self.start, first[context.joints], state)
         live = context.planner and plan and plan.motion is None
         self._fence = Fence(context.planner, state.qpos) if context.planner and live else None
-        self._search: Search[Way] | None = None  # for the way back
+        self._search: Search[Trajectory] | None = None  # for the way back
         self._way_since = 0  # period of blend_out in which the way back began
         self.weight = self._handed = self._progress = 0.0  # weights; s on the way to the first target
         self._obstacle, self._released, self._checked_payload = "", "handed over", False
@@ -227,10 +227,10 @@ class TargetGenerator:
         self._obstacle = fence.near or self._obstacle
         return self._last
 
-    def _straight(self, start: Array, goal: Array, state: State) -> Way:
+    def _straight(self, start: Array, goal: Array, state: State) -> Trajectory:
         config, joints = self.context.config, self.context.joints
         points = np.stack([state.qpos_with(joints, start), state.qpos_with(joints, goal)])
-        return Way.along(points, config.blend_speed, np.inf, config.blend)
+        return Trajectory.minimum_jerk(points, config.blend_speed, np.inf, config.blend)
 
     def _along(self, passed: float, start: Array, goal: Array) -> Array:
         """Return where the way leads after some s, with its ends moved to where they truly are."""

@@ -20,7 +20,7 @@ from gaponet.nn.training.config import RewardConfig
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import idle_limbs
-from gaponet.sysid.free_runs import IMMOVABLE
+from gaponet.sysid.robot_rollouts import IMMOVABLE
 
 ROWS = ("row", "first", "last", "elapsed")  # of each environment
 AHEAD = (1, 2, 5, 10, 20)  # rows of the recording that the critic looks ahead

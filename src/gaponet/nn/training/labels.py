@@ -19,7 +19,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import replay
-from gaponet.sysid.touching import tip_heights
+from gaponet.sysid.table_contact import tip_heights
 
 ITERATIONS, GAIN = 3, 0.8
 LEAD, SMOOTH, NEAR = 0.12, 0.06, 0.01  # s: how much later a correction shows, σ of the filter; m: a tip is at the table

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gaponet.report.figures.style import figure, joint_label, styled
-from gaponet.sysid.knowledge import Knowledge
-from gaponet.sysid.table import SHOWN, certainty
+from gaponet.sysid.uncertainty import ParameterUncertainty
+from gaponet.sysid.uncertainty_table import FIELD_UNITS, summarize
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 @styled
-def picture(known: Knowledge, title: str) -> Figure:
+def picture(known: ParameterUncertainty, title: str) -> Figure:
     """A panel for each field: every joint's value with the range that holds 9 of 10 times."""
-    fields = [f for f in known.fields if any(certainty(known, j).values[f] for j in known.joints)]
+    fields = [f for f in known.fields if any(summarize(known, j).values[f] for j in known.joints)]
     joints, columns = list(known.joints), min(4, len(fields))
     lines = -(-len(fields) // columns)
     fig = figure(2.4 * columns + 1.0, (0.24 * len(joints) + 0.8) * lines + 0.4)
@@ -27,8 +27,8 @@ def picture(known: Knowledge, title: str) -> Figure:
         if place >= len(fields):
             ax.set_visible(False)
             continue
-        heading, factor = SHOWN[fields[place]]
-        known_of = [certainty(known, j) for j in joints]
+        heading, factor = FIELD_UNITS[fields[place]]
+        known_of = [summarize(known, j) for j in joints]
         at = np.array([c.values[fields[place]] * factor for c in known_of])
         wide = np.array([1.645 * c.errors[fields[place]] * factor for c in known_of])
         span = max(float(np.ptp(at)), float(np.abs(at).max()) * 0.1, 1e-9)

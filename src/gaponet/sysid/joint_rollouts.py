@@ -3,7 +3,7 @@
 A servo's parameters act on its own joint first; what they do to the others is a few milliradians of their path. So
 inertia, gravity and the pull of the others are taken from the recording once, and a joint is one equation, stepped as
 MuJoCo steps it (implicit damping, friction that stops within a step): a hundredth of the time of a simulator of the
-whole robot, and its error by joint to a few per cent (tests/sysid/test_joint_runs.py).
+whole robot, and its error by joint to a few per cent (tests/sysid/test_joint_rollouts.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.optimize import nnls
 
 from gaponet.data.sequence import Sequence
 from gaponet.data.signals import differentiate, lowpass
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim import servo
 from gaponet.sim.batch import ramped
 from gaponet.sim.model import build_model
@@ -39,13 +39,22 @@ SOFT = 0.01  # rad: errors beyond count linearly, so that one blocked joint does
 THIN = 0.01  # s between rows that are compared
 MOST, SLIPS, LATEST = 20_000, 0.02, 0.1  # of a regression: rows, rad/s at which friction is whole, s of delay
 BEYOND = 7.0  # rad: the stops of a joint without any
-KERNEL = ("kp", "damping", "frictionloss", "armature", "offset", "delay", "effort_limit", *LAW)  # order of its values
+KERNEL = (
+    "kp",
+    "damping",
+    "frictionloss",
+    "armature",
+    "offset",
+    "delay",
+    "effort_limit",
+    *SERVO_TERMS,
+)  # order of its values
 SETTLE = 0.1  # s: velocities at a window's start are measured ones
 CUTOFF = 10.0  # Hz, of the other joints' accelerations: above the arms' bandwidth
 TURN = 0.02  # rad: for the derivative of gravity's torque
 
 
-class JointRuns:
+class JointRollouts:
     """Windows of recordings, n operated joints; rows in which the robot may touch something are passed over."""
 
     def __init__(self, parts: list[Sequence], robot: RobotSpec, below: float = -np.inf, nthread: int = 0) -> None:
@@ -125,7 +134,7 @@ class JointRuns:
         """Rows that count, of each joint, (n,)."""
         return np.asarray((self.counted & self.recorded[..., None]).sum(axis=(1, 2)))
 
-    def shortened(self, seconds: float) -> JointRuns:
+    def shortened(self, seconds: float) -> JointRollouts:
         """The same windows, put back on the recording every so many seconds: a smoother surface to descend on."""
         short = copy.copy(self)
         short.touch = self.touch.copy()
@@ -171,7 +180,7 @@ class JointRuns:
 
         Args:
             values: kp at the robot's own gains, damping, frictionloss, armature, offset, delay, and any of
-                effort_limit and LAW. A damping below zero takes from the servo's own kd.
+                effort_limit and SERVO_TERMS. A damping below zero takes from the servo's own kd.
         """
         out = _compiled(self, values) if advance is not None else self._arrays(values)
         return np.asarray(out * (self.counted & self.recorded[..., None]))
@@ -182,7 +191,7 @@ class JointRuns:
         k = len(values["kp"])
         shape = (k, *self.qpos.shape[:2])
         v = {name: _filled(x[:, :, None], shape) for name, x in values.items()}
-        law = present({name: v[name] for name in LAW if name in v})
+        law = present({name: v[name] for name in SERVO_TERMS if name in v})
         kp, kd = v["kp"] * _filled(self.stiffer.T, shape), _filled(self.kd.T, shape)
         kd = np.maximum(kd + np.minimum(v["damping"], 0), 0)
         own, mass, offset, dry = np.maximum(v["damping"], 0), v["armature"], v["offset"], v["frictionloss"]
@@ -272,12 +281,12 @@ class _Along:
         return self.data.qfrc_bias.copy()
 
 
-def _compiled(runs: JointRuns, values: dict[str, Array]) -> Array:
+def _compiled(runs: JointRollouts, values: dict[str, Array]) -> Array:
     """The runs of candidates, shared by threads."""
     k, (n, windows) = len(values["kp"]), runs.qpos.shape[:2]
     own = {"effort_limit": runs.robot.effort_limit[runs.op]}
     packed = np.stack([np.broadcast_to(values.get(f, own.get(f, 0.0)), (k, n)) for f in KERNEL], axis=-1)
-    law = any(values[f].any() for f in LAW if f in values)
+    law = any(values[f].any() for f in SERVO_TERMS if f in values)
     out = np.zeros((k, n * windows, runs.counted.shape[1]), np.float32)
     cuts = np.linspace(0, n * windows, runs.nthread + 1).astype(int)
     rest = (packed, law, runs.tables, runs.ctrl, runs.qpos, runs.qvel, runs.touch, runs.lengths, runs.stiffer, runs.kd,

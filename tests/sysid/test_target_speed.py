@@ -9,8 +9,8 @@ from arm import commands, write_arm
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
-from gaponet.sysid.joint_runs import JointRuns
-from gaponet.sysid.ramps import target_speeds
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.target_speed import target_speeds
 
 
 def recorded(robot, count=6, still=()):
@@ -60,7 +60,7 @@ def test_identification_finds_a_ramp_and_says_so(tmp_path, servos):
 def test_joints_on_their_own_run_along_ramps_as_the_whole_robot_does(tmp_path, servos):
     servos["shoulder"]["target_speed"] = 0.6
     robot = write_arm(tmp_path).with_servos(servos)
-    runs = JointRuns(recorded(robot), robot, nthread=1)
+    runs = JointRollouts(recorded(robot), robot, nthread=1)
     values = {f: np.array([[s[f] for s in servos.values()]]) for f in ("kp", "delay", "damping", "armature")}
     errors = runs.errors(values | {"offset": np.zeros((1, 2)), "frictionloss": np.full((1, 2), 0.05)})
     assert np.abs(errors).mean() < 1e-3

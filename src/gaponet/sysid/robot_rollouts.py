@@ -11,7 +11,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import LAW, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.replay import Corrector, idle_limbs, rollout
 
@@ -22,7 +22,7 @@ SETTLE = 0.1  # s: velocities at a window's start are measured ones
 IMMOVABLE = 1e6  # kg·m²: the armature of a joint that stands
 FAR = np.pi  # rad: an error beyond, of a simulation that flew away, counts as this
 
-NO_LAW = {name: np.array(0.0) for name in LAW}
+NO_LAW = {name: np.array(0.0) for name in SERVO_TERMS}
 
 
 def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
@@ -37,7 +37,7 @@ def cut(sequences: ListOf[Sequence], count: int) -> list[Sequence]:
     return [parts[i * len(parts) // min(count, len(parts))] for i in range(min(count, len(parts)))]
 
 
-class FreeRuns:
+class RobotRollouts:
     """Windows of recordings, n operated joints of a robot; rows in which something may be touched are passed over.
 
     Attributes:
@@ -94,10 +94,10 @@ class FreeRuns:
         late = np.array(self.robot.delay)
         late[self.op] = max(float(values["delay"].max()), self.robot.dt / self.robot.decimation)
         parts = self.parts * k if parts is None else parts
-        law = any(values[f].any() for f in LAW if f in values)
+        law = any(values[f].any() for f in SERVO_TERMS if f in values)
         known: dict[str, Any] = {} if law else NO_LAW
         acting = replace(self.robot, delay=late, **known)
-        sim = BatchSim(acting, [Condition.of(s, self.robot) for s in parts], self.nthread, self.locked, law=law)
+        sim = BatchSim(acting, [Condition.of(s, self.robot) for s in parts], self.nthread, self.locked, servo_model=law)
         sim.set_servos(self.robot.operated, {f: np.repeat(x, m, axis=0) for f, x in values.items()})
         for w, i in self.standing:  # n joints of a robot that is not locked have as many degrees of freedom
             sim.batch.expand("dof_armature")[w::m, i] = IMMOVABLE

@@ -8,8 +8,8 @@ from arm import TOML, recordings, write_arm
 
 from gaponet.base.errors import RobotError
 from gaponet.sysid.identify import identify
-from gaponet.sysid.joint_runs import JointRuns
-from gaponet.sysid.shared import far_from_published, same_servos, share
+from gaponet.sysid.joint_rollouts import JointRollouts
+from gaponet.sysid.shared_servo import far_from_published, same_servos, share
 
 SERVO = '[[servo]]\nname = "S1"\nsource = "a bench"\narmature = 0.02\ndamping = 0.5\n'
 TWO = (
@@ -25,7 +25,7 @@ def test_two_equal_servos_are_given_the_law_that_they_have(tmp_path):
     assert same_servos(robot) == {"S1": [0, 1]}
     true = {"kp": 15.0, "damping": 0.6, "frictionloss": 0.1, "armature": 0.02, "offset": 0.0, "delay": 0.0}
     acting = robot.with_servos({"shoulder": true | {"offset": 0.02}, "elbow": true | {"offset": -0.01}})
-    runs = JointRuns(recordings(acting, 2, rows=80), robot)
+    runs = JointRollouts(recordings(acting, 2, rows=80), robot)
     start = {f: np.array([0.7, 1.3]) * v for f, v in true.items()}  # what each joint's own fit may end at
     before = np.abs(runs.errors({f: v[None] for f, v in start.items()})).mean()
     found = share(runs, start, [0, 1], 0.02, lambda error: None)

@@ -10,12 +10,12 @@ from arm import TOML, XML, commands, record, write_arm
 from gaponet.cli.main import main
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
-from gaponet.sysid.evidence import known
-from gaponet.sysid.knowledge import Knowledge
+from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.motion.experiment_design import ExperimentDesign, candidates, expected, open_gains
 from gaponet.sysid.motion.feasible import Feasibility
 from gaponet.sysid.motion.files import read_motion
 from gaponet.sysid.motion.library import Library
-from gaponet.sysid.motion.telling import Telling, candidates, expected, open_gains
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 HELD = 0.3  # kg
 
@@ -27,7 +27,7 @@ def identified(place, xml=XML):
     rng = np.random.default_rng(0)
     logs = [replace(s, qpos=s.qpos + 4e-4 * rng.standard_normal(s.qpos.shape).astype(np.float32)) for s in logs]
     save_robot(robot.with_servos({j: {"kp": 16.0, "delay": 0.02} for j in robot.operated}), place / "known")
-    known(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
+    estimate_uncertainty(load_robot(place / "known"), logs, [], nthread=1).save(place / "known")
     return load_robot(place / "known")
 
 
@@ -43,7 +43,7 @@ def pool(robot):
 
 @pytest.fixture(scope="module")
 def told(robot, pool):
-    return Telling.of(robot, Knowledge.load(robot), expected(robot, pool, 0.0, 1), 1)
+    return ExperimentDesign.from_recordings(robot, ParameterUncertainty.load(robot), expected(robot, pool, 0.0, 1), 1)
 
 
 def errors(covariance):
@@ -57,10 +57,10 @@ def test_every_candidate_is_within_the_limits(robot, pool):
 
 def test_what_is_expected_of_a_recording_is_what_it_tells(robot, pool, told):
     """Played on another arm than the identified one."""
-    mine = Knowledge.load(robot)
+    mine = ParameterUncertainty.load(robot)
     nominal = load_robot(robot.folder.parent / "arm")
     played = [record(nominal, m.sample(nominal.dt), f"n{k}", kp=0.84, delay=1) for k, m in enumerate(pool[:4])]
-    there = Telling.of(robot, mine, played, 1)
+    there = ExperimentDesign.from_recordings(robot, mine, played, 1)
     np.testing.assert_allclose(errors(told.after(range(4))), errors(there.after(range(4))), rtol=0.5)
 
 
@@ -92,11 +92,11 @@ def test_a_robot_that_is_known_well_has_little_more_worth_playing(told):
 
 def test_where_gravity_turns_nothing_a_known_payload_is_asked_for(tmp_path, robot, pool, told):
     """Its joints turn about upright axes, and no log has shown what moves: friction over kp is seen, kp is not."""
-    assert open_gains(robot, Knowledge.load(robot), told, pool, (0.0,)) == {}
+    assert open_gains(robot, ParameterUncertainty.load(robot), told, pool, (0.0,)) == {}
     free = identified(tmp_path, XML.replace('axis="0 1 0"', 'axis="0 0 1"'))
-    mine = Knowledge.load(free)
+    mine = ParameterUncertainty.load(free)
     motions = [m for m in candidates(Library(free, 3, HELD)) if m.name.startswith("creep")]
-    slow = Telling.of(free, mine, expected(free, motions, 0.0, 1), 1)
+    slow = ExperimentDesign.from_recordings(free, mine, expected(free, motions, 0.0, 1), 1)
     unsure = replace(slow, covariance=slow.covariance + 0.25 * np.eye(len(mine.fields))[0][:, None] * np.eye(6)[0])
     said = open_gains(free, mine, unsure, motions, (0.0,))
     assert set(said) == {"shoulder", "elbow"}

@@ -1,10 +1,10 @@
-"""Which motions would tell most of a robot that is known in part, before anything is played.
+"""Choice of the motions whose recordings would reduce a robot's parameter uncertainty most.
 
-Every candidate is played in the identified simulator. How far each number of a servo moves that path is what a
-recording of it would tell; that errors of the model last is taken from how recordings of this robot scattered
-(known.json). Chosen are those after which the standard errors are smallest: the sum of their logarithms, each number by
-itself, since numbers that are only known together are what more motion should tell apart (a greedy design with
-exchanges; Pukelsheim, Optimal Design of Experiments, 2006).
+Every candidate is played in the identified simulator. The derivative of its path by a servo parameter is the
+information that a recording of it would hold. The overdispersion of this robot's recordings (uncertainty.json) accounts
+for model errors that last. The chosen motions minimise the sum of the logarithms of the standard errors, each parameter
+by itself, since parameters that are only known together are to be separated. It is a greedy design with exchanges
+(Pukelsheim, Optimal Design of Experiments, 2006).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from gaponet.sim.dynamics import static_torque
 from gaponet.sim.model import build_model
 from gaponet.sim.replay import replay
 from gaponet.sysid.evidence import evidence
-from gaponet.sysid.knowledge import Knowledge
 from gaponet.sysid.motion.excite import SIGNALS
 from gaponet.sysid.motion.feasible import TORQUE_SHARE
 from gaponet.sysid.motion.library import Library, short
 from gaponet.sysid.motion.motion import GRID, Motion
 from gaponet.sysid.motion.whole_body import ANY
+from gaponet.sysid.uncertainty import ParameterUncertainty
 
 ALL_AT_ONCE, VARIANTS = 24, 4  # candidates in which every joint plays a signal of its own; tours and the like
 ALONE = 8  # joints: of a robot with more, none is moved by itself
@@ -41,8 +41,8 @@ NONE = 1e-9
 
 
 @dataclass(frozen=True)
-class Telling:
-    """What R recordings would tell of n joints' P numbers, on the axes of sysid/knowledge.py.
+class ExperimentDesign:
+    """What R recordings would tell of n joints' P numbers, on the axes of sysid/uncertainty.py.
 
     Attributes:
         normals: Slopes of the path over the numbers, squared, (n, R, P, P).
@@ -57,11 +57,13 @@ class Telling:
     scatter: Array
 
     @classmethod
-    def of(cls, robot: RobotSpec, known: Knowledge, played: ListOf[Sequence], nthread: int = 0) -> Telling:
+    def from_recordings(
+        cls, robot: RobotSpec, known: ParameterUncertainty, played: ListOf[Sequence], nthread: int = 0
+    ) -> ExperimentDesign:
         """What recordings would tell that the identified robot would make; their names differ."""
         says = evidence(robot, played, known.fields, 10**6, nthread).by_recording()
         kept = lambda what: np.stack([known.array(j, what) for j in robot.operated])  # noqa: E731
-        scatter = np.maximum(kept("scatter")[:, :-1], 1.0)
+        scatter = np.maximum(kept("overdispersion")[:, :-1], 1.0)
         return cls(says.normals[..., :-1, :-1], np.array([s.duration for s in played]), kept("covariance"), scatter)
 
     def after(self, picks: ListOf[int]) -> Array:
@@ -170,12 +172,16 @@ def expected(robot: RobotSpec, motions: ListOf[Motion], payload: float, nthread:
 
 
 def open_gains(
-    robot: RobotSpec, known: Knowledge, told: Telling, motions: ListOf[Motion], payloads: ListOf[float]
+    robot: RobotSpec,
+    known: ParameterUncertainty,
+    told: ExperimentDesign,
+    motions: ListOf[Motion],
+    payloads: ListOf[float],
 ) -> dict[str, str]:
     """Joints whose kp none of these motions tells, with what would."""
     kp = known.fields.index("kp")
 
-    def errors(of: Telling) -> dict[str, float]:
+    def errors(of: ExperimentDesign) -> dict[str, float]:
         whole = of.after(range(len(of.seconds)))
         return dict(zip(known.joints, np.sqrt(whole[:, kp, kp]).tolist(), strict=True))
 
@@ -183,7 +189,7 @@ def open_gains(
     mass = _held(robot, motions) if left and max(payloads) == 0 else None
     tried = {}
     if mass is not None:
-        with_it = Telling.of(robot, known, expected(robot, motions, mass))
+        with_it = ExperimentDesign.from_recordings(robot, known, expected(robot, motions, mass))
         tried = errors(replace(told, normals=np.concatenate([told.normals, with_it.normals], axis=1)))
     return {j: _advice(e, tried.get(j), mass, bool(robot.payload_mounts), max(payloads)) for j, e in left.items()}
 

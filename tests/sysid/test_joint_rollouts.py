@@ -8,12 +8,12 @@ from arm import TOML, commands, recordings, write_arm
 
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.report.verdict import verdict
-from gaponet.robot.spec import LAW, load_robot
+from gaponet.robot.spec import SERVO_TERMS, load_robot
 from gaponet.sim.metrics import runs, summary
 from gaponet.sim.replay import replay
-from gaponet.sysid import joint_runs
+from gaponet.sysid import joint_rollouts
 from gaponet.sysid.identify import identify
-from gaponet.sysid.joint_runs import JointRuns
+from gaponet.sysid.joint_rollouts import JointRollouts
 
 FIRST = {"kp": 20.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.0}
 
@@ -36,20 +36,20 @@ def test_a_joint_on_its_own_moves_as_the_whole_robot(tmp_path, changed):
     acting = robot.with_servos(dict.fromkeys(robot.joint_names, servos))
     real = recordings(robot, 1, rows=200, kp=0.7)
     whole = [t.qpos for t in replay(real, acting)]
-    runs = JointRuns(real, robot)
+    runs = JointRollouts(real, robot)
     values = {f: np.full((1, 2), float(v)) for f, v in servos.items()}
     alone = runs.errors(values)[0, :, 0].T
     company = np.where(runs.counted[0][:, None], whole[0] - real[0].qpos, 0.0)
     assert np.abs(company).mean() > 0.005  # it is not the robot that was recorded
     assert np.abs(alone - company).mean() < 0.1 * np.abs(company).mean()
-    assert set(changed) <= {*FIRST, *LAW}
-    if joint_runs.advance is not None:
+    assert set(changed) <= {*FIRST, *SERVO_TERMS}
+    if joint_rollouts.advance is not None:
         np.testing.assert_allclose(runs._arrays(values)[0, :, 0].T * runs.counted[0][:, None], alone, atol=2e-4)
 
 
 def test_candidates_side_by_side_are_those_one_by_one(tmp_path):
     robot = write_arm(tmp_path)
-    runs = JointRuns(recordings(robot, 2, rows=60, kp=0.7), robot)
+    runs = JointRollouts(recordings(robot, 2, rows=60, kp=0.7), robot)
     law = {"stribeck": 0.1, "stribeck_speed": 0.05, "friction_motor": 0.2, "min_torque": 0.1}
     values = {f: v * np.linspace(0.5, 1.5, 6).reshape(3, 2) for f, v in (FIRST | {"delay": 0.013} | law).items()}
     alone = [runs.errors({f: v[i : i + 1] for f, v in values.items()})[0] for i in range(3)]
@@ -65,9 +65,9 @@ def test_recordings_at_several_gains_have_one_servo(tmp_path):
         made = recordings(set_to.with_servos(motor), 1, rows=200)[0]
         told.append(replace(made, meta=replace(made.meta, kp=(kp, kp), kd=(0.0, 0.0))))
     values = {f: np.full((1, 2), v) for f, v in (FIRST | {"kp": 0.8 * 20.0}).items()}
-    assert np.abs(JointRuns(told, robot).errors(values)).mean() < 1e-3
+    assert np.abs(JointRollouts(told, robot).errors(values)).mean() < 1e-3
     untold = [replace(s, meta=replace(s.meta, kp=None)) for s in told]
-    assert np.abs(JointRuns(untold, robot).errors(values)).mean() > 5e-3
+    assert np.abs(JointRollouts(untold, robot).errors(values)).mean() > 5e-3
 
 
 def test_what_was_not_recorded_stands_still_and_counts_nowhere(tmp_path):
@@ -99,7 +99,7 @@ def test_no_joint_flies_away_where_gravity_is_stiffer_than_its_servo():
     qpos = np.tile(np.float32(robot.qpos_home), (200, 1))
     qpos[:, robot.index(["waist_roll_joint", "waist_pitch_joint"])] = 0.3
     meta = SequenceMeta("g1_29", "unit", "bent", 0.0)
-    runs = JointRuns([Sequence(meta, robot.joint_names, 0.02, qpos, qpos, 0 * qpos)], robot)
+    runs = JointRollouts([Sequence(meta, robot.joint_names, 0.02, qpos, qpos, 0 * qpos)], robot)
     candidates = (3, len(robot.operated))
     values = {f: np.zeros(candidates) for f in FIRST} | {
         "kp": np.repeat([[40.0], [10.0], [0.1]], candidates[1], axis=1)
@@ -121,7 +121,7 @@ def test_windows_at_several_rates_each_run_at_their_own(tmp_path):
         asked = Sequence(template.meta, robot.joint_names, dt, ctrl, np.tile(ctrl[0], (rows, 1)), 0 * ctrl)
         (twin,) = replay([asked], acting)
         parts.append(replace(asked, qpos=twin.qpos, qvel=twin.qvel))
-    runs = JointRuns(parts, robot)
+    runs = JointRollouts(parts, robot)
     values = {f: np.array([getattr(acting, f)]) for f in FIRST}
     first = np.abs(runs.errors({f: np.full((1, 2), v) for f, v in FIRST.items()})).mean(axis=(0, 1, 3))
     assert (np.abs(runs.errors(values)).mean(axis=(0, 1, 3)) < 0.1 * first).all()

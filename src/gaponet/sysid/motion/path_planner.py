@@ -25,7 +25,7 @@ ROWS = 16  # postures that are looked at in one step of a search
 
 
 @dataclass(frozen=True)
-class Way:
+class Trajectory:
     """Minimum-jerk moves from point to point, at rest at each.
 
     Attributes:
@@ -37,7 +37,7 @@ class Way:
     times: Array
 
     @classmethod
-    def along(cls, points: Array, speed: float, acceleration: float, least: float) -> Way:
+    def minimum_jerk(cls, points: Array, speed: float, acceleration: float, least: float) -> Trajectory:
         """The way as fast as peaks of speed (rad/s) and acceleration (rad/s²) allow, in at least `least` s."""
         far = np.abs(np.diff(points, axis=0)).max(axis=1)
         legs = move_time(far, speed, least if len(points) == 2 else LEG)
@@ -67,7 +67,7 @@ def line(a: Array, b: Array) -> Array:
     return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / FINE)) + 1))
 
 
-def ended(search: Search[_T]) -> _T:
+def finish_search(search: Search[_T]) -> _T:
     """What a search finds, whatever time it takes."""
     while True:
         try:

@@ -15,8 +15,8 @@ from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot
 from gaponet.sim.replay import replay
 from gaponet.sysid.drift import drift
-from gaponet.sysid.evidence import known
-from gaponet.sysid.knowledge import Knowledge, values_of
+from gaponet.sysid.evidence import estimate_uncertainty
+from gaponet.sysid.uncertainty import OLD_KEYS, ParameterUncertainty, from_axes
 
 TRUE = {"kp": 16.0, "damping": 0.5, "frictionloss": 0.05, "armature": 0.02, "offset": 0.0, "delay": 0.02}
 
@@ -42,7 +42,7 @@ def folder(arm, tmp_path_factory):
     right = arm.with_servos(dict.fromkeys(arm.joint_names, TRUE))
     place = tmp_path_factory.mktemp("know") / "right"
     save_robot(right, place)
-    known(load_robot(place), played(arm), played(arm, 20, 3), nthread=1).save(place)
+    estimate_uncertainty(load_robot(place), played(arm), played(arm, 20, 3), nthread=1).save(place)
     return place
 
 
@@ -63,7 +63,7 @@ def checked(capsys, *words):
 
 
 def test_a_folder_says_how_sure_it_is_and_from_which_logs(arm, folder):
-    mine = Knowledge.load(load_robot(folder))
+    mine = ParameterUncertainty.load(load_robot(folder))
     (source,) = mine.sources
     assert source["logs"].keys() == {f"m{seed}" for seed in range(6)}
     assert source["seconds"] == pytest.approx(48.0)
@@ -73,60 +73,64 @@ def test_a_folder_says_how_sure_it_is_and_from_which_logs(arm, folder):
         drawn = np.random.default_rng(0).multivariate_normal(
             mine.array(joint, "values"), mine.array(joint, "covariance"), 20_000
         )
-        spread = np.std([values_of(mine.fields, drawn)[f] for f in mine.fields], axis=1)
+        spread = np.std([from_axes(mine.fields, drawn)[f] for f in mine.fields], axis=1)
         np.testing.assert_allclose(spread, np.sqrt(np.diag(covariance)), rtol=0.1)
-        assert mine.joints[joint].left < 2e-3
+        assert mine.joints[joint].residual_rms < 2e-3
 
 
 def test_what_logs_do_not_show_is_as_sure_as_before_them(arm):
     """A joint that nothing loads and that hardly moves shows no gain: kp is believed to a factor, not to the moon."""
     still = [replace(s, ctrl=s.ctrl * [0.02, 1], qpos=s.qpos * [0.02, 1]) for s in played(arm, 0, 3)]
-    mine = known(arm, still, [], nthread=1)
+    mine = estimate_uncertainty(arm, still, [], nthread=1)
     assert np.sqrt(np.diag(mine.array("shoulder", "covariance"))[0]) <= 0.5
 
 
 def test_what_is_left_of_a_joint_is_of_recordings_that_hold_it_and_of_the_robot_that_they_judged(arm, folder):
     robot, judges = load_robot(folder), played(arm, 20, 2)
     alone = [replace(s, meta=replace(s.meta, notes={"held_at_home": ["elbow"]})) for s in judges]
-    both, one, none = (known(robot, judges, some, nthread=1).joints for some in (judges, [judges[0], alone[1]], alone))
-    assert one["elbow"].left == pytest.approx(known(robot, judges, judges[:1], nthread=1).joints["elbow"].left, rel=0.2)
-    assert one["elbow"].left > 0.5 * both["elbow"].left  # rows that do not hold it are no zeros
-    assert none["elbow"].band == none["shoulder"].band > 0.0
+    both, one, none = (
+        estimate_uncertainty(robot, judges, some, nthread=1).joints for some in (judges, [judges[0], alone[1]], alone)
+    )
+    assert one["elbow"].residual_rms == pytest.approx(
+        estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_rms, rel=0.2
+    )
+    assert one["elbow"].residual_rms > 0.5 * both["elbow"].residual_rms  # rows that do not hold it are no zeros
+    assert none["elbow"].residual_p90 == none["shoulder"].residual_p90 > 0.0
     off = robot.with_servos({"elbow": {"offset": 0.05}})
-    judged = known(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
-    assert judged.left > 10 * both["elbow"].left
+    judged = estimate_uncertainty(robot, judges, judges, judged=off, nthread=1).joints["elbow"]
+    assert judged.residual_rms > 10 * both["elbow"].residual_rms
     assert judged.values == both["elbow"].values
 
 
 def test_a_band_is_wider_where_few_motions_differ_much(arm, folder):
     robot, judges = load_robot(folder), played(arm, 20, 4)
-    alike = known(robot, judges, judges, nthread=1).joints["elbow"]
+    alike = estimate_uncertainty(robot, judges, judges, nthread=1).joints["elbow"]
     apart = [replace(s, qpos=s.qpos + np.float32(0.05 * (i == 0))) for i, s in enumerate(judges)]
     twins = replay(apart, robot, nthread=1, lock_idle=True)
     pooled = np.concatenate([np.abs(t.qpos - s.qpos)[1:] for s, t in zip(apart, twins, strict=True)])
-    wide = known(robot, judges, apart, nthread=1).joints["elbow"].band
-    assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.band
-    one = known(robot, judges, judges[:1], nthread=1).joints["elbow"].band
+    wide = estimate_uncertainty(robot, judges, apart, nthread=1).joints["elbow"].residual_p90
+    assert wide > 1.5 * np.quantile(pooled[:, robot.index(["elbow"])], 0.9) > alike.residual_p90
+    one = estimate_uncertainty(robot, judges, judges[:1], nthread=1).joints["elbow"].residual_p90
     assert np.isfinite(one)
 
 
 def test_more_seconds_make_it_surer_and_are_told(arm, folder):
     robot = load_robot(folder)
-    mine = Knowledge.load(robot)
-    more = known(robot, played(arm, 40, 4), [], before=mine, nthread=1)
+    mine = ParameterUncertainty.load(robot)
+    more = estimate_uncertainty(robot, played(arm, 40, 4), [], before=mine, nthread=1)
     assert len(more.sources) == 2
     for joint in arm.operated:
         before, after = (np.diag(k.array(joint, "covariance")) for k in (mine, more))
         assert (after < before).all()
 
 
-def test_what_a_adaptation_moves_is_unsure_of_the_old_value(arm, folder):
+def test_what_an_adaptation_moves_is_unsure_of_the_old_value(arm, folder):
     robot = load_robot(folder)
-    mine, found = Knowledge.load(robot), []
+    mine, found = ParameterUncertainty.load(robot), []
     for by in (0.0, -0.05):
         there = robot.with_servos({"elbow": {"offset": by}})
         seen = [replace(s, qpos=s.qpos + np.array([0.0, by])) for s in played(arm, 40, 2)]
-        found.append(known(there, seen, [], before=mine, nthread=1).array("elbow", "covariance"))
+        found.append(estimate_uncertainty(there, seen, [], before=mine, nthread=1).array("elbow", "covariance"))
     same, moved = (np.diag(covariance)[mine.fields.index("offset")] for covariance in found)
     assert moved > 1.1 * same
 
@@ -135,19 +139,30 @@ def test_a_folder_that_was_edited_is_not_believed(folder, tmp_path):
     robot = load_robot(folder)
     save_robot(robot.with_servos({"elbow": {"kp": 30.0}}), tmp_path / "edited")
     with pytest.raises(RobotError, match=r"other values than robot\.toml's, at elbow; identify or adapt again"):
-        Knowledge.load(load_robot(tmp_path / "edited"))
+        ParameterUncertainty.load(load_robot(tmp_path / "edited"))
+
+
+def test_a_folder_of_an_older_version_loads(folder, tmp_path):
+    save_robot(load_robot(folder), tmp_path / "old")
+    new = tmp_path / "old" / "uncertainty.json"
+    text = new.read_text()
+    for old, key in OLD_KEYS.items():
+        text = text.replace(f'"{key}"', f'"{old}"')
+    (tmp_path / "old" / "known.json").write_text(text)
+    new.unlink()
+    assert ParameterUncertainty.load(load_robot(tmp_path / "old")) == ParameterUncertainty.load(load_robot(folder))
 
 
 def test_a_folder_without_it_loads_and_show_says_what_to_do(arm, capsys):
-    assert Knowledge.load(arm) is None
+    assert ParameterUncertainty.load(arm) is None
     assert main(["show", str(arm.folder)]) == 2
     assert "keeps only values" in capsys.readouterr().err
 
 
-def test_a_adaptation_keeps_what_it_learned(arm, folder, tmp_path):
+def test_an_adaptation_keeps_what_it_learned(arm, folder, tmp_path):
     data = dataset(arm, tmp_path / "data", played(arm, 60, 3, kp=0.7))
     api.adapt_robot(load_robot(folder), data, tmp_path / "today", seconds=24.0)
-    mine = Knowledge.load(load_robot(tmp_path / "today"))
+    mine = ParameterUncertainty.load(load_robot(tmp_path / "today"))
     assert [s["made_by"] for s in mine.sources] == ["identify", "adapt"]
     assert mine.sources[1]["logs"].keys() == {"m60", "m61", "m62"}
 
@@ -210,7 +225,7 @@ def test_another_arm_that_no_number_explains_is_not_the_same(arm, folder, monkey
     """Its links are twice as heavy; even where no change of a number counts it is not called the same."""
     xml = XML.replace('mass="0.3"', 'mass="0.6"').replace('mass="0.2"', 'mass="0.4"')
     heavy, robot = write_arm(tmp_path / "heavy", TOML, xml), load_robot(folder)
-    mine = Knowledge.load(robot)
+    mine = ParameterUncertainty.load(robot)
     fresh = drift(robot, mine, played(arm, 70, 6), 1)
     assert (fresh.verdict, fresh.far) == ("same", {})
     monkeypatch.setattr("gaponet.sysid.drift.FELT", 1e9)

@@ -20,8 +20,8 @@ from gaponet.sim.dynamics import tips_of
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import idle_limbs, rollout, whole_errors
 from gaponet.sim.table import write_table
-from gaponet.sysid.joint_runs import SETTLE, SOFT
-from gaponet.sysid.multistart import soft
+from gaponet.sysid.joint_rollouts import SETTLE, SOFT
+from gaponet.sysid.least_squares import soft
 
 Array = np.ndarray
 

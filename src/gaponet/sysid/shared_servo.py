@@ -12,8 +12,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.robot.spec import RobotSpec
-from gaponet.sysid.joint_runs import SOFT, JointRuns
-from gaponet.sysid.multistart import descend, soft
+from gaponet.sysid.joint_rollouts import SOFT, JointRollouts
+from gaponet.sysid.least_squares import descend, soft
 
 Values = dict[str, Array]  # field → (n,) of the operated joints
 
@@ -53,7 +53,9 @@ def far_from_published(robot: RobotSpec) -> list[str]:
     return found
 
 
-def share(runs: JointRuns, values: Values, places: list[int], armature: float, tell: Callable[[float], None]) -> Values:
+def share(
+    runs: JointRollouts, values: Values, places: list[int], armature: float, tell: Callable[[float], None]
+) -> Values:
     """Fit one law to the joints at `places`; other joints stay as they are.
 
     Least squares, from the law of the joint that does best for all of them or from the middle of theirs, twice: with

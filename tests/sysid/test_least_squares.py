@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaponet.sysid.multistart import agreed_slopes, better_half, descend, step
+from gaponet.sysid.least_squares import agreed_slopes, better_half, descend, step
 
 POINTS = np.linspace(-1, 1, 60)
 

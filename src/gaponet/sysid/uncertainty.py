@@ -1,0 +1,178 @@
+"""Uncertainty of a robot's fitted parameters, stored as uncertainty.json in its folder.
+
+The parameters are Gaussian on axes that do not depend on a motor's gain: the logarithms of kp and stribeck_speed;
+torques, damping and armature divided by kp; other fields in SI units. The file also holds what the recordings showed by
+themselves, for comparison with later ones, and the error of motions that were not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from typing_extensions import TypedDict
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import GAPONetError, RobotError, UsageError
+from gaponet.base.files import write_json
+from gaponet.base.structure import read_json, validated
+from gaponet.robot.folder import OLD_UNCERTAINTY_FILE, UNCERTAINTY_FILE
+from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.axes import LOGARITHM, OVER_KP, first_values
+
+# Prior standard deviations on the axes; of fields that are not logarithms at least the value itself.
+PRIOR_STD = {
+    "kp": 0.5, "stribeck_speed": 1.0, "damping": 0.05, "frictionloss": 0.02, "armature": 2e-4, "offset": 0.03,
+    "delay": 0.02, "stribeck": 0.01, "friction_motor": 0.1, "friction_external": 0.1, "min_torque": 0.003,
+}  # fmt: skip
+MEND = "identify or adapt it again"
+OLD_KEYS = {  # of known.json → of uncertainty.json
+    "step": "gauss_newton_step", "step_covariance": "gauss_newton_covariance", "scatter": "overdispersion",
+    "predicted": "parameter_rms", "left": "residual_rms", "band": "residual_p90", "held": "validated",
+}  # fmt: skip
+
+
+class Provenance(TypedDict):
+    """Origin of numbers: command, recording days, robot id, name → SHA-256 of each log, total seconds; the values on
+    the axes that were fitted then, by joint, and their covariance."""
+
+    made_by: str
+    days: tuple[str, ...]
+    unit: str
+    logs: dict[str, str]
+    seconds: float
+    values: dict[str, tuple[float, ...]]
+    covariance: dict[str, tuple[tuple[float, ...], ...]]
+
+
+@dataclass(frozen=True)
+class JointUncertainty:
+    """Uncertainty of one joint's P fields on their axes.
+
+    Attributes:
+        values: Fitted values, (P,).
+        covariance: (P, P).
+        gauss_newton_step: Gauss-Newton step of fields and play that the recordings ask for by themselves, (P + 1,).
+        gauss_newton_covariance: Its covariance, (P + 1, P + 1).
+        overdispersion: Variance of the recordings' gradients over that of independent rows, (P + 1,).
+        parameter_rms: RMS position error that the covariance alone predicts, rad.
+        residual_rms: RMS position error of motions that were not fitted, rad.
+        residual_p90: Bound of 90 % of the position errors of other motions, rad.
+    """
+
+    values: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+    gauss_newton_step: tuple[float, ...]
+    gauss_newton_covariance: tuple[tuple[float, ...], ...]
+    overdispersion: tuple[float, ...]
+    parameter_rms: float
+    residual_rms: float
+    residual_p90: float
+
+
+ArrayName = Literal["values", "covariance", "gauss_newton_step", "gauss_newton_covariance", "overdispersion"]
+
+
+@dataclass(frozen=True)
+class ParameterUncertainty:
+    """Uncertainty of a robot's parameters.
+
+    Attributes:
+        fields: The P fields of the axes.
+        joints: Joint name → its uncertainty.
+        sources: Recordings, from the first to the last.
+        clusters: Number of parts of the recordings from which the overdispersion was estimated.
+        validated: Whether the residuals are of motions that were not fitted.
+    """
+
+    fields: tuple[str, ...]
+    joints: dict[str, JointUncertainty]
+    sources: tuple[Provenance, ...]
+    clusters: int
+    validated: bool
+
+    @classmethod
+    def load(cls, robot: RobotSpec) -> ParameterUncertainty | None:
+        """Read uncertainty.json, or known.json of older versions, of the robot's folder; None if there is neither.
+
+        Raises:
+            RobotError: The file is damaged, or its values are not those of robot.toml.
+        """
+        hint = "identify or adapt again, or remove the file: the robot then has values without uncertainty"
+        file, old = (robot.folder / name for name in (UNCERTAINTY_FILE, OLD_UNCERTAINTY_FILE))
+        if file.is_file():
+            found = read_json(cls, file, RobotError, hint)
+        elif old.is_file():
+            file = old
+            table = _with_new_keys(read_json(dict[str, Any], old, RobotError, hint))
+            found = validated(cls, table, old, RobotError, hint)
+        else:
+            return None
+        for joint, values in to_axes(robot, found.fields).items():
+            stored = found.joints.get(joint)
+            if stored is None or not np.allclose(values, stored.values, rtol=1e-4, atol=1e-5):
+                raise RobotError(f"{file}: its values are other values than robot.toml's, at {joint}; {hint}")
+        return found
+
+    @classmethod
+    def require(cls, robot: RobotSpec, error: type[GAPONetError] = UsageError) -> ParameterUncertainty:
+        """Return `load`, or raise `error` if the robot's folder has no uncertainty."""
+        found = cls.load(robot)
+        if found is None:
+            raise error(f"{robot.folder}: keeps only values (no {UNCERTAINTY_FILE}); {MEND}")
+        return found
+
+    def save(self, folder: Path) -> None:
+        """Write uncertainty.json into a robot folder."""
+        write_json(folder / UNCERTAINTY_FILE, asdict(self))
+
+    def array(self, joint: str, name: ArrayName) -> Array:
+        """Return an attribute of a joint as an array."""
+        return np.array(getattr(self.joints[joint], name), float)
+
+    def si(self, joint: str, covariance: Array | None = None) -> tuple[dict[str, float], Array]:
+        """Return a joint's values by field and their covariance (P, P), in SI units.
+
+        Args:
+            joint: Its name.
+            covariance: (P, P) on the axes, instead of the joint's own.
+        """
+        x, step = self.array(joint, "values"), 1e-6
+        here = from_axes(self.fields, x)
+        ahead = from_axes(self.fields, x + step * np.eye(len(x)))
+        jac = np.stack([(ahead[f] - here[f]) / step for f in self.fields])  # (P, axes)
+        own = self.array(joint, "covariance") if covariance is None else covariance
+        return {f: float(v) for f, v in here.items()}, jac @ own @ jac.T
+
+
+def _with_new_keys(table: dict[str, Any]) -> dict[str, Any]:
+    """Rename the keys of a known.json."""
+    return {
+        OLD_KEYS.get(key, key): {j: _with_new_keys(v) if isinstance(v, dict) else v for j, v in value.items()}
+        if key == "joints" and isinstance(value, dict)
+        else value
+        for key, value in table.items()
+    }
+
+
+def to_axes(robot: RobotSpec, fields: ListOf[str]) -> dict[str, Array]:
+    """Return a robot's own values on the axes, (P,) of each operated joint."""
+    first = first_values(robot)
+    kp = first["kp"]
+    rows = [np.log(np.maximum(first[f], 1e-9)) if f in LOGARITHM else first[f] / kp ** (f in OVER_KP) for f in fields]
+    return dict(zip(robot.operated, np.stack(rows, axis=-1), strict=True))
+
+
+def from_axes(fields: ListOf[str], x: Array) -> dict[str, Array]:
+    """Return values on the axes, (…, P), as field → (…) in SI units."""
+    values = {f: np.exp(x[..., i]) if f in LOGARITHM else x[..., i] for i, f in enumerate(fields)}
+    return {f: v * values["kp"] if f in OVER_KP else v for f, v in values.items()}
+
+
+def prior_std(fields: ListOf[str], x: Array) -> Array:
+    """Return the prior standard deviations of values (…, P) on the axes, before any log."""
+    least = np.array([PRIOR_STD[f] for f in fields])
+    return np.where(np.isin(fields, LOGARITHM), least, np.maximum(least, np.abs(x)))
