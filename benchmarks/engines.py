@@ -26,7 +26,7 @@ from gaponet.export.mujoco_servos import read
 from gaponet.report.candidate import read_origin
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
-from gaponet.share.reading import opened
+from gaponet.share.reading import load_dataset
 
 CACHE = Path.home() / ".cache" / "gaponet"
 CHECKS = {  # environment → export, check, what runs in it
@@ -62,7 +62,7 @@ def tested(spec: RobotSpec, plain: RobotSpec, robot: Path, exported: Path) -> No
     """Print what each form leaves of the test motions that the robot's own folder names."""
     origin = read_origin(robot)
     assert origin is not None
-    dataset = opened(str(robot / origin["dataset"]))
+    dataset = load_dataset(str(robot / origin["dataset"]))
     hashes = set(origin["parts"]["test"].values())
     motions = comparable(dataset.sequences([e for e in dataset.entries if e.hash in hashes]), spec, 0.0)
     facts = read(exported / "facts.json")

@@ -124,8 +124,10 @@ class Handler(BaseHTTPRequestHandler):
         if path == "/api/repos/create":
             asked = json.loads(data)
             repo = f"{asked.get('type', 'model')}s/{asked['organization']}/{asked['name']}"
-            self.server.commit(repo, {".gitattributes": b"*.parquet filter=lfs\n"})
-            self.answer({"url": f"{self.server.url}/{repo.removeprefix('models/')}"})
+            there = repo in self.server.repos
+            if not there:
+                self.server.commit(repo, {".gitattributes": b"*.parquet filter=lfs\n"})
+            self.answer({"url": f"{self.server.url}/{repo.removeprefix('models/')}"}, 409 if there else 200)
         elif path == "/api/validate-yaml":
             self.answer({"errors": [], "warnings": []})
         elif re.fullmatch(rf"{REPO}/preupload/[^/]+", path):

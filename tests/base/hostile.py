@@ -385,8 +385,8 @@ def pushed(change: Callable[[Path], None]) -> Callable[[Path], None]:
 
     def make(folder: Path) -> None:
         from gaponet.data.store import Dataset
-        from gaponet.share.move import push
-        from gaponet.share.target import Part
+        from gaponet.share.push_pull import push
+        from gaponet.share.remote import FileRecord
 
         ctrl = wave(60, 2)
         robot = write_arm(folder / "good")
@@ -395,7 +395,7 @@ def pushed(change: Callable[[Path], None]) -> Callable[[Path], None]:
         push(data.path, f"file://{folder}/bucket")
         change(folder)
         index = json.loads((folder / "bucket" / "gaponet.json").read_text())
-        part = Part.of(folder / "arm" / "robot.xml")
+        part = FileRecord.of(folder / "arm" / "robot.xml")
         shutil.copyfile(folder / "arm" / "robot.xml", folder / "bucket" / "sha256" / part.sha256)
         index["files"]["gaponet/robot/robot.xml"] = vars(part)
         (folder / "bucket" / "gaponet.json").write_text(json.dumps(index))

@@ -9,7 +9,7 @@ from logs import arm_sequence, late, wave
 
 from gaponet.data.split import make_split, write_split
 from gaponet.data.store import Dataset
-from gaponet.share.target import Part
+from gaponet.share.remote import FileRecord
 
 
 def add(data, arm, names, **meta):
@@ -86,7 +86,7 @@ def forge(bucket):
 
         def put(name, content):
             (bucket / ".new").write_bytes(content)
-            index["files"][name] = vars(Part.of(bucket / ".new"))
+            index["files"][name] = vars(FileRecord.of(bucket / ".new"))
             shutil.move(bucket / ".new", bucket / "sha256" / index["files"][name]["sha256"])
 
         change(index, put, lambda name: (bucket / "sha256" / index["files"][name]["sha256"]).read_bytes())

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import pytest
 from runs import untrained
@@ -13,10 +14,9 @@ from gaponet.cli.main import main
 from gaponet.data.store import Dataset, dataset_hash
 from gaponet.nn.artifact import GapModel
 from gaponet.share.bucket import Bucket
-from gaponet.share.errors import RemoteError
 from gaponet.share.hub import Hub
-from gaponet.share.move import pull, push
-from gaponet.share.target import reaching
+from gaponet.share.push_pull import pull, push
+from gaponet.share.remote import FileRecord, Index, RemoteError, network_errors
 
 from .conftest import add, same
 
@@ -116,7 +116,9 @@ def test_on_the_hub_a_push_is_a_set_that_lerobot_reads_with_a_card_and_its_tag(h
     assert len(hub.repos["datasets/me/arm"]) == 3  # made, pushed, pushed
 
 
-def test_a_pull_goes_on_with_the_files_that_an_earlier_one_left(hub, dataset, bucket, tmp_path):
+def test_a_push_mends_a_damaged_object_and_a_pull_continues_with_the_files_that_an_earlier_one_left(
+    dataset, bucket, tmp_path
+):
     place, folder = f"file://{bucket}", tmp_path / ".gaponet-pull-back"
     push(dataset.path, place)
     largest = max((bucket / "sha256").iterdir(), key=lambda file: file.stat().st_size)
@@ -127,12 +129,13 @@ def test_a_pull_goes_on_with_the_files_that_an_earlier_one_left(hub, dataset, bu
     assert not (tmp_path / "back").exists()
     arrived = {file: file.stat().st_mtime_ns for file in folder.rglob("[!.]*.*") if file.is_file()}
     assert arrived
-    push(dataset.path, place)  # an object of the right size is believed
-    with pytest.raises(RemoteError, match="push it again, with --replace"):
+    push(dataset.path, place)
+    assert largest.read_bytes() == content
+    opened = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shutil, "copyfile", lambda a, b, copy=shutil.copyfile: opened.append(b) or copy(a, b))
         pull(place, tmp_path / "back")
-    assert arrived == {file: file.stat().st_mtime_ns for file in folder.rglob("[!.]*.*") if file.is_file()}
-    push(dataset.path, place, replace=True)
-    pull(place, tmp_path / "back")
+    assert not {str(file) for file in arrived} & set(map(str, opened))
     same(dataset, Dataset(tmp_path / "back"))
 
 
@@ -142,6 +145,44 @@ def test_an_object_that_was_cut_short_is_sent_again(dataset, bucket, tmp_path):
         file.write_bytes(file.read_bytes()[:100])
     push(dataset.path, f"file://{bucket}")
     pull(f"file://{bucket}", tmp_path / "back")
+
+
+def test_an_object_in_s3_is_sent_again_if_it_is_younger_than_the_index_that_lists_it(tmp_path):
+    bucket, record = Bucket(f"file://{tmp_path}"), FileRecord(3, "0" * 64)
+    bucket.scheme, bucket._index_info = "s3", {"LastModified": datetime(2026, 1, 2, tzinfo=UTC)}
+    for day, listed, intact in ((1, True, True), (3, True, False), (3, False, True)):
+        info = {"size": 3, "type": "file", "LastModified": datetime(2026, 1, day, tzinfo=UTC)}
+        assert bucket._intact(info, record, listed) == intact
+
+
+def test_a_dataset_appears_under_its_name_when_it_is_complete(dataset, bucket, tmp_path, monkeypatch):
+    push(dataset.path, place := f"file://{bucket}")
+    append = Dataset.append
+
+    def killed(self, *given):
+        if len(self) == 2:
+            raise KeyboardInterrupt
+        return append(self, *given)
+
+    monkeypatch.setattr(Dataset, "append", killed)
+    with pytest.raises(KeyboardInterrupt):
+        pull(place, tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+    monkeypatch.setattr(Dataset, "append", append)
+    pull(place, tmp_path / "back")
+    same(dataset, back := Dataset(tmp_path / "back"))
+    assert back.header["licence"] == "CC-BY-4.0"
+
+
+def test_a_push_with_nothing_new_reads_no_recording(dataset, place, tmp_path, monkeypatch):
+    first = push(dataset.path, place)
+    with monkeypatch.context() as patch:
+        patch.setattr("gaponet.share.dataset.write", None)
+        assert push(dataset.path, place) == first
+    dataset.state(licence="MIT")
+    push(dataset.path, place)
+    pull(place, tmp_path / "back")
+    assert Dataset(tmp_path / "back").header["licence"] == "MIT"
 
 
 def test_prune_deletes_what_neither_this_push_nor_the_last_names_once_it_is_a_day_old(dataset, arm, bucket, tmp_path):
@@ -163,23 +204,40 @@ def test_the_command_prune_names_the_one_that_replaces_it(capsys):
     assert capsys.readouterr().err == "Usage: gaponet prune was removed; use gaponet push --prune\n"
 
 
-@pytest.mark.parametrize("target", [Bucket, Hub])
-def test_who_pushed_meanwhile_loses_nothing(hub, dataset, arm, bucket, tmp_path, monkeypatch, target):
-    place, store = {Bucket: f"file://{bucket}", Hub: "me/arm"}[target], target.store
+@pytest.mark.parametrize(
+    ("remote", "step"), [(Bucket, "store"), (Bucket, "_replace_index"), (Hub, "store")], ids=lambda x: str(x)
+)
+def test_of_two_simultaneous_pushes_the_slower_one_gets_one_error_and_replaces_nothing(
+    hub, dataset, arm, bucket, tmp_path, monkeypatch, capsys, remote, step
+):
+    place, own = {Bucket: f"file://{bucket}", Hub: "me/arm"}[remote], getattr(remote, step)
     other = Dataset.create(tmp_path / "other", arm)
     add(other, arm, ["elsewhere"], unit_id="another")
-    push(dataset.path, place)
-
-    def after_somebody_else(self, *given):
-        monkeypatch.setattr(target, "store", store)
-        push(other.path, place, replace=True)
-        return store(self, *given)
-
-    monkeypatch.setattr(target, "store", after_somebody_else)
-    with pytest.raises(RemoteError, match=r"somebody else pushed|412"):
+    if step != "_replace_index":  # otherwise both are the first push
         push(dataset.path, place)
+        add(dataset, arm, ["new"])
+
+    def after_another_push(self, *given):
+        monkeypatch.setattr(remote, step, own)
+        push(other.path, place, replace=True)
+        return own(self, *given)
+
+    monkeypatch.setattr(remote, step, after_another_push)
+    assert main(["push", str(dataset.path), place]) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-1] == f"Remote: {place}: somebody else pushed at the same time, and nothing was replaced; push again"
     pull(place, tmp_path / "theirs")
     same(other, Dataset(tmp_path / "theirs"))
+
+
+def test_of_two_first_pushes_to_the_hub_the_slower_one_gets_the_error_too(hub, dataset, arm, tmp_path):
+    other = Dataset.create(tmp_path / "other", arm)
+    add(other, arm, ["elsewhere"])
+    remote = Hub("me/arm")
+    assert remote.index("dataset") is None
+    push(other.path, "me/arm")
+    with pytest.raises(RemoteError, match="somebody else pushed at the same time"):
+        remote.store(tmp_path, Index(1, "dataset", "arm", ("a",), {"x": FileRecord(1, "0" * 64)}), ["x"], False)
 
 
 def test_the_same_recording_under_another_name_is_the_one_that_is_there(dataset, arm, place, tmp_path):
@@ -218,7 +276,7 @@ def test_an_address_of_nothing_is_one_line_without_keys(hub, tmp_path, capsys, a
 
 def test_no_error_shows_keys_or_the_signature_of_a_link():
     link = "https://KEY:SECRET@host/file?X-Amz-Signature=SECRET"
-    with pytest.raises(RemoteError, match=r"^me/arm: 403 for https://host/file\?…$"), reaching("me/arm"):
+    with pytest.raises(RemoteError, match=r"^me/arm: 403 for https://host/file\?…$"), network_errors("me/arm"):
         raise OSError(f"403 for {link}")
 
 
@@ -259,39 +317,62 @@ def test_more_than_the_disk_holds_is_refused_before_anything_is_fetched(hub, dat
     assert set(hub.got) == {"gaponet.json"}
 
 
-@pytest.mark.parametrize(
-    "name", ["../x", "/x", "a/../../x", "a//x", ".ssh/x", "a\\x", "C:x", "x\n", "a/" * 9 + "x", "gaponet.json", "ARM/y"]
-)
-def test_an_index_that_names_a_place_outside_or_twice_is_refused_before_anything_is_fetched(
-    hub, dataset, tmp_path, name
-):
-    push(dataset.path, "me/arm")
-    files = dict(hub.files("datasets/me/arm"))
-    index = json.loads(files["gaponet.json"])
-    for strange in (name, "arm/y"):
-        index["files"][strange] = {"size": 1, "sha256": "0" * 64}
-        files[strange] = b"x"
-    hub.commit("datasets/me/arm", files | {"gaponet.json": json.dumps(index).encode()})
-    with pytest.raises(RemoteError, match=r"is not the name of a file inside a folder|differ in capitals"):
-        pull("me/arm", tmp_path / "back")
-    assert set(hub.got) == {"gaponet.json"}
+GOOD = {"size": 1, "sha256": "0" * 64}
+NAMES = ("../x", "/x", "a/../../x", "a//x", ".ssh/x", "a\\x", "C:x", "x\n", "a/" * 9 + "x", "gaponet.json", "a" * 401)
+DIGESTS = ("../" * 19 + "etc/pwd", "A" * 64, "0" * 63 + " ", "0" * 65)
+HOSTILE = [
+    *(({"files": {name: GOOD}}, "is not the name of a file inside a folder") for name in NAMES),
+    *(({"files": {"x": GOOD | {"sha256": text}}}, "should be the 64 lowercase hex digits") for text in DIGESTS),
+    ({"files": {"arm/y": GOOD, "ARM/y": GOOD}}, "differ in capitals"),
+    ({"files": {"arm": GOOD, "arm/y": GOOD}}, "'arm' is a file and a folder"),
+    ({"files": {str(i): GOOD for i in range(20_001)}}, "files: "),
+    ({"files": {}}, "files: "),
+    ({"files": [["x", GOOD]]}, "files: "),
+    ({"files": {"x": GOOD | {"size": 1 << 41}}}, "size: "),
+    ({"files": {"x": GOOD | {"size": "1"}}}, "size: "),
+    ({"files": {"x": GOOD | {"size": -1}}}, "size: "),
+    ({"contents": ["a"] * 1_000_001}, "contents: "),
+    ({"contents": "a"}, "contents: "),
+    ({"contents": [1]}, "contents"),
+    ({"name": "../x"}, "name: "),
+    ({"name": None}, "name: "),
+    ({"kind": "model"}, "kind: "),
+    ({"format": "1"}, "format: "),
+    ({"format": 2}, "is newer than this gaponet reads"),
+    ({"more": 1}, "more: "),
+]
 
 
-@pytest.mark.parametrize("digest", ["../" * 19 + "etc/pwd", "A" * 64, "0" * 63 + " ", "0" * 65])
-def test_a_hash_is_64_hex_digits_and_never_a_path(dataset, bucket, forge, tmp_path, digest):
-    push(dataset.path, f"file://{bucket}")
-    forge(lambda index, put, read: next(iter(index["files"].values())).update(sha256=digest))
-    with pytest.raises(RemoteError, match="should be the 64 lowercase hex digits"):
+@pytest.mark.parametrize(("change", "error"), HOSTILE, ids=range(len(HOSTILE)))
+def test_a_hostile_index_is_refused_in_one_line(bucket, tmp_path, capsys, change, error):
+    index = {"format": 1, "kind": "dataset", "name": "arm", "contents": ["a"], "files": {"x": GOOD}}
+    bucket.mkdir(parents=True)
+    (bucket / "gaponet.json").write_text(json.dumps(index | change))
+    assert main(["pull", f"file://{bucket}", str(tmp_path / "back")]) == 2
+    line = capsys.readouterr().err
+    assert line.startswith(f"Remote: file://{bucket}: ")
+    assert error in line
+    assert line.count("\n") == 1
+    assert list(tmp_path.glob("*back*")) == []
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["pipe", "device"])
+def test_an_index_that_is_a_pipe_or_a_device_is_not_read(bucket, tmp_path, make):
+    bucket.mkdir(parents=True)
+    make(bucket / "gaponet.json")
+    with pytest.raises(RemoteError, match=r"nothing was pushed there|gaponet did not push it"):
         pull(f"file://{bucket}", tmp_path / "back")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="Windows has no named pipes")
-@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
-def test_an_object_that_is_a_pipe_or_a_device_is_not_read(dataset, bucket, tmp_path, make):
-    push(dataset.path, f"file://{bucket}")
-    for file in (bucket / "sha256").iterdir():
-        file.unlink()
-        make(file)
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/etc/hostname")], ids=["pipe", "link"])
+def test_an_object_that_is_a_pipe_or_a_link_is_not_read(bucket, tmp_path, make):
+    size = 0 if make is os.mkfifo else os.stat("/etc/hostname").st_size
+    index = {"format": 1, "kind": "dataset", "name": "arm", "contents": ["a"], "files": {"x": GOOD | {"size": size}}}
+    (bucket / "sha256").mkdir(parents=True)
+    (bucket / "gaponet.json").write_text(json.dumps(index))
+    make(bucket / "sha256" / GOOD["sha256"])
     with pytest.raises(RemoteError, match="is not the file that was pushed"):
         pull(f"file://{bucket}", tmp_path / "back")
 

@@ -18,7 +18,7 @@ from gaponet.nn.artifact import GapModel
 from gaponet.nn.delay_offset import DelayOffset
 from gaponet.report.candidate import choose
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import opened
+from gaponet.share.reading import load_dataset
 from gaponet.sim.metrics import Run, runs, summary
 from gaponet.sim.replay import Corrector, replay
 
@@ -29,7 +29,7 @@ def train_and_evaluate(cell: Cell, tell: Tell) -> None:
     """Train a cell and write its cell.json."""
     told = train_cell(cell, tell)
     tell(1.0, "evaluation")
-    found = evaluate_model(cell.folder, opened(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
+    found = evaluate_model(cell.folder, load_dataset(cell.dataset), cell.robot, cell.holdout_units, cell.threads)
     start = "identified" if cell.robot.nominal is not None else "nominal"
     told |= {"kind": cell.variant.kind, "changes": list(cell.variant.changes), "start": start}
     write_json(cell.folder / RESULT, told | found)

@@ -29,7 +29,7 @@ from gaponet.nn.delay_offset import DelayOffset
 from gaponet.nn.training.budget import Budget
 from gaponet.nn.training.config import TrainConfig
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import opened
+from gaponet.share.reading import load_dataset
 from gaponet.sim.model import model_hash
 
 Tell = Callable[[float, str], None]  # share done, what is going on
@@ -136,7 +136,7 @@ def train_cell(cell: Cell, tell: Tell) -> dict[str, Any]:
     config = replace(cell.variant.config, seed=cell.seed, threads=cell.threads)
     card = _card(cell.folder)
     if not card or card["interrupted"]:
-        data = opened(cell.dataset)
+        data = load_dataset(cell.dataset)
 
         def show(s: Status) -> None:
             tell(s.fraction, s.note)

@@ -30,7 +30,7 @@ from gaponet.export.mujoco_servos import delay_weights
 from gaponet.report.candidate import split_of_run
 from gaponet.report.run_files import read_config
 from gaponet.robot.spec import RobotSpec
-from gaponet.share.reading import opened
+from gaponet.share.reading import load_dataset
 from gaponet.sim.replay import Corrector, replay
 
 PAST, HIDDEN, CLAMP = 0.1, (32, 32), 5.0  # s beyond the longest delay, widths, standard deviations
@@ -80,7 +80,7 @@ def recordings(run: Path, data: str | None, robot: RobotSpec, payload_mass: floa
         UsageError: There is none.
     """
     there = data or read_config(run)["dataset"]
-    dataset = opened(there if data or "://" in there else run / there)
+    dataset = load_dataset(there if data or "://" in there else run / there)
     made = [e for e in dataset.entries if e.meta.payload_mass == payload_mass]
     held = split_of_run(run)
     parts = [spread([e for e in made if e.hash in held[part].values()], MOST) for part in ("train", "val")]

@@ -14,7 +14,7 @@ from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.report.candidate import read_origin
 from gaponet.robot.spec import SERVO_TERMS, RobotSpec
-from gaponet.share.reading import opened
+from gaponet.share.reading import load_dataset
 from gaponet.sim.batch import Condition, ramped
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
@@ -33,7 +33,7 @@ def recordings_of(folder: Path, data: str | None, robot: RobotSpec) -> tuple[lis
         data = data if "://" in there or Path(data).is_dir() else None  # it may have moved away
     if data is None:
         return None
-    dataset = opened(data)
+    dataset = load_dataset(data)
     dataset.require_robot(robot)
     first = dataset.read(dataset.entries[0])
     if np.array_equal(first.ctrl, first.qpos):  # driven by torque: no position was commanded, so none can be followed

@@ -1,1 +1,1 @@
-"""Datasets and runs to and from places on the network, by the hash of every file."""
+"""Push datasets and runs to the Hugging Face Hub or a bucket, and pull them, checked by the hash of every file."""

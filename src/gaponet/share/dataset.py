@@ -1,16 +1,20 @@
-"""A dataset as the files that are pushed, and back.
+"""Conversion between a dataset and the files that are pushed.
 
 The files are a LeRobot set (gaponet.data.writers.lerobot), which LeRobot and the Hub's viewer read. The folder
-gaponet/ beside it holds what such a set has no place for: the nominal robot, splits, recipe, offsets.
+gaponet/ beside it holds what such a set has no place for: the nominal robot, splits, recipe, offsets, and the hashes
+of the files that the push was made from.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 from pathlib import Path
 
+from gaponet import __version__
 from gaponet.base.errors import DatasetError
-from gaponet.base.files import write_text
+from gaponet.base.files import FOLDER_MARKER, write_text
 from gaponet.base.progress import progress_bar
 from gaponet.data.card import make_card
 from gaponet.data.card_text import card_text
@@ -19,49 +23,69 @@ from gaponet.data.importer import findings
 from gaponet.data.offsets import FILE as OFFSETS
 from gaponet.data.offsets import read_offsets
 from gaponet.data.split import read_split
-from gaponet.data.store import Dataset
+from gaponet.data.store import JOURNAL, Dataset
 from gaponet.data.writers.lerobot import write
 from gaponet.robot.folder import KEPT, kept_robot, require_bare, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
+from gaponet.share.remote import FileRecord, Index
 from gaponet.sim.model import model_hash
 
-BESIDE = "gaponet"  # folder beside the LeRobot set
-BROUGHT = ("collect.json", OFFSETS)  # files in it, as they lie in the dataset
+SIDECAR = "gaponet"  # folder beside the LeRobot set
+SOURCE = f"{SIDECAR}/source.json"  # hashes of all files that the pushed files follow from
+COPIED_FILES = ("collect.json", OFFSETS)
 
 
-def lay_out(path: Path, folder: Path, address: str) -> tuple[str, ...]:
-    """Write the files of a dataset into an empty folder; returns the hashes of its sequences.
+def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
+    """Write the files of a dataset into an empty folder; return the hashes of its sequences.
 
     Raises:
-        DatasetError: It is empty, or a recording is damaged.
+        DatasetError: The dataset is empty, or a recording is damaged.
     """
-    dataset = Dataset(path)
+    dataset, source = Dataset(path), _source_text(path, address)
     robot = kept_robot(dataset.path, dataset.robot_name)
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
     with progress_bar("reading") as update:
         done = iter(range(1, len(dataset) + 1))
         sets = write(dataset, robot, folder, lambda motion: update(next(done), len(dataset), motion))
-    (folder / BESIDE).mkdir()
-    save_robot(robot.nominal or robot, folder / BESIDE / KEPT)
-    (folder / BESIDE / KEPT / ".gaponet").unlink()
-    bring(dataset.path, folder / BESIDE, dataset)
+    (folder / SIDECAR).mkdir()
+    save_robot(robot.nominal or robot, folder / SIDECAR / KEPT)
+    (folder / SIDECAR / KEPT / ".gaponet").unlink()
+    copy_sidecars(dataset.path, folder / SIDECAR, dataset)
     card = make_card(dataset)
     text = dataset_readme(card, card_text(card), address, [part.path.as_posix() for part in sets])
     write_text(folder / "README.md", text)
+    write_text(folder / SOURCE, source)
     return contents
 
 
-def take_in(pushed: Dataset, robot: RobotSpec, out: Path) -> None:
-    """Copy what a dataset lacks of one that was pushed, in the memory of one recording.
+def is_pushed(path: Path, address: str, index: Index) -> bool:
+    """True if a dataset and everything that is pushed with it are as in the push of this index."""
+    record = index.files.get(SOURCE)
+    return record is not None and record.sha256 == hashlib.sha256(_source_text(path, address).encode()).hexdigest()
+
+
+def _source_text(path: Path, address: str) -> str:
+    """Return what the pushed files depend on, as JSON: version, address, and hashes of the dataset's small files.
+
+    The journal lists the content hash of every recording, so that no recording is read.
+    """
+    names = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{KEPT}/*.*")
+    files = sorted(file for name in names for file in path.glob(name) if file.is_file() and file.name != FOLDER_MARKER)
+    hashes = {file.relative_to(path).as_posix(): FileRecord.of(file).sha256 for file in files}
+    return json.dumps({"gaponet": __version__, "address": address, "files": hashes}, indent=1) + "\n"
+
+
+def add_missing(pushed: Dataset, robot: RobotSpec, out: Path, new: bool) -> None:
+    """Copy the sequences that a dataset lacks from a pushed one; one recording at a time is in memory.
 
     Args:
-        out: Dataset; made where there is none, else brought up to date.
+        out: Dataset; made if there is none.
+        new: Also copy licence and source.
 
     Raises:
-        GAPONetError: It is another robot's, or a recording is not what was pushed.
+        GAPONetError: It is another robot's, or a recording differs from the pushed one.
     """
-    new = not (out / "dataset.json").is_file()
     dataset = Dataset.create(out, robot)
     if new:
         dataset.state(**{name: str(pushed.header[name]) for name in Stated.__annotations__ if name in pushed.header})
@@ -71,27 +95,27 @@ def take_in(pushed: Dataset, robot: RobotSpec, out: Path) -> None:
             sequence = pushed.read(entry)
             dataset.append(sequence, entry.findings or findings(sequence), entry.hash)
             update(done, len(missing), entry.meta.motion)
-    bring(pushed.path, dataset.path, dataset)
+    copy_sidecars(pushed.path, dataset.path, dataset)
 
 
-def bring(source: Path, out: Path, dataset: Dataset) -> None:
-    """Copy splits, recipe and offsets of a dataset, checked, where there are none yet."""
-    for file in [source / name for name in BROUGHT] + sorted((source / "splits").glob("*.json")):
-        place = out / file.relative_to(source)
-        if file.is_file() and not place.exists():
+def copy_sidecars(source: Path, out: Path, dataset: Dataset) -> None:
+    """Copy splits, recipe and offsets of a dataset, checked, where `out` has none yet."""
+    for file in [source / name for name in COPIED_FILES] + sorted((source / "splits").glob("*.json")):
+        copy = out / file.relative_to(source)
+        if file.is_file() and not copy.exists():
             if file.parent != source:
                 read_split(file, dataset)
-            place.parent.mkdir(exist_ok=True)
-            shutil.copyfile(file, place)
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, copy)
     read_offsets(dataset)
 
 
-def pushed_robot(folder: Path) -> RobotSpec:
-    """The robot in what was downloaded: a stranger's, which may name no file outside its folder."""
-    folder = folder / BESIDE / KEPT
+def downloaded_robot(folder: Path) -> RobotSpec:
+    """Load the robot among downloaded files; it must name no file outside its folder."""
+    folder = folder / SIDECAR / KEPT
     if not (folder / "robot.toml").is_file():
-        raise DatasetError(f"{BESIDE}/{KEPT}: no robot.toml; push the dataset again")
+        raise DatasetError(f"{SIDECAR}/{KEPT}: no robot.toml; push the dataset again")
     require_bare(folder)
     robot = load_robot(folder)
-    model_hash(robot)  # raises if it is none
+    model_hash(robot)  # raises an error for an invalid robot
     return robot

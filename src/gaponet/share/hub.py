@@ -1,25 +1,26 @@
 """Repositories of the Hugging Face Hub: datasets as dataset repositories, runs as model repositories.
 
-A push is one commit. huggingface_hub uploads the files that the Hub does not have, and retries and resumes transfers.
+A push is one commit. huggingface_hub uploads only files that the Hub does not have; it retries and resumes transfers.
 """
 
 from __future__ import annotations
 
 import glob
 import os
+from collections.abc import Collection
 from contextlib import suppress
 from pathlib import Path
 
 from gaponet.data.formats.lerobot_set import VERSION as LEROBOT_TAG
-from gaponet.share.errors import RemoteError
-from gaponet.share.target import INDEX, MAX_INDEX_BYTES, Index, Kind, reaching
+from gaponet.share.remote import INDEX, MAX_INDEX_BYTES, Index, Kind, RemoteError, lost_race, network_errors
 
-TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
-BORN_WITH = {".gitattributes", "README.md"}  # files of a new repository
+REPOSITORY_TYPES: dict[Kind, str] = {"dataset": "dataset", "run": "model"}
+INITIAL_FILES = {".gitattributes", "README.md"}  # of a new repository
+PARENT_CHANGED = 412  # HTTP status of a commit whose parent is not the newest commit
 
 
 class Hub:
-    """A `Target` on the Hub, or wherever HF_ENDPOINT points; HF_TOKEN or `hf auth login` says who pushes."""
+    """A `Remote` on the Hub, or at HF_ENDPOINT; the token is HF_TOKEN or that of `hf auth login`."""
 
     def __init__(self, address: str) -> None:
         """
@@ -37,8 +38,8 @@ class Hub:
     def index(self, kind: Kind | None = None) -> bytes | None:
         from huggingface_hub.errors import RepositoryNotFoundError
 
-        for wanted in TYPES.values() if kind is None else (TYPES[kind],):
-            with suppress(RepositoryNotFoundError), reaching(self.address, RepositoryNotFoundError):
+        for wanted in REPOSITORY_TYPES.values() if kind is None else (REPOSITORY_TYPES[kind],):
+            with suppress(RepositoryNotFoundError), network_errors(self.address, RepositoryNotFoundError):
                 info = self.api.repo_info(self.repo, repo_type=wanted, revision=self.revision, files_metadata=True)
                 self.type, self.commit = wanted, str(info.sha)
                 self._sizes = {file.rfilename: file.size for file in getattr(info, "siblings", None) or ()}
@@ -47,7 +48,7 @@ class Hub:
                 if INDEX in self._sizes:
                     file = self.api.hf_hub_download(self.repo, INDEX, repo_type=wanted, revision=self.commit)
                     return Path(file).read_bytes()
-                if self._sizes.keys() - BORN_WITH:
+                if self._sizes.keys() - INITIAL_FILES:
                     raise RemoteError(
                         f"{self.address}: the {wanted} repository holds files but no {INDEX}: gaponet did not push it; "
                         "a LeRobot set is fetched with: hf download --repo-type dataset, and read by gaponet import"
@@ -56,36 +57,50 @@ class Hub:
             raise RemoteError(f"{self.address}: no dataset or run there that may be read; see hf auth login")
         return None
 
-    def sizes(self, places: list[str], index: Index) -> list[int | None]:
-        return [self._sizes.get(place) for place in places]
+    def sizes(self, paths: list[str], index: Index) -> list[int | None]:
+        return [self._sizes.get(path) for path in paths]
 
-    def fetch(self, places: list[str], index: Index, folder: Path) -> None:
-        names = [glob.escape(place) for place in places]
-        with reaching(self.address):
+    def outdated(self, index: Index) -> set[str]:
+        return {path for path, record in index.files.items() if self._sizes.get(path) != record.size}
+
+    def fetch(self, paths: list[str], index: Index, folder: Path) -> None:
+        names = [glob.escape(path) for path in paths]
+        with network_errors(self.address):
             self.api.snapshot_download(
                 self.repo, repo_type=self.type, revision=self.commit, local_dir=folder, allow_patterns=names
             )
 
-    def store(self, folder: Path, index: Index, private: bool, replace: bool, prune: bool) -> int:
+    def store(self, folder: Path, index: Index, paths: Collection[str], private: bool) -> None:
+        """Commit all files of the index; the Hub itself knows which of them are new (`paths` is not used)."""
         from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-        from huggingface_hub.errors import RevisionNotFoundError
+        from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
-        kind, now = TYPES[index.kind], {*index.files, INDEX}
-        gone = sorted(self._sizes.keys() - now - BORN_WITH)
-        with reaching(self.address):
+        repo_type, files = REPOSITORY_TYPES[index.kind], {*index.files, INDEX}
+        with network_errors(self.address):
             if not self.type:
-                self.api.create_repo(self.repo, repo_type=kind, private=private or None, exist_ok=True)
-            self.api.create_commit(  # upload_folder may make several, and a reader would see a part
-                self.repo,
-                [CommitOperationAdd(place, str(folder / place)) for place in sorted(now)]
-                + [CommitOperationDelete(place) for place in gone],
-                commit_message=f"gaponet push: {index.kind} of {len(index.files)} files",
-                repo_type=kind,
-                revision=self.revision,
-                parent_commit=self.commit or None,
-            )
+                self.api.create_repo(self.repo, repo_type=repo_type, private=private or None, exist_ok=True)
+                if self.index(index.kind) is not None:
+                    raise lost_race(self.address)
+            removed = sorted(self._sizes.keys() - files - INITIAL_FILES)
+            try:
+                self.api.create_commit(  # upload_folder and upload_large_folder show readers a part of the new state
+                    self.repo,
+                    [CommitOperationAdd(path, str(folder / path)) for path in sorted(files)]
+                    + [CommitOperationDelete(path) for path in removed],
+                    commit_message=f"gaponet push: {index.kind} of {len(index.files)} files",
+                    repo_type=repo_type,
+                    revision=self.revision,
+                    parent_commit=self.commit or None,
+                )
+            except HfHubHTTPError as error:
+                if error.response.status_code == PARENT_CHANGED:
+                    raise lost_race(self.address) from None
+                raise
             if index.kind == "dataset" and self.revision == "main":  # LeRobot opens the tag of its version, not main
                 with suppress(RevisionNotFoundError):
-                    self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=kind)
-                self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=kind)
-        return 0  # files that a commit deletes stay in the repository's history
+                    self.api.delete_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type)
+                self.api.create_tag(self.repo, tag=LEROBOT_TAG, repo_type=repo_type, exist_ok=True)
+
+    def prune(self, index: Index) -> int:
+        """Return 0: files that a commit deletes stay in the history of the repository."""
+        return 0

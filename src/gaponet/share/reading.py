@@ -1,4 +1,4 @@
-"""Datasets to read: a folder, or what was pushed to a bucket, read where it lies."""
+"""Open a dataset for reading: a folder, or a pushed one at an address."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from gaponet.robot.folder import keeps_robot, kept_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 
 
-def opened(place: str | Path) -> Dataset:
-    """A dataset folder, or one behind an address.
+def load_dataset(place: str | Path) -> Dataset:
+    """Open a dataset folder, or a pushed dataset at an address.
 
     Raises:
-        DatasetError: As open_dataset.
+        DatasetError: There is no dataset, it is damaged, or it cannot be reached.
     """
     if "://" not in str(place):
         return Dataset(place)
-    from gaponet.share.stream import open_pushed
+    from gaponet.share.stream import open_remote_dataset
 
-    return open_pushed(str(place))
+    return open_remote_dataset(str(place))
 
 
 def open_dataset(
     dataset: Dataset | str | Path, robot: RobotSpec | str | Path | None = None, run: str | Path | None = None
 ) -> tuple[Dataset, RobotSpec]:
-    """A dataset, to be read, and its robot: the one asked for, else the one that the dataset keeps.
+    """Open a dataset for reading; return it and its robot.
 
     Args:
-        dataset: Folder; or the address (s3://, gs://, file://, hf://) of one that was pushed, which is read where it
-            lies.
-        robot: Another robot than the one that the dataset keeps.
-        run: The run whose robot is taken where the dataset keeps none.
+        dataset: Folder; or the address (s3://, gs://, file://, hf://) of a pushed dataset, which is read without a
+            pull.
+        robot: Robot to use instead of the one in the dataset folder.
+        run: Run folder whose robot is used if the dataset folder has none.
 
     Raises:
         DatasetError: There is no dataset, it is damaged, or it cannot be reached.
 
-    A dataset written before it kept any takes the one that the run keeps, or else the package's of that name, and that
-    is said on stderr.
+    Datasets written before November 2026 have no robot folder. For those the run's robot is used, or else the robot of
+    that name in the package, with a note on stderr.
     """
-    data = dataset if isinstance(dataset, Dataset) else opened(dataset)
+    data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):

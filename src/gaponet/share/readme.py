@@ -1,4 +1,4 @@
-"""README.md of what was pushed: the Hub's header, the card, and the command that brings it back."""
+"""README.md of a push: the header for the Hub, the data card or model card, and the command that pulls it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LICENCES = ("apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-4.0", "cc-by-
 
 
 def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str]) -> str:
-    """A dataset card: the header by which the Hub shows LeRobot sets, and the card's text.
+    """Return a dataset card: the header with which the Hub shows LeRobot sets, and the text of the card.
 
     Args:
         sets: Folders of the sets, below the repository.
@@ -31,7 +31,7 @@ def dataset_readme(card: dict[str, Any], text: str, address: str, sets: list[str
 
 
 def run_readme(facts: dict[str, Any], address: str) -> str:
-    """A model card: what the network corrects, what it was trained on, and its errors on the test motions."""
+    """Return a model card: corrected joints, training data, and errors on the test motions."""
     card, metrics = facts["card"], facts["metrics"]
     virtual, rates = ", trained on VIRTUAL robots", ", ".join(f"{1 / dt:.2f}" for dt in card.get("dt", []))
     lines = [
@@ -58,6 +58,6 @@ def _tags(card: dict[str, Any], *more: str) -> list[str]:
 
 
 def _page(header: dict[str, Any], lines: list[str], use: list[str]) -> str:
-    """YAML between two rules, each value as JSON, which YAML is; then the page."""
-    said = [f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in header.items()]
-    return "\n".join(["---", *said, "---", "", *lines, "", "## Use", "", *use, ""])
+    """Return YAML between two rules and then the page. Each value is written as JSON, which is valid YAML."""
+    fields = [f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in header.items()]
+    return "\n".join(["---", *fields, "---", "", *lines, "", "## Use", "", *use, ""])

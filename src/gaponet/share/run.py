@@ -1,4 +1,4 @@
-"""A run as the files that are pushed, and back: what loads, evaluates and resumes it; nothing that a browser runs."""
+"""The files of a run that are pushed: those that load, evaluate and resume it, and no HTML."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from gaponet.base.files import lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.report.run_files import read_config, read_metrics
 from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, require_bare
-from gaponet.share.errors import RemoteError
 from gaponet.share.readme import run_readme
-from gaponet.share.target import Index
+from gaponet.share.remote import Index, RemoteError
 
 README = "README.md"
 FILES = re.compile(
@@ -25,43 +24,40 @@ FILES = re.compile(
 )
 
 
-def lay_out(run: Path, folder: Path, address: str) -> tuple[str, ...]:
-    """Copy the files of a run, with a README, into an empty folder; returns the hash of its network."""
+def write_files(run: Path, folder: Path, address: str) -> tuple[str, ...]:
+    """Copy the files of a run, with a README, into an empty folder; return the hash of its network."""
     if not (run / "model" / CARD).is_file():
         raise ModelError(f"{run}: no model yet; train it first")
     write_text(folder / README, run_readme(_facts(run), address))
     for file in sorted(run.rglob("*")):
-        if file.is_file() and FILES.fullmatch(place := file.relative_to(run).as_posix()):
-            (folder / place).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, folder / place)
+        if file.is_file() and FILES.fullmatch(path := file.relative_to(run).as_posix()):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / path)
     return (sha256(run / "model" / WEIGHTS),)
 
 
-def require_run(index: Index) -> None:
-    """Refuse an index that names a file which no run has."""
-    for place in index.files.keys() - {README}:
-        if not FILES.fullmatch(place):
-            raise RemoteError(f"{place}: a run has no such file")
+def require_run_files(index: Index) -> None:
+    """Refuse an index with files that no run has."""
+    for path in index.files.keys() - {README}:
+        if not FILES.fullmatch(path):
+            raise RemoteError(f"{path}: a run has no such file")
 
 
-def take_in(folder: Path, index: Index, out: Path) -> None:
-    """Check that what was downloaded is the run that was pushed, and rename the folder.
+def require_pushed_run(folder: Path, index: Index) -> None:
+    """Check that downloaded files are the run that was pushed, and mark the folder as a run.
 
     Raises:
-        GAPONetError: It is another network, or a file is not what it should be.
+        GAPONetError: It is another network, or a file is invalid.
     """
     with lock_folder(folder, "run"):
         if sha256(folder / "model" / WEIGHTS) not in index.contents:
             raise RemoteError("model/model.onnx is not the network that was pushed, by its hash; push it again")
         _facts(folder)
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # of huggingface_hub
-    if out.exists():
-        out.rmdir()
-    folder.rename(out)
 
 
 def _facts(run: Path) -> dict[str, Any]:
-    """What the card of the model and the newest evaluation say, all of it read and checked."""
+    """Read and check the files of a run; return model card, configuration, newest metrics and hash of the weights."""
     if keeps_robot(run):
         require_bare(run / KEPT)
     config, model = read_config(run), GapModel.load(run)

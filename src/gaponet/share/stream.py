@@ -1,6 +1,6 @@
-"""A dataset that was pushed, read where it lies: a file is downloaded when one of its recordings is read.
+"""Read a pushed dataset without a pull: a file is downloaded when one of its recordings is read.
 
-A recording is a row group, so that memory holds one recording. Nothing is written to the place.
+A recording is a row group, so that memory holds one recording. Nothing is written to the remote place.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ from gaponet.data.formats.lerobot_set import FEATURES, Set, Stated, sets_under
 from gaponet.data.sequence import ARRAYS, SequenceMeta, to_sequence
 from gaponet.data.store import Dataset, Entry, entry_id
 from gaponet.share import dataset as datasets
-from gaponet.share.errors import RemoteError
-from gaponet.share.places import open_target
-from gaponet.share.target import INDEX, Index, Target, download, naming, read_index
+from gaponet.share.remote import INDEX, Index, Remote, RemoteError, download, file_errors, read_index
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,26 +33,41 @@ if TYPE_CHECKING:
 AGAIN = "push it again"
 
 
-class Pushed(Dataset):
-    """A dataset that is only read; every recording is compared with the content hash that was pushed."""
+def open_remote(address: str) -> Remote:
+    """Return the place at an address: USER/NAME or hf://USER/NAME of the Hub, or s3://, gs:// or file:// and a folder.
 
-    def __init__(self, target: Target, index: Index, folder: Path) -> None:
+    Raises:
+        RemoteError: The address is not valid.
+    """
+    if "://" in address and not address.startswith("hf://"):
+        from gaponet.share.bucket import Bucket
+
+        return Bucket(address)
+    from gaponet.share.hub import Hub
+
+    return Hub(address)
+
+
+class RemoteDataset(Dataset):
+    """A read-only dataset at a remote place; every recording is compared with the content hash that was pushed."""
+
+    def __init__(self, remote: Remote, index: Index, folder: Path) -> None:
         """Download and read the list of recordings, the robot and the splits.
 
         Args:
             folder: Working folder; the files of the index go into its folder `files`.
 
         Raises:
-            RemoteError: The place cannot be reached, or does not hold what it says.
+            RemoteError: The place cannot be reached, or its content differs from its index.
         """
         if index.kind != "dataset":
-            raise RemoteError(f"{target.address}: holds a run, not a dataset")
-        self._target, self._index, self.files, self.address = target, index, folder / "files", target.address
-        self._where: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
-        self._there = {place for place in index.files if "data" not in place.split("/")[:-1]}
-        download(target, index, sorted(self._there), self.files)
-        with naming(self.address, self.files):
-            self.robot, self._sets = datasets.pushed_robot(self.files), sets_under(self.files)
+            raise RemoteError(f"{remote.address}: holds a run, not a dataset")
+        self._remote, self._index, self.files, self.address = remote, index, folder / "files", remote.address
+        self._locations: dict[str, tuple[Set, dict[str, Any], int]] = {}  # content hash → set, episode, first row
+        self._present = {path for path in index.files if "data" not in path.split("/")[:-1]}
+        download(remote, index, sorted(self._present), self.files)
+        with file_errors(self.address, self.files):
+            self.robot, self._sets = datasets.downloaded_robot(self.files), sets_under(self.files)
             made = Dataset.create(Path(mkdtemp(dir=folder)) / index.name, self.robot)
             for part in self._sets:
                 if part.ours is None:
@@ -63,49 +76,49 @@ class Pushed(Dataset):
             super().__init__(made.path)
             if sorted(entry.hash for entry in self.entries) != sorted(index.contents):
                 raise RemoteError(f"the sequences listed are not those of {INDEX}; {AGAIN}")
-            datasets.bring(self.files / datasets.BESIDE, self.path, self)
+            datasets.copy_sidecars(self.files / datasets.SIDECAR, self.path, self)
 
     def fetch(self, entries: list[Entry]) -> list[str]:
-        """Download the files that hold these recordings and are not here yet; returns all that are here."""
-        with naming(self.address, self.files):
-            files = {part.data_file(episode) for part, episode, _ in (self._where[entry.hash] for entry in entries)}
-            wanted = {file.relative_to(self.files).as_posix() for file in files} - self._there
-            if strange := wanted - self._index.files.keys():
-                raise RemoteError(f"{min(strange)} is not in {INDEX}; {AGAIN}")
+        """Download the missing files with these recordings; return all files that are on this machine."""
+        with file_errors(self.address, self.files):
+            files = {part.data_file(episode) for part, episode, _ in (self._locations[entry.hash] for entry in entries)}
+            wanted = {file.relative_to(self.files).as_posix() for file in files} - self._present
+            if unlisted := wanted - self._index.files.keys():
+                raise RemoteError(f"{min(unlisted)} is not in {INDEX}; {AGAIN}")
         if wanted:
-            download(self._target, self._index, sorted(wanted), self.files)
-            self._there |= wanted
-        return sorted(self._there)
+            download(self._remote, self._index, sorted(wanted), self.files)
+            self._present |= wanted
+        return sorted(self._present)
 
     def channels(self, entry: Entry, names: tuple[str, ...]) -> dict[str, Array]:
-        """Some channels of one sequence, (T, n) float32 each; all of it is downloaded and checked.
+        """Return some channels of one sequence, (T, n) float32 each; the whole sequence is downloaded and checked.
 
         Raises:
-            RemoteError: It cannot be reached, or is not the one that was pushed.
+            RemoteError: The sequence cannot be reached, or is not the one that was pushed.
         """
         self.fetch([entry])
-        part, episode, first = self._where[entry.hash]
-        with naming(self.address, self.files):
+        part, episode, first = self._locations[entry.hash]
+        with file_errors(self.address, self.files):
             table = _rows_of(part.data_file(episode), first, entry.rows)
             sequence = to_sequence(read_episode(part, episode, self.robot, table), self.robot, entry.meta)
-            if replace(sequence, meta=entry.meta).content_hash() != entry.hash:  # as it was first recorded
+            if replace(sequence, meta=entry.meta).content_hash() != entry.hash:  # motion and unit as recorded
                 raise RemoteError(f"'{entry.id}' is not what was pushed, by its content hash; {AGAIN}")
         return {name: getattr(sequence, name) for name in names}
 
     @property
     def read_only(self) -> bool:
-        """Always."""
+        """True: a remote dataset cannot be changed."""
         return True
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Refused."""
+        """Raise DatasetError: a remote dataset cannot be changed."""
         raise DatasetError(f"{self.address}: is only read; to change it, gaponet pull it and push it again")
         yield
 
     def _journal(self) -> Iterator[Entry]:
         for part in self._sets:
-            rows: dict[Path, int] = {}  # of a data file, before the next episode
+            rows: dict[Path, int] = {}  # of each data file, before the next episode
             for episode in part.episodes:
                 file = part.data_file(episode)
                 meta = SequenceMeta(**(episode["stated"] | {"robot": self.robot.name}))
@@ -113,21 +126,21 @@ class Pushed(Dataset):
                 channels = tuple(c for c in ARRAYS if FEATURES[c] in part.features)
                 found = episode["findings"]
                 entry = Entry(entry_id(meta, digest), digest, part.dt, episode["length"], channels, meta, found)
-                self._where[digest], rows[file] = (part, episode, first), first + entry.rows
+                self._locations[digest], rows[file] = (part, episode, first), first + entry.rows
                 yield entry
 
 
-def open_pushed(address: str) -> Pushed:
-    """Open a dataset that was pushed; what is downloaded of it is deleted with the object.
+def open_remote_dataset(address: str) -> RemoteDataset:
+    """Open a pushed dataset; downloaded files are deleted with the object.
 
     Raises:
-        RemoteError: The place cannot be reached, or does not hold what it says.
+        RemoteError: The place cannot be reached, or its content differs from its index.
     """
-    target = open_target(address)
-    index = read_index(target, target.index())
+    remote = open_remote(address)
+    index = read_index(remote, remote.index())
     folder = Path(mkdtemp(prefix="gaponet-"))
     try:
-        pushed = Pushed(target, index, folder)
+        pushed = RemoteDataset(remote, index, folder)
     except BaseException:
         shutil.rmtree(folder)
         raise
@@ -137,7 +150,7 @@ def open_pushed(address: str) -> Pushed:
 
 @sandboxed(RemoteError, "pyarrow.parquet")
 def _rows_of(file: Path, first: int, rows: int) -> pa.Table:
-    """Rows of a data file; they fill whole row groups, and no others are read."""
+    """Read rows of a data file that fill whole row groups; no other row group is read."""
     import pyarrow.parquet as pq
 
     parquet = pq.ParquetFile(file)

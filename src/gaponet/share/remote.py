@@ -1,0 +1,184 @@
+"""Remote places for datasets and runs, and the index file that lists the content of a place."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal, Protocol
+
+from annotated_types import Interval, Len
+
+from gaponet.base.errors import GAPONetError
+from gaponet.base.structure import Name, Sha256, parse_json
+
+Kind = Literal["dataset", "run"]
+FORMAT = 1
+INDEX = "gaponet.json"
+MAX_INDEX_BYTES = 96 << 20  # 67 bytes per sequence
+MAX_FOLDER_DEPTH = 8
+MAX_PATH_LENGTH = 400  # characters
+MIN_FREE_BYTES = 1 << 28  # disk space that a download leaves free
+PROGRAMMING_ERRORS = (AssertionError, AttributeError, ModuleNotFoundError, NameError, TypeError)
+
+
+class RemoteError(GAPONetError):
+    """A remote place cannot be reached, or its content differs from its index."""
+
+
+@dataclass(frozen=True)
+class FileRecord:
+    """Size of a file in bytes and SHA-256 of its content."""
+
+    size: Annotated[int, Interval(ge=0, le=1 << 40)]
+    sha256: Sha256
+
+    @classmethod
+    def of(cls, file: Path) -> FileRecord:
+        """Measure a file."""
+        with file.open("rb") as content:
+            return cls(file.stat().st_size, hashlib.file_digest(content, "sha256").hexdigest())
+
+
+@dataclass(frozen=True)
+class Index:
+    """Content of gaponet.json: the list of pushed files.
+
+    Attributes:
+        contents: Content hashes of a dataset's sequences, or the hash of a run's network.
+        files: Files by their path below the place, with forward slashes.
+    """
+
+    format: int
+    kind: Kind
+    name: Name
+    contents: Annotated[tuple[Name, ...], Len(1, 1_000_000)]
+    files: Annotated[dict[str, FileRecord], Len(1, 20_000)]
+
+    def __post_init__(self) -> None:
+        for path in self.files:
+            parts = path.split("/")
+            invalid = any(p in ("", "..") or p.startswith(".") or "\\" in p or not p.isprintable() for p in parts)
+            too_long = len(parts) > MAX_FOLDER_DEPTH or len(path) > MAX_PATH_LENGTH
+            if invalid or too_long or ":" in path or path == INDEX:
+                raise RemoteError(f"files: '{path}' is not the name of a file inside a folder")
+        if len({path.casefold() for path in self.files}) < len(self.files):
+            raise RemoteError("files: two names differ in capitals alone")
+        folders = {str(folder) for path in self.files for folder in PurePosixPath(path).parents}
+        if both := folders & self.files.keys():
+            raise RemoteError(f"files: '{min(both)}' is a file and a folder")
+
+    def text(self) -> str:
+        """Return the content of gaponet.json."""
+        return json.dumps(asdict(self), indent=1) + "\n"
+
+    def size(self, paths: Collection[str]) -> int:
+        """Return the total bytes of some files."""
+        return sum(self.files[path].size for path in paths)
+
+
+class Remote(Protocol):
+    """A remote place for one dataset or run. Its methods raise RemoteError for errors of network and place."""
+
+    address: str
+
+    def index(self, kind: Kind | None = None) -> bytes | None:
+        """Return the content of gaponet.json, None if nothing was pushed. The Hub looks for `kind` only, if given."""
+
+    def sizes(self, paths: list[str], index: Index) -> list[int | None]:
+        """Return the bytes of files of the index as the place has them; None for a missing one."""
+
+    def outdated(self, index: Index) -> set[str]:
+        """Return the files of the index that are missing at the place, or damaged there as far as it can tell."""
+
+    def fetch(self, paths: list[str], index: Index, folder: Path) -> None:
+        """Download files of the index into a folder, except those that an earlier download left there."""
+
+    def store(self, folder: Path, index: Index, paths: Collection[str], private: bool) -> None:
+        """Upload files and then the index.
+
+        Args:
+            folder: Folder with all files of the index.
+            paths: Files that must be uploaded.
+            private: Make a new repository readable by its owner only.
+
+        Raises:
+            RemoteError: Somebody else pushed since `index` was called.
+        """
+
+    def prune(self, index: Index) -> int:
+        """Delete files that neither this index nor the one before it lists; return their number."""
+
+
+def lost_race(address: str) -> RemoteError:
+    """Return the error of the slower one of two simultaneous pushes."""
+    return RemoteError(f"{address}: somebody else pushed at the same time, and nothing was replaced; push again")
+
+
+def read_index(remote: Remote, content: bytes | None) -> Index:
+    """Parse and check the content of gaponet.json.
+
+    Raises:
+        RemoteError: It is missing, damaged or of a newer format.
+    """
+    if content is None:
+        raise RemoteError(f"{remote.address}: nothing was pushed there")
+    where = f"{remote.address}: {INDEX}"
+    index = parse_json(Index, content, where, RemoteError, "push it again, with --replace")
+    if index.format > FORMAT:
+        raise RemoteError(f"{where}: format {index.format} is newer than this gaponet reads; upgrade gaponet")
+    return index
+
+
+def download(remote: Remote, index: Index, paths: list[str], folder: Path) -> None:
+    """Download files of an index into a folder, and compare their sizes and hashes.
+
+    Raises:
+        RemoteError: A file is missing or differs, or the disk is too small.
+    """
+    folder.mkdir(exist_ok=True)
+    wrong = "{}: {} is not the file that was pushed, by its size or hash; push it again, or else with --replace"
+    for path, size in zip(paths, remote.sizes(paths, index), strict=True):
+        if size != index.files[path].size:
+            raise RemoteError(wrong.format(remote.address, path))
+    needed, free = index.size(paths), shutil.disk_usage(folder).free
+    if needed + MIN_FREE_BYTES > free:
+        raise RemoteError(f"{remote.address}: has {needed / 1e9:.2f} GB; {free / 1e9:.2f} GB of the disk are free")
+    remote.fetch(paths, index, folder)
+    for path in paths:
+        if FileRecord.of(folder / path) != index.files[path]:
+            (folder / path).unlink()
+            raise RemoteError(wrong.format(remote.address, path))
+
+
+@contextmanager
+def network_errors(address: str, *unchanged: type[Exception]) -> Iterator[None]:
+    """Turn errors of the network libraries into a RemoteError with the address and without secrets.
+
+    Args:
+        unchanged: Errors that pass as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, (GAPONetError, *PROGRAMMING_ERRORS, *unchanged)):
+            raise
+        text = re.sub(r"\?\S+", "?…", " ".join(str(error).split()))  # a query may hold a signature
+        missing, refused = (isinstance(error, kind) for kind in (FileNotFoundError, PermissionError))
+        reason = "not found: " * missing + "no permission: " * refused
+        raise RemoteError(f"{address}: {reason}{text[:300] or type(error).__name__}") from None
+
+
+@contextmanager
+def file_errors(address: str, folder: Path) -> Iterator[None]:
+    """Turn errors about downloaded files into a RemoteError that names the address instead of the folder."""
+    try:
+        yield
+    except GAPONetError as error:
+        text = str(error).replace(f"{folder}/", "").removeprefix(f"{address}: ")
+        raise RemoteError(f"{address}: {text}") from None
