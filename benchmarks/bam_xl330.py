@@ -17,7 +17,7 @@ import numpy as np
 
 import gaponet as gp
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import SERVO, RobotSpec, load_robot
+from gaponet.robot.spec import SERVO_FIELDS, RobotSpec, load_robot
 from gaponet.sim.metrics import standard_error
 from gaponet.sim.replay import replay
 from gaponet.sysid.identify import identify
@@ -54,7 +54,7 @@ def judge(sequences: list[Sequence], held: float, law: str) -> dict[str, object]
     return {
         "held": held, "law": law, "seconds": time.monotonic() - began,
         "motions": [s.meta.motion for s in test], "nominal": errors(test, robot), "test": errors(test, fit.robot),
-        "train": errors(train, fit.robot), "servo": {f: float(getattr(fit.robot, f)[0]) for f in SERVO},
+        "train": errors(train, fit.robot), "servo": {f: float(getattr(fit.robot, f)[0]) for f in SERVO_FIELDS},
         "std": fit.std["motor"],
     }  # fmt: skip
 

@@ -23,7 +23,7 @@ from gaponet.data.log import Channel, Log
 from gaponet.data.sequence import SequenceMeta, to_sequence
 from gaponet.data.store import Dataset
 from gaponet.robot.finding import Finding
-from gaponet.robot.new import Wanted, new_robot
+from gaponet.robot.new import RobotOptions, new_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.dynamics import gravity_of
 
@@ -182,7 +182,7 @@ def main() -> None:
             folder = Path(place)
             (folder / "vendor.xml").write_text(robot.file())
             mounts = (f"hand={robot.bodies[-1]}:0,0,0",) if robot.payload else ()
-            wanted = Wanted(rate=robot.rate, mounts=mounts, name="stranger", joints=robot.joints)
+            wanted = RobotOptions(rate=robot.rate, mounts=mounts, name="stranger", joints=robot.joints)
             spec = new_robot(folder / "vendor.xml", folder / "robot", wanted).robot
             robot = replace(robot, joints=spec.joint_names) if "/" not in robot.joints[0] else robot
             logs = list(robot.recordings(MOTIONS, MOTIONS * SECONDS))

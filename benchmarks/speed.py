@@ -36,7 +36,7 @@ from gaponet.nn.onnx_export import trained_network
 from gaponet.nn.training.config import RewardConfig, TrainConfig
 from gaponet.nn.training.env import DeltaEnv
 from gaponet.nn.training.ppo import PPO
-from gaponet.robot.folder import kept_robot
+from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import idle_joints
@@ -163,7 +163,7 @@ def bench_latency(run: Path, calls: int = 3000, threads: int = 1) -> dict[str, A
 def bench_aligned(run: Path, num_envs: int, rounds: int, steps: int = TURN_STEPS) -> Speeds:
     """Control steps per second of the nominal and the aligned simulator; idle limbs are locked in both."""
     model = GapModel.load(run, threads=0)
-    robot = kept_robot(run, model.card["robot"])
+    robot = load_stored_robot(run, model.card["robot"])
     locked = idle_joints(robot, robot.operated)
     nominal = BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 0, locked)
     aligned = AlignedSim(robot, model, 0.0, num_envs=num_envs, locked=locked)

@@ -21,7 +21,7 @@ from gaponet.base.errors import DatasetError, NoGainError, UsageError
 from gaponet.base.files import FOLDER_MARKER
 from gaponet.base.progress import progress_bar, with_note
 from gaponet.data.store import Dataset
-from gaponet.robot.folder import MOVE_KEPT
+from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def import_logs(
 
     spec = robot if isinstance(robot, RobotSpec) else load_robot(robot)
     if Dataset.peek(out, spec) is not None:
-        require_stored_robot(Path(out), spec, DatasetError, MOVE_KEPT)
+        require_stored_robot(Path(out), spec, DatasetError, MOVE_STORED_ROBOT)
     with progress_bar("importing") as update:
         return run(
             src, spec, unit_id, payload_mass, out,
@@ -237,7 +237,7 @@ def identify(
     from gaponet.base.files import lock_folder, write_json
     from gaponet.data.split import split_entries
     from gaponet.nn.training.budget import Budget
-    from gaponet.robot.folder import ORIGIN, save_robot
+    from gaponet.robot.folder import PROVENANCE_FILE, save_robot
     from gaponet.sim.replay import whole_errors
     from gaponet.sysid.fit import BETTER
     from gaponet.sysid.identify import identify as fit
@@ -263,7 +263,7 @@ def identify(
         save_robot(found.robot, Path(out))
         nominal = given if spec.nominal is None else whole_errors(val, spec.nominal, threads)
         val_errors = {"nominal": nominal, "identified": left}
-        write_json(Path(out) / ORIGIN, {
+        write_json(Path(out) / PROVENANCE_FILE, {
             "dataset": data.address or os.path.relpath(data.path, out),
             "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
             "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},
@@ -365,14 +365,14 @@ def evaluate(
     """
     from gaponet.report import evaluate as measuring
     from gaponet.report.candidate import is_robot
-    from gaponet.robot.folder import keeps_robot, kept_robot
+    from gaponet.robot.folder import has_stored_robot, load_stored_robot
     from gaponet.sim.model import model_hash
 
     folder = _run(run)
     data, spec = _opened(dataset, robot, folder)
     target, kept = None, spec
-    if robot is not None and (is_robot(folder) or keeps_robot(folder)):
-        kept = load_robot(folder) if is_robot(folder) else kept_robot(folder, spec.name)
+    if robot is not None and (is_robot(folder) or has_stored_robot(folder)):
+        kept = load_robot(folder) if is_robot(folder) else load_stored_robot(folder, spec.name)
     if model_hash(kept) != model_hash(spec):
         target, spec = spec, kept.nominal or kept
     with progress_bar("evaluating") as update:
@@ -478,7 +478,7 @@ def adapt_robot(
             it was known; nothing is written.
     """
     from gaponet.base.files import lock_folder, write_text
-    from gaponet.robot.folder import ORIGIN, save_robot
+    from gaponet.robot.folder import PROVENANCE_FILE, save_robot
     from gaponet.sim.replay import whole_errors
     from gaponet.sysid.fit import BETTER
     from gaponet.sysid.refit import refit
@@ -515,8 +515,8 @@ def adapt_robot(
                 f"{spec.name} as it is known {before:.2f}; give longer logs (--seconds), or keep the robot as it is"
             )
         save_robot(found.robot, Path(out))
-        if (spec.folder / ORIGIN).is_file():  # which motions identification saw is still to be known
-            write_text(Path(out) / ORIGIN, (spec.folder / ORIGIN).read_text(encoding="utf-8"))
+        if (spec.folder / PROVENANCE_FILE).is_file():  # which motions identification saw is still to be known
+            write_text(Path(out) / PROVENANCE_FILE, (spec.folder / PROVENANCE_FILE).read_text(encoding="utf-8"))
         _keep_known(Path(out), sequences, [], {}, before_known)
     return AdaptedRobot(found.robot, unit, errors, found.payload_mass, found.payload_std)
 

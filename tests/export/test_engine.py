@@ -31,7 +31,7 @@ from gaponet.export.program import program
 from gaponet.export.scene_facts import require_scene
 from gaponet.export.step import delta_step
 from gaponet.nn.config import ModelConfig
-from gaponet.robot.identity import lines
+from gaponet.robot.fingerprint import model_fingerprint
 from gaponet.robot.spec import SERVO_TERMS, load_robot
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.model import build_model, model_hash
@@ -164,7 +164,7 @@ def test_an_mjcf_with_servos_is_the_simulator(name):
     dt = 1 / 60  # no round number of physics steps: all digits count
     again = mujoco.MjModel.from_xml_string(mjcf_text(robot, dt, 0.5))
     own = build_model(robot, 0.5, dt=dt)
-    assert list(lines(again)) == list(lines(own))
+    assert list(model_fingerprint(again)) == list(model_fingerprint(own))
     assert again.opt.timestep == own.opt.timestep
 
 

@@ -13,7 +13,7 @@ from gaponet.data.store import Dataset
 from gaponet.report.candidate import Candidate, choose
 from gaponet.report.verdict import added, next_step, verdict
 from gaponet.report.view.side_by_side import pick, side_by_side
-from gaponet.robot.folder import ORIGIN, save_robot
+from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def fitted(arm, data, tmp_path):
     parts = {p: {e.id: e.hash} for p, e in zip(("train", "val", "test"), data.entries, strict=True)}
     motions = {part: [f"motion{i}"] for i, part in enumerate(parts)}
     origin = {"dataset": "../data", "parts": parts, "motions": motions, "val_mpjae": {}}
-    (tmp_path / "fitted" / ORIGIN).write_text(json.dumps(origin))
+    (tmp_path / "fitted" / PROVENANCE_FILE).write_text(json.dumps(origin))
     return tmp_path / "fitted"
 
 
@@ -60,9 +60,9 @@ def test_one_unit_alone_can_be_asked(fitted, data):
 
 
 def test_a_folder_that_does_not_say_what_it_was_fitted_to_has_no_held_out_recordings(fitted, data):
-    (fitted / ORIGIN).unlink()
+    (fitted / PROVENANCE_FILE).unlink()
     assert choose([fitted], data) == (data.entries, False)
-    (fitted / ORIGIN).write_text('{"parts": 3}')
+    (fitted / PROVENANCE_FILE).write_text('{"parts": 3}')
     with pytest.raises(RobotError, match=r"identified\.json.*identify again"):
         choose([fitted], data)
 

@@ -15,7 +15,7 @@ from gaponet.report.candidate import Candidate, choose
 from gaponet.report.evaluate import evaluate
 from gaponet.report.gap import gap_by_step
 from gaponet.report.view.side_by_side import side_by_side
-from gaponet.robot.folder import kept_robot
+from gaponet.robot.folder import load_stored_robot
 from gaponet.robot.spec import load_robot
 from gaponet.share.reading import open_dataset
 from gaponet.sim.model import model_hash
@@ -79,7 +79,7 @@ def test_an_identified_simulator_of_the_same_robot_is_another_start_and_the_same
 
 
 def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(data, arm, tmp_path, capsys):
-    assert model_hash(kept_robot(data.path, "arm")) == model_hash(arm)
+    assert model_hash(load_stored_robot(data.path, "arm")) == model_hash(arm)
     shutil.rmtree(arm.folder)
     assert open_dataset(data.path, None)[1].kp.tolist() == [20.0, 20.0]
     stranger = write_arm(tmp_path / "other" / "arm", toml=STIFF)
@@ -101,7 +101,7 @@ def test_the_dataset_keeps_its_robot_and_takes_no_recordings_of_another_one(data
     assert main([*words, "--robot", str(stranger.folder)]) == 2
     assert "its nominal simulator is" in " ".join(capsys.readouterr().err.split())
     assert not (data.path / "recordings").exists()
-    assert kept_robot(data.path, "arm").kp.tolist() == [20.0, 20.0]
+    assert load_stored_robot(data.path, "arm").kp.tolist() == [20.0, 20.0]
 
 
 def test_a_dataset_keeps_the_nominal_robot_where_an_identified_one_is_given(arm, tmp_path):

@@ -3,7 +3,7 @@ import pytest
 from contacts import Contacts
 
 from gaponet.base.errors import RobotError
-from gaponet.robot.collision import CLEARANCE, Collision, read_shapes, segment_distance
+from gaponet.robot.collision import CLEARANCE_M, Collision, read_shapes, segment_distance
 from gaponet.robot.spec import load_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.robot_check import check_robot
@@ -42,7 +42,7 @@ def test_hanging_arms_are_clear_and_folded_ones_are_not(h1):
     hit = robot.qpos_home.copy()
     hit[robot.index(["left_shoulder_yaw_joint"])] = -1.5  # forearm into the belly
     distances = collision.distance(np.stack([robot.qpos_home, hit]))
-    assert distances[0] > CLEARANCE
+    assert distances[0] > CLEARANCE_M
     assert distances[1] < 0
     nearest = collision.nearest(collision.along(hit[None]))
     assert "torso_link" in nearest

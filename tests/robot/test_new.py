@@ -10,7 +10,7 @@ from vendors import MJCF, URDF, write_mjcf, write_urdf
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.robot.mjcf import read_mjcf
-from gaponet.robot.new import Made, Wanted, new_robot
+from gaponet.robot.new import NewRobot, RobotOptions, new_robot
 from gaponet.sim.model import build_model
 from gaponet.sim.robot_check import check_robot
 
@@ -18,11 +18,11 @@ GAINS = {"kp": ("20",), "kd": ("1",)}
 ARM = ("shoulder", "elbow", "roll")
 
 
-def make(tmp_path: Path, model: Path | None = None, **wanted) -> Made:
-    return new_robot(model or write_mjcf(tmp_path / "repo"), tmp_path / "out", Wanted(**(GAINS | wanted)))
+def make(tmp_path: Path, model: Path | None = None, **wanted) -> NewRobot:
+    return new_robot(model or write_mjcf(tmp_path / "repo"), tmp_path / "out", RobotOptions(**(GAINS | wanted)))
 
 
-def written(made: Made) -> dict[str, dict]:
+def written(made: NewRobot) -> dict[str, dict]:
     table = tomllib.loads((made.robot.folder / "robot.toml").read_text(encoding="utf-8"))
     return {joint["name"]: joint for joint in table["joint"]}
 
@@ -34,7 +34,7 @@ def inertia(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
     return columns
 
 
-def furthest(made: Made) -> tuple[float, float]:
+def furthest(made: NewRobot) -> tuple[float, float]:
     """Largest difference of gravity (N·m) and inertia (kg·m²) at kept joints over 50 postures, other joints at home."""
     ours, theirs = build_model(made.robot), made.vendor
     a, b = mujoco.MjData(ours), mujoco.MjData(theirs)

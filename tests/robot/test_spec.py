@@ -8,12 +8,12 @@ from arm import TOML, XML, write_arm
 
 from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import as_option, available, load_robot
+from gaponet.robot.spec import load_robot, packaged_robots, robot_argument
 from gaponet.sim.model import build_model, model_hash
 
 
 def test_the_package_holds_its_robots():
-    assert available() == ["fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"]
+    assert packaged_robots() == ["fr3", "g1_23", "g1_29", "h1_2", "so101", "ur10e", "xl330_bench"]
 
 
 def test_h1_2_operates_the_ten_arm_joints_of_27():
@@ -145,7 +145,7 @@ def test_a_folder_as_an_option_is_found_by_that_option(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_arm(Path("mine"))
     for folder in (Path("mine"), tmp_path / "mine", Path("..") / tmp_path.name / "mine"):
-        assert load_robot(as_option(folder)).name == "arm"
+        assert load_robot(robot_argument(folder)).name == "arm"
 
 
 def test_a_name_is_never_a_folder_of_that_name_and_a_path_never_a_packaged_robot(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 from arm import XML, write_arm
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.spec import SERVO, SERVO_TERMS, STOPS
+from gaponet.robot.spec import SERVO_FIELDS, SERVO_TERMS, STOP_FIELDS
 from gaponet.sim.batch import BatchSim, OneByOne, ramped
 from gaponet.sim.model import build_model
 
@@ -166,7 +166,7 @@ OTHER = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("field", sorted(set(SERVO) - set(STOPS)))
+@pytest.mark.parametrize("field", sorted(set(SERVO_FIELDS) - set(STOP_FIELDS)))
 def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     """One joint's value changes; the other joint keeps the robot's own."""
     robot = write_arm(tmp_path, xml=XML.replace('range="-1.5 1.5"', 'range="-1.5 1.5" ref="0.1"'))
@@ -187,7 +187,7 @@ def test_servos_set_in_a_batch_move_as_a_robot_made_with_them(tmp_path, field):
     np.testing.assert_allclose(path["set"], path["made"], atol=1e-4 if field == "armature" else 1e-12)
 
 
-@pytest.mark.parametrize("field", [*STOPS, "delay", *SERVO_TERMS])
+@pytest.mark.parametrize("field", [*STOP_FIELDS, "delay", *SERVO_TERMS])
 def test_a_value_that_simulations_cannot_take_is_refused(tmp_path, field):
     robot = write_arm(tmp_path)
     values = {f: np.full((1, 1), 0.1) for f in ("kp", "damping", "frictionloss", "armature", "offset", field)}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arm import write_arm
 
-from gaponet.robot.spec import SERVO_TERMS, available, load_robot
+from gaponet.robot.spec import SERVO_TERMS, load_robot, packaged_robots
 from gaponet.sim.batch import BatchSim, Condition
 
 pytest.importorskip("torch")
@@ -62,7 +62,7 @@ class Both:
 
 
 @pytest.mark.parametrize("friction", [False, True])
-@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("name", packaged_robots())
 def test_a_second_of_motion_is_mujocos(name, friction):
     robot = load_robot(name)
     if not friction:
@@ -79,7 +79,7 @@ def test_a_second_of_motion_is_mujocos(name, friction):
     assert np.ptp(both.ours.qpos, axis=0).max() > 1e-3  # the simulations are not one
 
 
-@pytest.mark.parametrize("name", available())
+@pytest.mark.parametrize("name", packaged_robots())
 def test_holding_for_ten_seconds_is_mujocos(name):
     robot = load_robot(name)
     both = Both(robot, both_rates=False)

@@ -16,7 +16,7 @@ from gaponet.cli.identify import COLUMNS
 from gaponet.cli.options import Flag, Folder, Json, Robot, Unit, like
 from gaponet.cli.out import Out
 from gaponet.report.tables import mrad
-from gaponet.robot.spec import RobotSpec, as_option
+from gaponet.robot.spec import RobotSpec, robot_argument
 
 Known = Annotated[
     Folder, tyro.conf.arg(help="Robot folder (with --out), or run folder of gaponet train.", metavar="ROBOT|RUN")
@@ -66,7 +66,7 @@ def adapt(
         )
         servos = _servos(made.robot)
         _show(screen, made.unit, servos, made.payload_mass, made.payload_std)
-        screen.say(f"next: gaponet run --motion FILE --robot {as_option(out)} --compensate")
+        screen.say(f"next: gaponet run --motion FILE --robot {robot_argument(out)} --compensate")
         screen.result({
             "unit_id": made.unit, "before": before, "after": after, "servos": servos, "robot": str(out),
             "payload_mass": made.payload_mass, "payload_std": made.payload_std,

@@ -11,7 +11,7 @@ from gaponet.base.progress import progress_bar
 from gaponet.cli.options import Data, Json, Logs, Robot, Source
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset
-from gaponet.robot.finding import some
+from gaponet.robot.finding import abbreviate
 from gaponet.share.reading import open_dataset
 
 
@@ -71,7 +71,7 @@ def _split(
     virtual = ", VIRTUAL robots" if any(e.meta.virtual for e in data.entries) else ""
     out.table(f"{data.path.name} by {by}{virtual}; parts share no recording", columns, [
         [part, f"{r['sequences']:,}", f"{r['hours']:.2f}", f"{r['frames']:,}", str(r["motions"]),
-         some(r["units"]), some(r["payloads_kg"])]
+         abbreviate(r["units"]), abbreviate(r["payloads_kg"])]
         for part, r in rows.items()
     ])  # fmt: skip
     out.say(f"written: {path!s}")
@@ -142,7 +142,7 @@ def _remove(dataset: Data, ids: tyro.conf.Positional[tuple[str, ...]], json: Jso
     """
     out, data = Out(json), Dataset(dataset)
     gone = data.remove(ids)
-    out.say(f"removed {len(gone)}: {some([e.id for e in gone])}; {data.path!s} now holds {len(data)}")
+    out.say(f"removed {len(gone)}: {abbreviate([e.id for e in gone])}; {data.path!s} now holds {len(data)}")
     out.result({"removed": [e.id for e in gone], "sequences": len(data)})
 
 

@@ -17,7 +17,7 @@ from gaponet.cli.options import Json
 from gaponet.cli.out import Out, writes
 from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.report.verdict import verdict
-from gaponet.robot.spec import as_option, load_robot
+from gaponet.robot.spec import load_robot, robot_argument
 
 # Many small rounds: minutes, not hours.
 QUICK = PretrainingConfig(rounds=12, num_envs=128, steps=300, gradient_steps=200)
@@ -61,7 +61,8 @@ def demo(
         if not (known / "robot.toml").is_file():
             identify(str(dataset), known, budget=budget, robot=robot, holdout_units=holdout)
         screen.say(
-            f": does a network find more?  (gaponet train {dataset} --robot {as_option(known)} --out {run})", "3 Use"
+            f": does a network find more?  (gaponet train {dataset} --robot {robot_argument(known)} --out {run})",
+            "3 Use",
         )
         resume, config = (run / "checkpoint.pt").is_file(), TrainConfig(warm_start=QUICK)
         try:
@@ -78,7 +79,7 @@ def demo(
     for sentence in verdict(found["methods"]):
         screen.say(sentence)
     screen.say(f"report: {path}  ({time.monotonic() - began:.0f} s in all)")
-    screen.say(f"next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot {as_option(known)}")
+    screen.say(f"next: gaponet export {known} --to mjcf; gaponet view {dataset} --robot {robot_argument(known)}")
     screen.result(found)
 
 

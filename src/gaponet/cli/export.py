@@ -10,7 +10,7 @@ import tyro
 from gaponet.base.errors import UsageError
 from gaponet.cli.options import Folder, Json
 from gaponet.cli.out import Out
-from gaponet.robot.folder import KEPT, keeps_robot
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot
 from gaponet.robot.spec import load_robot
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def _randomization(
 
 def _simulator(holder: Path) -> Path:
     """The robot folder of a run or an artifact, or the folder itself."""
-    return holder / KEPT if keeps_robot(holder) else holder
+    return holder / STORED_ROBOT if has_stored_robot(holder) else holder
 
 
 def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: float) -> None:
@@ -135,13 +135,15 @@ def _network(screen: Out, run: Path, to: str, out: Path | None, payload_mass: fl
     else:
         from gaponet.nn.onnx_export import drawn_states, trained_network
         from gaponet.nn.onnx_export import export as write
-        from gaponet.robot.folder import kept_robot, save_robot
+        from gaponet.robot.folder import load_stored_robot, save_robot
 
         path = out or run / "model"
         card, config = GapModel.read_card(run / "model" / CARD)
         net = trained_network(run, config, len(card["joint_names"]))
         difference = write(net, path, card, drawn_states(net))
-        if path != run / "model" and keeps_robot(run):
-            save_robot(kept_robot(run, card["robot"]), path / KEPT)  # so that commands can be transferred
+        if path != run / "model" and has_stored_robot(run):
+            save_robot(
+                load_stored_robot(run, card["robot"]), path / STORED_ROBOT
+            )  # so that commands can be transferred
     screen.say(f"{path}: differs by {difference:.1e} rad from what was trained")
     screen.result({"path": str(path), "to": to, "parity_rad": difference})

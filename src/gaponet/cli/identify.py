@@ -12,7 +12,7 @@ from gaponet.base.text import format_uncertainty
 from gaponet.cli.options import Flag, Json, Robot, Source, like
 from gaponet.cli.out import Out, writes
 from gaponet.report.tables import mrad
-from gaponet.robot.spec import as_option
+from gaponet.robot.spec import robot_argument
 from gaponet.sim.metrics import standard_error
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def identify(
     )
     found = made.found
     _tell(screen, found, made.val, details)
-    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {as_option(out)}")
+    screen.say(f"{made.seconds:.0f} s; robot folder {out}; next: gaponet gap {dataset} --robot {robot_argument(out)}")
     screen.result({
         "chosen": found.chosen, "joints": _values(found), "std": found.std, "val_mpjae": made.val_mpjae,
         "val_standard_error": {k: standard_error(v) for k, v in made.val.items()},

@@ -15,7 +15,7 @@ from gaponet.cli.options import Flag, Json, Logs, Source, like
 from gaponet.cli.out import Out
 from gaponet.data.signals import FAST
 from gaponet.plugins import attempt
-from gaponet.robot.finding import some
+from gaponet.robot.finding import abbreviate
 from gaponet.robot.spec import RobotSpec, load_robot
 
 if TYPE_CHECKING:
@@ -173,7 +173,10 @@ def _unrecorded(entries: list[Entry], robot: RobotSpec) -> list[str]:
     lacking = [j for j in robot.operated if any(j in e.meta.notes.get("held_at_home", ()) for e in entries)]
     if not lacking:
         return []
-    return [f"{some(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says where"]
+    return [
+        f"{abbreviate(lacking)}: not in every recording, taken to stand at home there; [posture] in logs.toml says "
+        "where"
+    ]
 
 
 def joint_map(pairs: tuple[str, ...]) -> dict[str, str] | None:

@@ -38,7 +38,7 @@ def record(
     from gaponet.data.importer import findings
     from gaponet.data.sequence import SequenceMeta, to_sequence
     from gaponet.data.store import Dataset
-    from gaponet.robot.folder import MOVE_KEPT
+    from gaponet.robot.folder import MOVE_STORED_ROBOT
     from gaponet.sim.model import require_stored_robot
 
     connection, side = args.connection, args.payload_side
@@ -51,7 +51,7 @@ def record(
     spec = resolve_robot(request)
     known = Dataset.peek(out, spec)
     if known is not None:  # before anything moves
-        require_stored_robot(out, spec, DatasetError, MOVE_KEPT)
+        require_stored_robot(out, spec, DatasetError, MOVE_STORED_ROBOT)
     written: list[str] = []
     errors: list[dict[str, Any]] = []
     for count, name in enumerate([name for name in motion for _ in range(repetitions)], seed):

@@ -13,11 +13,11 @@ from gaponet.base.errors import UsageError
 from gaponet.base.files import atomic_write
 from gaponet.cli.options import Flag, Json, Model
 from gaponet.cli.out import Out
-from gaponet.robot.spec import RobotSpec, as_option, available, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 from gaponet.share.reading import open_dataset
 
 if TYPE_CHECKING:
-    from gaponet.robot.new import Made
+    from gaponet.robot.new import NewRobot
 
 POSTURES = 300  # of the logs
 
@@ -25,7 +25,7 @@ POSTURES = 300  # of the logs
 def list_robots(json: Json = False) -> None:
     """Robots in the package."""
     out = Out(json)
-    specs = [load_robot(name) for name in available()]
+    specs = [load_robot(name) for name in packaged_robots()]
     out.table("Robots", ["name", "joints", "operated", "Hz", "payload", "what it is"], [
         [s.name, str(len(s.joint_names)), str(len(s.operated)), f"{1 / s.dt:g}",
          ", ".join(m.side for m in s.payload_mounts) or "–", s.description] for s in specs
@@ -73,7 +73,7 @@ def check(
         payloads: kg in every mount, each held for a minute; default those of the data, or 0.
     """
     if not robot:
-        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(available())}) or a folder")
+        raise UsageError(f"gaponet robot check needs a robot name ({', '.join(packaged_robots())}) or a folder")
     out = Out(json)
     out.result(check_robot(out, load_robot(robot), data, payloads))
 
@@ -116,10 +116,10 @@ def new(
     from gaponet.report.view.portrait import prepare
 
     prepare()
-    from gaponet.robot.new import Wanted, new_robot
+    from gaponet.robot.new import RobotOptions, new_robot
 
     screen = Out(json)
-    made = new_robot(model, out, Wanted(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
+    made = new_robot(model, out, RobotOptions(joints, operated, kp, kd, effort_limit, mounts, packages, rate, keyframe,
                                         contacts, name))  # fmt: skip
     for note in made.notes:
         screen.say(f"  {note}", "   note", "cyan")
@@ -134,11 +134,13 @@ def new(
         screen.say(f"  no picture: {error}", "   note", "cyan")
     result = check_robot(screen, made.robot, None, ())
     screen.say(f"written: {out}/robot.toml, robot.xml{', picture.png' if picture else ''}")
-    screen.say(f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {as_option(out)} --out data")
+    screen.say(
+        f"Next: look at robot.toml and the picture; gaponet import LOGS --robot {robot_argument(out)} --out data"
+    )
     screen.result(result | {"folder": str(out), "notes": made.notes, "picture": picture and str(picture)})
 
 
-def _picture(made: Made, label: str, still: Callable[..., bytes]) -> Path:
+def _picture(made: NewRobot, label: str, still: Callable[..., bytes]) -> Path:
     """picture.png in the folder: the vendor's model beside ours, both at home."""
     from gaponet.sim.model import build_model
 

@@ -256,15 +256,15 @@ def listen(screen: Out, args: RunArgs, robot: RobotSpec, driver: Driver, clock: 
 def resolve_robot(args: RunArgs) -> RobotSpec:
     """The robot that the model's run keeps, which one named must be; without a model the one named, or the driver's."""
     from gaponet.base.errors import ModelError
-    from gaponet.robot.folder import keeps_robot, kept_robot
+    from gaponet.robot.folder import has_stored_robot, load_stored_robot
     from gaponet.robot.spec import load_robot
     from gaponet.sim.model import require_stored_robot
 
     place = None if args.model is None else args.model.parent if args.model.name == "model" else args.model
     if place is not None and args.robot is not None:
         return require_stored_robot(place, load_robot(args.robot), ModelError, "leave --robot out")
-    if place is not None and keeps_robot(place):
-        return kept_robot(place, "")
+    if place is not None and has_stored_robot(place):
+        return load_stored_robot(place, "")
     return load_robot(args.robot or ("so101" if args.driver == "so101" else "h1_2"))
 
 

@@ -11,7 +11,7 @@ from gaponet.cli.out import Out
 from gaponet.nn.artifact import CARD, GapModel
 from gaponet.report.methods import method, title
 from gaponet.report.run_files import read_config, read_metrics, read_progress
-from gaponet.robot.folder import kept_robot
+from gaponet.robot.folder import load_stored_robot
 
 
 def runs(
@@ -51,7 +51,7 @@ def _facts(run: Path, folder: Path) -> dict[str, Any]:
     card = GapModel.read_card(file)[0] if file.is_file() else {}
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else {}
     val = card.get("val_mpjae", {"model": last.get("best"), "nominal": last.get("nominal_mpjae")})
-    own = method(kind, kept_robot(run, config["robot"]))
+    own = method(kind, load_stored_robot(run, config["robot"]))
     measured = metrics.get("methods", {}).get(own, {})
     virtual = bool(card.get("virtual", False))
     return {

@@ -25,12 +25,12 @@ from gaponet.cli.main import COMMANDS, main
 from gaponet.cli.options import Flag, Json, Logs, Model
 from gaponet.cli.out import Out
 from gaponet.data.store import Dataset, dataset_hash
-from gaponet.robot.finding import some
-from gaponet.robot.spec import RobotSpec, as_option, available, load_robot
+from gaponet.robot.finding import abbreviate
+from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots, robot_argument
 
 if TYPE_CHECKING:
     from gaponet.data.log import Log
-    from gaponet.robot.new import Wanted
+    from gaponet.robot.new import RobotOptions
 
 RAN = "commands.sh"  # what ran to its end, a line each
 MADE_FROM, ROBOT = "start.json", "the model"
@@ -120,7 +120,7 @@ def start(
 
     prepare()  # before MuJoCo is imported, which the report's picture would be too late for
     from gaponet.data.reading import UnreadError
-    from gaponet.robot.new import Wanted
+    from gaponet.robot.new import RobotOptions
 
     screen, told = Out(json), out / "logs.toml"
     values = {"format": format, "position_unit": position_unit, "time_unit": time_unit, "rate": rate, "cut": cut}
@@ -131,7 +131,7 @@ def start(
                "rate": rate, "skip_bad": skip_bad, "allow_pickle": allow_pickle}  # fmt: skip
     files = _hashes(logs, out)
     made = _earlier(out, logs, files)
-    wanted = Wanted(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
+    wanted = RobotOptions(joints=joints, kp=kp, kd=kd, effort_limit=effort_limit)
     with contextlib.redirect_stdout(sys.stderr if json else sys.stdout):
         try:
             found = understand(model, logs, told, wanted, options, keep=not dry_run)
@@ -173,7 +173,7 @@ def start(
 
 
 def understand(
-    model: Path, logs: Path, told: Path, wanted: Wanted, options: dict[str, Any], keep: bool = True
+    model: Path, logs: Path, told: Path, wanted: RobotOptions, options: dict[str, Any], keep: bool = True
 ) -> Understood:
     """Compile the model, and read the first recording as it lies there, or by a logs.toml that is guessed from it.
 
@@ -194,8 +194,8 @@ def understand(
 
     with tempfile.TemporaryDirectory() as place:
         if (model / "robot.toml").is_file():
-            robot, packaged = load_robot(model), as_option(model)
-        elif not model.exists() and str(model) in available():
+            robot, packaged = load_robot(model), robot_argument(model)
+        elif not model.exists() and str(model) in packaged_robots():
             robot = load_robot(packaged := str(model))
         else:
             robot, packaged = new_robot(model, Path(place) / "robot", wanted).robot, ""
@@ -213,7 +213,7 @@ def understand(
 
 
 def plan(
-    found: Understood, model: Path, logs: Path, out: Path, wanted: Wanted, stated: list[str], cuts: bool
+    found: Understood, model: Path, logs: Path, out: Path, wanted: RobotOptions, stated: list[str], cuts: bool
 ) -> list[list[str]]:
     """The commands of the whole way, as words after `gaponet`.
 
@@ -228,7 +228,7 @@ def plan(
             given["joints"] = found.log.joint_names
         words = [x for name, said in given.items() if said for x in (f"--{name.replace('_', '-')}", *said)]
         todo.append(["robot", "new", str(model), "--out", str(out / "robot"), "--rate", f"{found.rate:g}", *words])
-    robot, told = found.packaged or as_option(out / "robot"), out / "logs.toml"
+    robot, told = found.packaged or robot_argument(out / "robot"), out / "logs.toml"
     described = ["--logs", str(told)] if found.described or told.is_file() else []
     time = found.log.channels["ctrl"].time
     piece = min(PIECE, float(time[-1] - time[0]) / FEWEST)
@@ -238,7 +238,7 @@ def plan(
         ["doctor", data],
         ["gap", data],
         ["identify", data, "--out", str(known)],
-        ["gap", data, "--robot", as_option(known)],
+        ["gap", data, "--robot", robot_argument(known)],
         ["export", str(known)],
         ["report", str(known)],
     ]
@@ -307,7 +307,7 @@ def _earlier(out: Path, logs: Path, files: dict[str, str]) -> _MadeFrom:
     if made["logs"] and not other:
         return made
     if other:
-        where += f", of which {some(other)} {'is' if len(other) == 1 else 'are'} missing or changed"
+        where += f", of which {abbreviate(other)} {'is' if len(other) == 1 else 'are'} missing or changed"
         where += f" in {logs}" * (str(logs.resolve()) != made["logs"])
     raise UsageError(
         f"{data} was made from {where}. Give another --out for these logs, or the same logs again; or delete {data}, "

@@ -13,7 +13,7 @@ from gaponet.cli.options import Flag, Json, Robot, Source
 from gaponet.cli.out import Out, writes
 from gaponet.data.split import split_entries
 from gaponet.report.tables import mrad
-from gaponet.robot.folder import ORIGIN, save_robot
+from gaponet.robot.folder import PROVENANCE_FILE, save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.share.reading import open_dataset
 from gaponet.sysid.torque_motors import TERMS, Driven, driven
@@ -52,7 +52,7 @@ def torque(dataset: Source, out: Path, current: Flag = False, robot: Robot = Non
     if not after < before:
         raise NoGainError(f"nothing is written: half a second on {mrad(after)} mrad, the file's {mrad(before)}")
     save_robot(found.robot, out)
-    write_json(out / ORIGIN, {
+    write_json(out / PROVENANCE_FILE, {
         "dataset": str(data.path.resolve()),
         "parts": {part: {e.id: e.hash for e in entries} for part, entries in parts.items()},
         "motions": {part: sorted({e.meta.motion for e in entries}) for part, entries in parts.items()},

@@ -17,7 +17,7 @@ from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import title
 from gaponet.report.tables import mrad
 from gaponet.report.verdict import Added
-from gaponet.robot.folder import KEPT
+from gaponet.robot.folder import STORED_ROBOT
 
 
 @like(api.train)
@@ -66,7 +66,7 @@ def train(
     screen.say(f"the network adds {mrad(worth.less)} ± {mrad(worth.error)} mrad on validation motions (paired)")
     step = f"gaponet eval {out} {quote(dataset)}"
     if not worth.helps and val["start"] != val["nominal"]:
-        step = f"gaponet export {quote(str(out / KEPT))} --to mjcf"
+        step = f"gaponet export {quote(str(out / STORED_ROBOT))} --to mjcf"
         screen.say("that is within what motions scatter, or less than 2 %: the identified robot is as good without it")
     screen.say(f"model in {trained.path}; next: {step}")
     shown = ("val_mpjae", "steps", "seconds", "sensor_r2", "stages", "interrupted", "parity_rad", "seed")

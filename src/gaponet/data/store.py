@@ -44,7 +44,7 @@ from gaponet.data.commands import Sketch, sketch
 from gaponet.data.log import UNITS
 from gaponet.data.pair import Pair, Twin
 from gaponet.data.sequence import ARRAYS, OPTIONAL, Sequence, SequenceMeta
-from gaponet.robot.folder import KEPT, keeps_robot, save_robot
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec
 
 FORMAT = 1
@@ -149,15 +149,15 @@ class Dataset:
         The nominal robot is kept in it, if none is yet.
         """
         dataset = cls.peek(path, robot)
-        if dataset is not None and keeps_robot(dataset.path):
+        if dataset is not None and has_stored_robot(dataset.path):
             return dataset
         path = Path(path)
         with lock_folder(path, KIND):
             if not (path / "dataset.json").is_file():
                 header = {"format": FORMAT, "robot": robot.name, "joint_names": list(robot.joint_names), "units": UNITS}
                 write_text(path / "dataset.json", json.dumps(header, indent=1, ensure_ascii=False) + "\n")
-            if not keeps_robot(path):
-                save_robot(robot.nominal or robot, path / KEPT)
+            if not has_stored_robot(path):
+                save_robot(robot.nominal or robot, path / STORED_ROBOT)
         return cls.create(path, robot)
 
     @classmethod

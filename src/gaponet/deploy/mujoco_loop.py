@@ -12,7 +12,7 @@ from gaponet.base.arrays import Array
 from gaponet.base.errors import ModelError
 from gaponet.deploy.transfer import Inverse, Reference, Transfer, periods_of
 from gaponet.nn.artifact import GapModel
-from gaponet.robot.folder import keeper, keeps_robot
+from gaponet.robot.folder import has_stored_robot, stored_robot_holder
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Batch, BatchSim, Condition
 from gaponet.sim.inverse import ClosedForm, Probed
@@ -69,7 +69,7 @@ class MujocoAligner:
         told = Condition(payload_mass, "both", dt)
         if isinstance(model, GapModel):
             model.require_payload(payload_mass, extrapolate)
-        if isinstance(model, RobotSpec) or keeps_robot(keeper(model.path)):
+        if isinstance(model, RobotSpec) or has_stored_robot(stored_robot_holder(model.path)):
             self._invert(model, mj_model, told, prefix, extrapolate, inverse)
         else:
             _require_gains(model, mj_model, prefix)

@@ -23,7 +23,7 @@ import numpy as np
 from gaponet.base.errors import RobotError
 from gaponet.base.files import lock_folder
 from gaponet.export.facts import PLAIN_FIELDS, Joints
-from gaponet.robot.mjcf import compiled, read_mjcf, require_size
+from gaponet.robot.mjcf import compile_spec, inspect_mjcf, read_mjcf
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import PAYLOAD_DENSITY, STIFF_SOLIMP, STIFF_SOLREF, TOLERANCE, build_model
 from gaponet.sim.table import TABLE
@@ -57,7 +57,7 @@ class Source:
     last: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require_size(self.main)
+        inspect_mjcf(self.main)
         self._read(self.main)
 
     def _read(self, file: Path) -> None:
@@ -162,7 +162,7 @@ def edit_mjcf(
         RobotError: A joint is not in the text, has several servos, or the result does not compile to what was wanted.
     """
     path = path.resolve()
-    before = compiled(spec := read_mjcf(path), path)
+    before = compile_spec(spec := read_mjcf(path), path)
     source, added, other = Source(path), list[str](), list[str]()
     for name, servo in joints.items():
         full = prefix + name
@@ -193,7 +193,7 @@ def edit_mjcf(
             source.set(key, ctrl=" ".join([key.attributes["ctrl"], *added]))
     _surroundings(source, robot, prefix, payload_mass, before)
     target = _write(source, out)
-    _require(compiled(read_mjcf(target), target), before, joints, robot, prefix, target)
+    _require(compile_spec(read_mjcf(target), target), before, joints, robot, prefix, target)
     return target, difference(source), tuple(other)
 
 

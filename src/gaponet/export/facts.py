@@ -10,9 +10,9 @@ import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.export.scene_facts import joint_fields, solver_options
-from gaponet.robot.bare import bare_text, put
-from gaponet.robot.identity import lines
-from gaponet.robot.mjcf import compiled
+from gaponet.robot.fingerprint import model_fingerprint
+from gaponet.robot.mjcf import compile_spec
+from gaponet.robot.self_contained import self_contained_text, set_attributes
 from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.model import STIFF_MOBILITY, build_model, build_spec, model_hash
 
@@ -65,32 +65,32 @@ def mjcf_text(robot: RobotSpec, dt: float, payload_mass: float = 0.0) -> str:
         RobotError: A text cannot hold it.
     """
     model = build_model(robot, payload_mass, dt=dt)
-    root = ET.fromstring(bare_text(build_spec(robot, payload_mass, dt=dt), robot.mjcf))
+    root = ET.fromstring(self_contained_text(build_spec(robot, payload_mass, dt=dt), robot.mjcf))
     option = root.find("option")
     assert option is not None
-    put(option, timestep=model.opt.timestep)
+    set_attributes(option, timestep=model.opt.timestep)
     for i, pair in enumerate(root.iter("pair")):  # a table's stiffness is set after compilation
-        put(pair, **{name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")})
+        set_attributes(pair, **{name: getattr(model, f"pair_{name}")[i] for name in ("solref", "solimp", "friction")})
     servos = ET.SubElement(root, "actuator")
     for i in range(model.nu):
         name, bias = model.actuator(i).name, model.actuator_biasprm[i]
         if bias[0]:
             servo = ET.SubElement(servos, "general", {"name": name, "joint": name, "biastype": "affine"})
-            put(servo, gainprm=model.actuator_gainprm[i, 0], biasprm=bias[:3])
+            set_attributes(servo, gainprm=model.actuator_gainprm[i, 0], biasprm=bias[:3])
         else:
             servo = ET.SubElement(servos, "position", {"name": name, "joint": name})
-            put(servo, kp=-bias[1], kv=-bias[2])
-        put(servo, forcerange=model.actuator_forcerange[i])
+            set_attributes(servo, kp=-bias[1], kv=-bias[2])
+        set_attributes(servo, forcerange=model.actuator_forcerange[i])
         if model.actuator_history[i, 0]:
             servo.set("nsample", str(model.actuator_history[i, 0]))
             servo.set("interp", "linear")
-            put(servo, delay=model.actuator_delay[i])
+            set_attributes(servo, delay=model.actuator_delay[i])
         if model.nuser_actuator:
-            put(servo, user=model.actuator_user[i])
+            set_attributes(servo, user=model.actuator_user[i])
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
-    again = compiled(mujoco.MjSpec.from_string(text), robot.mjcf)
-    if list(lines(again)) != list(lines(model)) or again.opt.timestep != model.opt.timestep:
+    again = compile_spec(mujoco.MjSpec.from_string(text), robot.mjcf)
+    if list(model_fingerprint(again)) != list(model_fingerprint(model)) or again.opt.timestep != model.opt.timestep:
         raise RobotError(f"{robot.mjcf}: with its servos it does not fit into one file that moves the same")
     return text
 

@@ -20,7 +20,7 @@ from gaponet.base.structure import Json, Name, Number, Sha256, read_format, read
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.onnx_network import Network, OnnxNetwork
-from gaponet.robot.folder import keeper, keeps_robot, kept_robot
+from gaponet.robot.folder import has_stored_robot, load_stored_robot, stored_robot_holder
 from gaponet.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
@@ -213,12 +213,12 @@ class GapModel:
         Raises:
             ModelError: The model lies in no run, or in one that keeps another simulator.
         """
-        if not keeps_robot(keeper(self.path)):
+        if not has_stored_robot(stored_robot_holder(self.path)):
             raise ModelError(
                 f"{self.path}: trained in simulator {self.card['simulator']}, which does not lie beside it; "
                 "commands cannot be transferred to another simulator or rate; give the run folder, or an export (--out)"
             )
-        kept = kept_robot(keeper(self.path), self.card["robot"])
+        kept = load_stored_robot(stored_robot_holder(self.path), self.card["robot"])
         self.require(kept)
         return kept
 

@@ -17,7 +17,7 @@ from gaponet.nn.adaptation import Adaptation
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.loop import DeltaCorrector
 from gaponet.report.methods import method
-from gaponet.robot.folder import KEPT, ORIGIN
+from gaponet.robot.folder import PROVENANCE_FILE, STORED_ROBOT
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_same_robot, require_stored_robot
 
@@ -147,7 +147,7 @@ class Seen:
             return None if origin is None else cls._of(origin["parts"], origin["motions"])
         model = GapModel.load(folder)
         logs = {h for c in Adaptation.load(folder, model.weights_hash()).values() for h in c.logs}
-        origin = read_origin(folder / KEPT)  # of the robot under the model
+        origin = read_origin(folder / STORED_ROBOT)  # of the robot under the model
         logs |= set() if origin is None else {h for part in ("train", "val") for h in origin["parts"][part].values()}
         return cls._of(split_of_run(folder), model.card.get("motions", {}), logs)
 
@@ -173,7 +173,7 @@ def read_origin(folder: Path) -> _Origin | None:
     Raises:
         RobotError: Damaged.
     """
-    file = folder / ORIGIN
+    file = folder / PROVENANCE_FILE
     if not file.is_file():
         return None
     return read_json(

@@ -26,7 +26,7 @@ from gaponet.report.page import picture as image
 from gaponet.report.run_files import MEND, read_config, read_gap, read_metrics, read_progress, read_trajectories
 from gaponet.report.tables import by_group, mrad, totals
 from gaponet.report.verdict import added, verdict
-from gaponet.robot.folder import keeps_robot, kept_robot
+from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.model import require_stored_robot
 
@@ -54,7 +54,7 @@ def write_report(
     """
     model = None if is_robot(run) else GapModel.load(run)
     asked = None if robot is None else require_stored_robot(run, load_robot(robot), ModelError, "leave --robot out")
-    spec = load_robot(run) if model is None else asked or kept_robot(run, model.card["robot"])
+    spec = load_robot(run) if model is None else asked or load_stored_robot(run, model.card["robot"])
     if dataset is not None or also or not (run / "trajectories.npz").is_file():
         _evaluate(run, dataset, also, asked, progress)
     metrics = read_metrics(run)
@@ -87,7 +87,7 @@ def _evaluate(
         data = Dataset(place)
     except DatasetError as error:
         raise DatasetError(f"{error}. Say where the dataset is: gaponet report {run} --dataset DIR") from None
-    robot = robot or kept_robot(place if keeps_robot(place) else run, data.robot_name)
+    robot = robot or load_stored_robot(place if has_stored_robot(place) else run, data.robot_name)
     evaluate([run, *also], data, robot, progress=progress).save(run)
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gaponet.report.methods import IDENTIFIED, title
-from gaponet.robot.folder import KEPT
+from gaponet.robot.folder import STORED_ROBOT
 from gaponet.sim.metrics import standard_error
 
 LEARNED = ("inverse", "mlp", "shared_mlp", "paper", "gaponet")  # kinds of model
@@ -96,7 +96,7 @@ def next_step(methods: Scores, dataset: str, folder: Path | None = None, reporte
         )
     if "identified" not in methods or folder is None:
         return shlex.join(["gaponet", "identify", dataset, "--out", "my_robot"])
-    return shlex.join(["gaponet", "export", str(folder / KEPT if networks else folder), "--to", "mjcf"])
+    return shlex.join(["gaponet", "export", str(folder / STORED_ROBOT if networks else folder), "--to", "mjcf"])
 
 
 def _mrad(value: float) -> str:

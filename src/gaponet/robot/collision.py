@@ -23,8 +23,8 @@ from gaponet.robot.spec import RobotSpec
 
 Metres = Annotated[float, Interval(ge=-100, le=100)]
 Point = tuple[Metres, Metres, Metres]
-CLEARANCE = 0.03  # m kept between shells: a loaded arm sags by centimetres below what it is told
-FINE = 0.03  # rad between postures that are looked at: a hand 0.7 m away moves by less than the clearance
+CLEARANCE_M = 0.03  # m kept between shells: a loaded arm sags by centimetres below what it is told
+POSTURE_STEP_RAD = 0.03  # rad between postures that are looked at: a hand 0.7 m away moves by less than the clearance
 
 
 Radius = Annotated[float, Interval(ge=0, le=100)]
@@ -55,7 +55,7 @@ class Shapes:
     capsule: Annotated[tuple[Capsule, ...], Len(0, 1000)] = ()
     same_limb: tuple[str, ...] = ()
     plane: Plane | None = None
-    clearance: Annotated[float, Interval(ge=0, le=1)] = CLEARANCE
+    clearance: Annotated[float, Interval(ge=0, le=1)] = CLEARANCE_M
     box: Annotated[tuple[Box, ...], Len(0, 1000)] = ()
 
 
@@ -130,7 +130,7 @@ class Collision:
         return f"{self.names[self.above[at - len(self.pairs)]]} and the plane at {self.height:g} m"
 
 
-def thinned(ctrl: Array, step: float = FINE) -> Array:
+def thinned(ctrl: Array, step: float = POSTURE_STEP_RAD) -> Array:
     """Rows of a command (T, n) rad between which no joint goes further than `step` rad, if its own rows allow that."""
     gone = np.concatenate([[0.0], np.abs(np.diff(ctrl, axis=0)).max(axis=1).cumsum()])
     marks = np.searchsorted(gone, np.arange(0.0, gone[-1], step))

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import UsageError
-from gaponet.robot.finding import some
+from gaponet.robot.finding import abbreviate
 
 NO_LIMIT = 1e6  # N·m
 ON_JOINT = [int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)]
@@ -67,7 +67,8 @@ def drives(
         found.append(Drive(name, actuator, kp, sources["kp"], kd, sources["kd"], limit, why, home))
     if without:
         raise UsageError(
-            f"{file} has no position gain for {some(without)}: give those of the controller that recorded the logs, "
+            f"{file} has no position gain for {abbreviate(without)}: give those of the controller that recorded the "
+            "logs, "
             "--kp 100 '*wrist*=20' and --kd likewise (N·m/rad, N·m·s/rad); where nobody knows them a guess will do, "
             "gaponet identify finds them within a factor of 50"
         )

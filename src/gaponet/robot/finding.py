@@ -53,12 +53,12 @@ class Finding:
         return "\n".join(lines) + "\n"
 
 
-def some(motions: list[str]) -> str:
+def abbreviate(motions: list[str]) -> str:
     """Up to three names, each once, and how many more."""
     motions = list(dict.fromkeys(motions))
     return ", ".join(motions[:3]) + (f" and {len(motions) - 3} more" if len(motions) > 3 else "")
 
 
-def names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
+def masked_names(robot: RobotSpec, mask: Array) -> tuple[str, ...]:
     """Joint names where mask (n) is true."""
     return tuple(name for name, yes in zip(robot.joint_names, mask, strict=True) if yes)

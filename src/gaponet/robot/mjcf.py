@@ -52,22 +52,22 @@ def read_mjcf(path: Path, tried: bool = False) -> mujoco.MjSpec:
     """
     import mujoco
 
-    look = require_size(path)
+    look = inspect_mjcf(path)
     state = frozenset(look.files)
     if not (tried or look.plain or state in _TRIED or path.resolve().is_relative_to(PACKAGED)):
         _try(path)
         _TRIED.add(state)
-    with said(path, "not valid MJCF"):
+    with mujoco_errors(path, "not valid MJCF"):
         return mujoco.MjSpec.from_file(str(path))
 
 
-def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     """The model of a specification that was read from `path`.
 
     Raises:
         RobotError: It does not compile, or a mass, inertia or position in it is above MAX_VALUE.
     """
-    with said(path, "does not compile"):
+    with mujoco_errors(path, "does not compile"):
         model = spec.compile()
     for name in ("body_mass", "body_inertia", "body_pos", "body_ipos", "geom_pos", "jnt_pos"):
         values = getattr(model, name)
@@ -77,7 +77,7 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 @contextmanager
-def said(path: Path, what: str) -> Iterator[None]:
+def mujoco_errors(path: Path, what: str) -> Iterator[None]:
     """MuJoCo's errors as one line."""
     import mujoco
 
@@ -93,10 +93,10 @@ def said(path: Path, what: str) -> Iterator[None]:
 
 @sandboxed(RobotError, "mujoco", 0.5)
 def _try(path: Path) -> None:
-    require_moderate(compiled(read_mjcf(path, tried=True), path), path)
+    require_simulable(compile_spec(read_mjcf(path, tried=True), path), path)
 
 
-def require_moderate(model: mujoco.MjModel, path: Path) -> None:
+def require_simulable(model: mujoco.MjModel, path: Path) -> None:
     """Refuse a model whose simulation takes more than BYTES, or does not come through a step."""
     import mujoco
 
@@ -115,7 +115,7 @@ class _Look:
     plain: bool = True
 
 
-def require_size(path: Path) -> _Look:
+def inspect_mjcf(path: Path) -> _Look:
     """Refuse a file that is no XML, or makes or names more than a robot has."""
     look = _Look()
     _count(path, path.parent, {path.resolve()}, look, 1.0)

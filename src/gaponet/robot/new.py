@@ -15,10 +15,10 @@ import numpy as np
 
 from gaponet.base.errors import RobotError, UsageError
 from gaponet.base.files import lock_folder, write_text
-from gaponet.robot.bare import bare_text
 from gaponet.robot.drives import ON_JOINT, Drive, drives
 from gaponet.robot.freeze import freeze
-from gaponet.robot.mjcf import compiled
+from gaponet.robot.mjcf import compile_spec
+from gaponet.robot.self_contained import self_contained_text
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.robot.vendor import read_vendor
 
@@ -27,7 +27,7 @@ IMPLICIT = (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPL
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RobotOptions:
     """What the user says about the robot; joints are named by name or pattern (*_elbow_*).
 
     Attributes:
@@ -55,7 +55,7 @@ class Wanted:
 
 
 @dataclass(frozen=True)
-class Made:
+class NewRobot:
     """A robot folder that was written; the vendor's own model with its pose at home, (nq); what to know about it."""
 
     robot: RobotSpec
@@ -65,7 +65,7 @@ class Made:
     notes: list[str] = field(default_factory=list)
 
 
-def new_robot(path: Path, out: Path, wanted: Wanted) -> Made:
+def new_robot(path: Path, out: Path, wanted: RobotOptions) -> NewRobot:
     """Write the robot folder `out` from the MJCF or URDF at `path`.
 
     Raises:
@@ -73,7 +73,7 @@ def new_robot(path: Path, out: Path, wanted: Wanted) -> Made:
         UsageError: A name or number that does not fit the model, or a gain that neither says.
     """
     spec, notes = read_vendor(path, {k: Path(v) for k, v in map(_pair, wanted.packages)})
-    model = compiled(spec, path)
+    model = compile_spec(spec, path)
     kept = _kept(model, wanted.joints, path)
     pose, source = _home(model, wanted.keyframe, path)
     given = {name: getattr(wanted, name) for name in ("kp", "kd", "effort_limit")}
@@ -89,7 +89,7 @@ def new_robot(path: Path, out: Path, wanted: Wanted) -> Made:
     with lock_folder(out, "robot"):
         write_text(out / "robot.xml", text)
         write_text(out / "robot.toml", robot_toml)
-    return Made(load_robot(out), found, model, pose, notes)
+    return NewRobot(load_robot(out), found, model, pose, notes)
 
 
 def matching(names: Iterable[str], patterns: Iterable[str], what: str) -> list[str]:
@@ -196,14 +196,14 @@ def _text(
         spec.delete(joint)
     if spec.option.integrator not in IMPLICIT:
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    plain = mujoco.MjSpec.from_string(bare_text(spec, path))  # explicit inertias, quaternions, no classes
+    plain = mujoco.MjSpec.from_string(self_contained_text(spec, path))  # explicit inertias, quaternions, no classes
     for joint in [j for j in plain.joints if j.name not in kept]:
         freeze(plain, joint, values[joint.name])
     for joint in plain.joints:
         joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE  # effort_limit says it, in one place
     if not contacts:
         _untouching(plain)
-    return bare_text(plain, path)
+    return self_contained_text(plain, path)
 
 
 def _wraps(model: mujoco.MjModel, tendon: int) -> set[str]:
@@ -225,7 +225,7 @@ def _untouching(spec: mujoco.MjSpec) -> None:
         spec.delete(pair)
 
 
-def _toml(model: mujoco.MjModel, found: tuple[Drive, ...], wanted: Wanted, path: Path, source: str) -> str:
+def _toml(model: mujoco.MjModel, found: tuple[Drive, ...], wanted: RobotOptions, path: Path, source: str) -> str:
     if not (0 < wanted.rate <= 1000):
         raise UsageError(f"--rate {wanted.rate}: give the rate of the commands in Hz, up to 1000")
     names = [d.name for d in found]

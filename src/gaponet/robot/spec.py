@@ -25,18 +25,18 @@ from gaponet.base.errors import JointMismatchError, RobotError
 from gaponet.base.structure import read_toml
 from gaponet.robot.toml_file import PayloadMount, RobotTable, ServoType, Table, Tip
 
-__all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "available", "load_robot"]
+__all__ = ["PayloadMount", "RobotSpec", "ServoType", "Table", "Tip", "load_robot", "packaged_robots"]
 
-BUILTIN = Path(__file__).parent / "robots"
+PACKAGE_FOLDER = Path(__file__).parent / "robots"
 LOG_UNITS = ("rad", "deg", "fraction")
-STOPS = ("stop_low", "stop_high")
-MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOPS)  # NaN where the MJCF's value stands
+STOP_FIELDS = ("stop_low", "stop_high")
+MJCF_FIELDS = ("damping", "armature", "frictionloss", *STOP_FIELDS)  # NaN where the MJCF's value stands
 SERVO_TERMS = ("stribeck", "stribeck_speed", "friction_motor", "friction_external", "min_torque", "encoder_step")
-FITTED = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *SERVO_TERMS)
+IDENTIFIED_FIELDS = (*MJCF_FIELDS, "delay", "offset", "zero", "target_speed", *SERVO_TERMS)
 MAX_SUGGESTIONS = 3  # similar joints that an error lists
 GAIN_TOLERANCE = 1e-3  # relative; gains that differ by less are the same
-SERVO = ("kp", "kd", "effort_limit", *FITTED)  # what identification may change
-SIGNED = ("qpos_home", "offset", "zero", *STOPS)
+SERVO_FIELDS = ("kp", "kd", "effort_limit", *IDENTIFIED_FIELDS)  # what identification may change
+SIGNED = ("qpos_home", "offset", "zero", *STOP_FIELDS)
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class RobotSpec:
             if np.shape(getattr(self, name)) != (n,):
                 shape = np.shape(getattr(self, name))
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got shape {shape}")
-        for name in ("kp", "kd", "effort_limit", "qpos_home", *FITTED):
+        for name in ("kp", "kd", "effort_limit", "qpos_home", *IDENTIFIED_FIELDS):
             value = np.array(np.broadcast_to(np.asarray(getattr(self, name), float), n))
             if np.isinf(value).any() or (name not in MJCF_FIELDS and np.isnan(value).any()):
                 raise RobotError(f"{self.name}: {name} must be {n} finite numbers, got {value}")
@@ -175,7 +175,7 @@ class RobotSpec:
 
     def with_servos(self, servos: dict[str, dict[str, float]]) -> RobotSpec:
         """The same robot with identified values: joint → any of SERVO. A damping below zero is taken from kd."""
-        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO}
+        changed: dict[str, Any] = {name: np.array(getattr(self, name)) for name in SERVO_FIELDS}
         for joint, values in servos.items():
             i = self.index([joint])[0]
             for name, value in values.items():
@@ -212,9 +212,9 @@ class RobotSpec:
     @functools.cached_property
     def qpos_range(self) -> Array:
         """Joint limits of the MJCF, (n, 2), rad; ±inf where a joint is unlimited. Compiles the MJCF on first use."""
-        from gaponet.robot.mjcf import compiled, read_mjcf
+        from gaponet.robot.mjcf import compile_spec, read_mjcf
 
-        model = compiled(read_mjcf(self.mjcf), self.mjcf)
+        model = compile_spec(read_mjcf(self.mjcf), self.mjcf)
         try:
             joints = [model.joint(name) for name in self.joint_names]
         except KeyError as error:
@@ -281,9 +281,9 @@ def _unpacked(files: tuple[tuple[str, bytes], ...]) -> Path:
     return folder
 
 
-def available() -> list[str]:
+def packaged_robots() -> list[str]:
     """Names of the robots in the package."""
-    return sorted(p.parent.name for p in BUILTIN.glob("*/robot.toml"))
+    return sorted(p.parent.name for p in PACKAGE_FOLDER.glob("*/robot.toml"))
 
 
 def load_robot(name_or_path: str | Path) -> RobotSpec:
@@ -309,7 +309,7 @@ def load_robot(name_or_path: str | Path) -> RobotSpec:
         raise RobotError(f"{toml}: {error}") from None
 
 
-def as_option(folder: Path) -> str:
+def robot_argument(folder: Path) -> str:
     """What to write after --robot for a robot folder: with a slash, as a text without one is a name."""
     return f"./{folder}" if folder.name == str(folder) else str(folder)
 
@@ -319,10 +319,10 @@ def _folder(name_or_path: str | Path) -> Path:
     text, folder = str(name_or_path), Path(name_or_path)
     if isinstance(name_or_path, Path) or folder.name != text or text == "..":
         return folder
-    packaged, here = BUILTIN / text, (folder / "robot.toml").is_file()
-    if text not in available():
+    packaged, here = PACKAGE_FOLDER / text, (folder / "robot.toml").is_file()
+    if text not in packaged_robots():
         what = f"for the folder here write ./{text}" if here else "or give a folder, with a slash: ./my_robot"
-        raise RobotError(f"no robot '{text}': in the package are {', '.join(available())}; {what}")
+        raise RobotError(f"no robot '{text}': in the package are {', '.join(packaged_robots())}; {what}")
     if here and not packaged.samefile(folder):
         raise RobotError(f"'{text}' is a robot of the package and a folder here; write {packaged} or ./{text}")
     return packaged

@@ -10,8 +10,8 @@ import numpy as np
 
 from gaponet.base.errors import RobotError
 from gaponet.base.sandbox import sandboxed
-from gaponet.robot.finding import some
-from gaponet.robot.mjcf import compiled, read_mjcf, require_moderate, require_size, said
+from gaponet.robot.finding import abbreviate
+from gaponet.robot.mjcf import compile_spec, inspect_mjcf, mujoco_errors, read_mjcf, require_simulable
 
 MESHES = (".stl", ".obj", ".msh")  # what MuJoCo reads
 KEEP = {"strippath": "false", "fusestatic": "false", "discardvisual": "false", "balanceinertia": "true",
@@ -31,10 +31,12 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
     """
     if path.is_dir():
         models = sorted(p.relative_to(path).as_posix() for e in ("xml", "urdf") for p in path.rglob(f"*.{e}"))
-        raise RobotError(f"{path}: is a folder; name the model in it: {some(models) or 'there is no .xml or .urdf'}")
+        raise RobotError(
+            f"{path}: is a folder; name the model in it: {abbreviate(models) or 'there is no .xml or .urdf'}"
+        )
     if path.suffix == ".xacro":
         raise RobotError(f"{path}: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf")
-    require_size(path)
+    inspect_mjcf(path)
     packages = {name: folder.absolute() for name, folder in packages.items()}
     _try(path, packages)
     return _read(path, packages)
@@ -43,7 +45,7 @@ def read_vendor(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, l
 @sandboxed(RobotError, "mujoco", 0.5)
 def _try(path: Path, packages: dict[str, Path]) -> None:
     spec, _ = _read(path, packages)
-    require_moderate(compiled(spec, path), path)
+    require_simulable(compile_spec(spec, path), path)
 
 
 def _read(path: Path, packages: dict[str, Path]) -> tuple[mujoco.MjSpec, list[str]]:
@@ -85,7 +87,7 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
     for compiler in own.findall("compiler"):
         own.remove(compiler)
     ET.SubElement(own, "compiler", KEEP)
-    with said(path, "not valid URDF"):
+    with mujoco_errors(path, "not valid URDF"):
         spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
     hint = "were not found; --packages NAME=FOLDER says where package://NAME is"
     notes = _left_out(missing, hint) + _left_out(unread, f"are none of {', '.join(MESHES)}")
@@ -93,7 +95,7 @@ def _urdf(root: ET.Element, path: Path, packages: dict[str, Path]) -> tuple[mujo
 
 
 def _left_out(names: list[str], why: str) -> list[str]:
-    return [f"{len(names)} mesh(es) {why}; left out: {some(names)}"] if names else []
+    return [f"{len(names)} mesh(es) {why}; left out: {abbreviate(names)}"] if names else []
 
 
 def _inertias(root: ET.Element) -> list[str]:
@@ -118,9 +120,13 @@ def _inertias(root: ET.Element) -> list[str]:
         impossible.append(link.get("name", ""))
     moved = {j.find("child").get("link", "") for j in root.iter("joint")  # type: ignore[union-attr]
              if j.get("type") != "fixed" and j.find("child") is not None}  # fmt: skip
-    said = [f"inertia that no body has, taken as a ball's of the link's mass: {some(impossible)}"] if impossible else []
+    notes = (
+        [f"inertia that no body has, taken as a ball's of the link's mass: {abbreviate(impossible)}"]
+        if impossible
+        else []
+    )
     light = [name for name in light if name in moved]
-    return said + ([f"links without mass behind a joint, taken as 1 mg: {some(light)}"] if light else [])
+    return notes + ([f"links without mass behind a joint, taken as 1 mg: {abbreviate(light)}"] if light else [])
 
 
 def _number(element: ET.Element | None, name: str) -> float:
@@ -132,7 +138,7 @@ def _number(element: ET.Element | None, name: str) -> float:
 
 def _unreadable(spec: mujoco.MjSpec) -> list[str]:
     """Leave out meshes that MuJoCo cannot read, for all but their looks are in the links' own inertias; says which."""
-    said = []
+    omitted = []
     for mesh in spec.meshes:
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # open ones have no volume
     while len(spec.meshes):
@@ -144,11 +150,11 @@ def _unreadable(spec: mujoco.MjSpec) -> list[str]:
             bad = next((m for m in spec.meshes if (m.file and Path(m.file).name in why) or f"'{m.name}'" in why), None)
             if bad is None:
                 break
-            said.append(f"mesh left out: {why}")
+            omitted.append(f"mesh left out: {why}")
             for geom in [g for g in spec.geoms if g.meshname == bad.name]:
                 spec.delete(geom)
             spec.delete(bad)
-    return said
+    return omitted
 
 
 def _resolve(name: str, path: Path, packages: dict[str, Path]) -> Path | None:

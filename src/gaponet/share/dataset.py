@@ -25,7 +25,7 @@ from gaponet.data.offsets import read_offsets
 from gaponet.data.split import read_split
 from gaponet.data.store import JOURNAL, Dataset
 from gaponet.data.writers.lerobot import write
-from gaponet.robot.folder import KEPT, kept_robot, require_bare, save_robot
+from gaponet.robot.folder import STORED_ROBOT, load_stored_robot, require_self_contained, save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.share.readme import dataset_readme
 from gaponet.share.remote import FileRecord, Index
@@ -43,14 +43,14 @@ def write_files(path: Path, folder: Path, address: str) -> tuple[str, ...]:
         DatasetError: The dataset is empty, or a recording is damaged.
     """
     dataset, source = Dataset(path), _source_text(path, address)
-    robot = kept_robot(dataset.path, dataset.robot_name)
+    robot = load_stored_robot(dataset.path, dataset.robot_name)
     contents = tuple(sorted(entry.hash for entry in dataset.select()))
     with progress_bar("reading") as update:
         done = iter(range(1, len(dataset) + 1))
         sets = write(dataset, robot, folder, lambda motion: update(next(done), len(dataset), motion))
     (folder / SIDECAR).mkdir()
-    save_robot(robot.nominal or robot, folder / SIDECAR / KEPT)
-    (folder / SIDECAR / KEPT / ".gaponet").unlink()
+    save_robot(robot.nominal or robot, folder / SIDECAR / STORED_ROBOT)
+    (folder / SIDECAR / STORED_ROBOT / ".gaponet").unlink()
     copy_sidecars(dataset.path, folder / SIDECAR, dataset)
     card = make_card(dataset)
     text = dataset_readme(card, card_text(card), address, [part.path.as_posix() for part in sets])
@@ -70,7 +70,7 @@ def _source_text(path: Path, address: str) -> str:
 
     The journal lists the content hash of every recording, so that no recording is read.
     """
-    names = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{KEPT}/*.*")
+    names = ("dataset.json", JOURNAL, *COPIED_FILES, "splits/*.json", f"{STORED_ROBOT}/*.*")
     files = sorted(file for name in names for file in path.glob(name) if file.is_file() and file.name != FOLDER_MARKER)
     hashes = {file.relative_to(path).as_posix(): FileRecord.of(file).sha256 for file in files}
     return json.dumps({"gaponet": __version__, "address": address, "files": hashes}, indent=1) + "\n"
@@ -112,10 +112,10 @@ def copy_sidecars(source: Path, out: Path, dataset: Dataset) -> None:
 
 def downloaded_robot(folder: Path) -> RobotSpec:
     """Load the robot among downloaded files; it must name no file outside its folder."""
-    folder = folder / SIDECAR / KEPT
+    folder = folder / SIDECAR / STORED_ROBOT
     if not (folder / "robot.toml").is_file():
-        raise DatasetError(f"{SIDECAR}/{KEPT}: no robot.toml; push the dataset again")
-    require_bare(folder)
+        raise DatasetError(f"{SIDECAR}/{STORED_ROBOT}: no robot.toml; push the dataset again")
+    require_self_contained(folder)
     robot = load_robot(folder)
     model_hash(robot)  # raises an error for an invalid robot
     return robot

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from gaponet.data.store import Dataset
-from gaponet.robot.folder import keeps_robot, kept_robot
+from gaponet.robot.folder import has_stored_robot, load_stored_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 
 
@@ -43,10 +43,10 @@ def open_dataset(
     data = dataset if isinstance(dataset, Dataset) else load_dataset(dataset)
     if robot is not None:
         return data, robot if isinstance(robot, RobotSpec) else load_robot(robot)
-    if not keeps_robot(data.path) and run is not None and keeps_robot(Path(run)):
-        return data, kept_robot(Path(run), data.robot_name)
-    spec = kept_robot(data.path, data.robot_name)
-    if not keeps_robot(data.path):
+    if not has_stored_robot(data.path) and run is not None and has_stored_robot(Path(run)):
+        return data, load_stored_robot(Path(run), data.robot_name)
+    spec = load_stored_robot(data.path, data.robot_name)
+    if not has_stored_robot(data.path):
         note = f"{data.path} keeps no robot (written before November 2026): taking the package's {spec.name}"
         print(note, file=sys.stderr)
     return data, spec

@@ -11,7 +11,7 @@ from gaponet.base.errors import ModelError
 from gaponet.base.files import lock_folder, write_text
 from gaponet.nn.artifact import CARD, WEIGHTS, GapModel, sha256
 from gaponet.report.run_files import read_config, read_metrics
-from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, require_bare
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, require_self_contained
 from gaponet.share.readme import run_readme
 from gaponet.share.remote import Index, RemoteError
 
@@ -58,9 +58,9 @@ def require_pushed_run(folder: Path, index: Index) -> None:
 
 def _facts(run: Path) -> dict[str, Any]:
     """Read and check the files of a run; return model card, configuration, newest metrics and hash of the weights."""
-    if keeps_robot(run):
-        require_bare(run / KEPT)
+    if has_stored_robot(run):
+        require_self_contained(run / STORED_ROBOT)
     config, model = read_config(run), GapModel.load(run)
-    kept_robot(run, config["robot"])
+    load_stored_robot(run, config["robot"])
     metrics = read_metrics(run) if (run / "metrics.json").is_file() else None
     return {"card": model.card, "config": config, "metrics": metrics, "weights": model.weights_hash()}

@@ -13,7 +13,7 @@ import numpy as np
 from gaponet.base.arrays import array_like
 from gaponet.base.errors import UsageError
 from gaponet.data.sequence import Sequence
-from gaponet.robot.spec import SERVO_TERMS, STOPS, RobotSpec
+from gaponet.robot.spec import SERVO_TERMS, STOP_FIELDS, RobotSpec
 from gaponet.sim.model import build_model, qpos_range
 from gaponet.sim.servo import ServoModel, present
 
@@ -240,7 +240,7 @@ class BatchSim:
             UsageError: A value that these simulations cannot take, such as a delay where the robot has none.
         """
         model, batch = next(iter(self.models.values())), self.batch
-        fixed = STOPS + ("delay",) * (not model.nhistory) + SERVO_TERMS * (self.servo_model is None)
+        fixed = STOP_FIELDS + ("delay",) * (not model.nhistory) + SERVO_TERMS * (self.servo_model is None)
         if refused := [f for f in fixed if f in values and np.any(values[f])]:
             raise UsageError(f"{', '.join(refused)} cannot differ between simulations of {self.robot.name}: give them "
                              "to the robot (with_servos) that BatchSim is made with")  # fmt: skip

@@ -10,10 +10,10 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import GAPONetError, RobotError, UsageError
-from gaponet.robot.folder import KEPT, keeps_robot, kept_robot
+from gaponet.robot.fingerprint import model_fingerprint
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot
 from gaponet.robot.freeze import freeze, units_per_si
-from gaponet.robot.identity import lines
-from gaponet.robot.mjcf import compiled, read_mjcf
+from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.spec import SERVO_TERMS, RobotSpec
 from gaponet.sim.table import add_table, soften_table
 
@@ -59,7 +59,7 @@ def build_model(
         UsageError: Negative payload, unknown side, or a dt that is not positive.
     """
     spec = build_spec(robot, payload_mass, payload_side, dt, locked, bare)
-    model = compiled(spec, robot.mjcf)
+    model = compile_spec(spec, robot.mjcf)
     if model.nq != model.nv or model.nq != len(robot.joint_names) - len(locked):
         known = {j.name for j in spec.joints}
         raise RobotError(
@@ -139,15 +139,15 @@ def model_hash(robot: RobotSpec) -> str:
     """What the nominal simulator is, in 12 hex digits: everything in its compiled model that decides how it moves.
 
     Two robots with the same hash move the same, wherever their folders lie and however their MJCF is written
-    (gaponet.robot.identity); reports print it beside every score, since two public MJCFs of one robot can differ by a
-    factor of 50 in gain.
+    (gaponet.robot.fingerprint); reports print it beside every score, since two public MJCFs of one robot can differ by
+    a factor of 50 in gain.
     """
     if "_model_hash" not in vars(robot):
         text = [
             f"step {robot.timestep:.7g} density {PAYLOAD_DENSITY:g} mobility {STIFF_MOBILITY:g}",
             *([] if robot.carries_payload else ["carries no payload"]),
             *([f"target speed {robot.target_speed}"] * bool(robot.target_speed.any())),
-            *lines(build_model(robot)),
+            *model_fingerprint(build_model(robot)),
         ]
         digest = hashlib.sha256("\n".join(text).encode()).hexdigest()[:12]
         object.__setattr__(robot, "_model_hash", digest)
@@ -163,10 +163,10 @@ def require_stored_robot(holder: Path, robot: RobotSpec, error: type[GAPONetErro
         error: Raised if the robots differ.
         hint: What to do about it.
     """
-    if not keeps_robot(holder):
+    if not has_stored_robot(holder):
         return robot
-    use = f"--robot {holder / KEPT} where that is the right one, or {hint}"
-    return require_same_robot(kept_robot(holder, robot.name), robot, holder, error, use)
+    use = f"--robot {holder / STORED_ROBOT} where that is the right one, or {hint}"
+    return require_same_robot(load_stored_robot(holder, robot.name), robot, holder, error, use)
 
 
 def require_same_robot(

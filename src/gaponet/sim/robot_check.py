@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from gaponet.robot.collision import Collision
-from gaponet.robot.finding import LEVELS, Finding, some
+from gaponet.robot.finding import LEVELS, Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import BatchSim, Condition
 from gaponet.sim.dynamics import static_torque
@@ -120,7 +120,7 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     springs = names[model.jnt_stiffness > 0]
     if len(springs):
         yield Finding(
-            "note", "couplings", f"springs at {some(springs.tolist())}: stiffness in robot.xml", tuple(springs)
+            "note", "couplings", f"springs at {abbreviate(springs.tolist())}: stiffness in robot.xml", tuple(springs)
         )
     if abs(np.linalg.norm(model.opt.gravity) - 9.81) > 0.1:
         text = f"gravity in robot.xml is {model.opt.gravity.tolist()} m/s²: write gravity in <option> if that is not so"
@@ -131,14 +131,16 @@ def _couplings(robot: RobotSpec, model: mujoco.MjModel) -> Iterator[Finding]:
     bare = names[model.dof_armature < ARMATURE]
     if len(bare):
         text = (
-            f"no armature at {some(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times ratio "
+            f"no armature at {abbreviate(bare.tolist())}: geared motors have 0.001 to 0.5 kg·m² (rotor inertia times "
+            "ratio "
             "squared); write armature in robot.xml, gaponet identify finds it"
         )
         yield Finding("note", "inertia", text, tuple(bare))
     free = names[(model.dof_damping + robot.kd < 1e-9) & (model.dof_frictionloss < 1e-9)]
     if len(free):
         text = (
-            f"no damping, kd or friction at {some(free.tolist())}: it swings for ever; write kd in robot.toml, or "
+            f"no damping, kd or friction at {abbreviate(free.tolist())}: it swings for ever; write kd in robot.toml, "
+            "or "
             "damping and frictionloss in robot.xml"
         )
         yield Finding("warning", "damping", text, tuple(free))
@@ -166,7 +168,7 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
         if robot.contacts:
             level = "warning"
             so = "joints carry that for ever: write <exclude> in robot.xml, or contacts = false in robot.toml"
-        text = f"at home {some(always)} lie inside each other; {so}"
+        text = f"at home {abbreviate(always)} lie inside each other; {so}"
         yield Finding(level, "contacts", text, values={"pairs": always})
     share = float(np.mean([bool(s - set(always)) for s in seen])) if seen else 0.0
     if share and (logged or robot.contacts):
@@ -174,7 +176,7 @@ def _contacts(robot: RobotSpec, postures: Array, logged: bool) -> Iterator[Findi
         often = sorted(set().union(*seen) - set(always))
         does = "and touch: the logs' robot did not go through itself" if robot.contacts else "(contacts are off)"
         level = "warning" if robot.contacts and logged else "note"
-        yield Finding(level, "contacts", f"in {share:.0%} {what} {some(often)} lie inside each other {does}",
+        yield Finding(level, "contacts", f"in {share:.0%} {what} {abbreviate(often)} lie inside each other {does}",
                       values={"pairs": often, "share": share})  # fmt: skip
     if not always and not share:
         yield Finding("ok", "contacts", f"no links lie inside each other at home and in {len(postures)} postures")

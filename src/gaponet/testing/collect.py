@@ -23,7 +23,7 @@ from gaponet.base.structure import read_json, validated
 from gaponet.data.pair import Twin
 from gaponet.data.sequence import Sequence
 from gaponet.data.store import KIND, Dataset
-from gaponet.robot.folder import MOVE_KEPT
+from gaponet.robot.folder import MOVE_STORED_ROBOT
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import require_stored_robot
 from gaponet.sim.replay import pair_dataset, replay
@@ -88,7 +88,7 @@ def collect(
     wanted = takes(recipe, library(robot, seed, recipe, files).names(recipe.variants))
     with lock_folder(Path(out), KIND):
         dataset = Dataset.create(out, robot)
-        require_stored_robot(dataset.path, robot, DatasetError, MOVE_KEPT)
+        require_stored_robot(dataset.path, robot, DatasetError, MOVE_STORED_ROBOT)
         _claim(dataset, robot, fleet, recipe, seed)
         present = {
             _key(e.meta.motion, e.meta.unit_id, e.meta.payload_mass, e.dt, e.meta.repetition) for e in dataset.entries

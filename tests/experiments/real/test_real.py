@@ -17,7 +17,7 @@ from gaponet.experiments.real.page import by_joint
 from gaponet.experiments.real.questions import floor, questions
 from gaponet.experiments.real.rivals import LEFT_OUT, METHODS
 from gaponet.robot.folder import save_robot
-from gaponet.robot.spec import available, load_robot
+from gaponet.robot.spec import load_robot, packaged_robots
 
 PAGE = Path(__file__).parents[3] / "docs" / "benchmark.md"
 
@@ -39,7 +39,7 @@ def played(arm, tmp_path):
 def test_every_card_is_of_a_robot_that_is_there_and_stands_on_the_page():
     cards, page = read_cards(CARDS), PAGE.read_text(encoding="utf-8")
     for card in cards.set:
-        robot = load_robot(ROBOTS / card.robot if card.robot not in available() else card.robot)
+        robot = load_robot(ROBOTS / card.robot if card.robot not in packaged_robots() else card.robot)
         assert set(card.joints) <= set(robot.joint_names)
         assert f"| {card.name} | {card.title} |" in page
         assert card.elsewhere in {"", *(c.name for c in cards.set)}

@@ -10,7 +10,7 @@ from gaponet.base.arrays import Array
 from gaponet.data.holds import Holds, StaticError
 from gaponet.data.signals import FAST, Response
 from gaponet.data.survey import Survey, Torque
-from gaponet.robot.finding import Finding, names, some
+from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 SAG = 0.02  # static error worth a line, rad
@@ -59,9 +59,9 @@ def _lag(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
 
 def _servo_lag(robot: RobotSpec) -> dict[str, float]:
     """Lag of a slow motion that kp, kd and the MJCF's damping make, by joint, s."""
-    from gaponet.robot.mjcf import compiled, read_mjcf
+    from gaponet.robot.mjcf import compile_spec, read_mjcf
 
-    model = compiled(read_mjcf(robot.mjcf), robot.mjcf)
+    model = compile_spec(read_mjcf(robot.mjcf), robot.mjcf)
     damping = np.array([model.dof_damping[model.joint(name).dofadr[0]] for name in robot.joint_names])
     damping = np.where(np.isfinite(robot.damping), robot.damping, damping) + robot.kd
     lags = np.divide(damping, robot.kp, out=np.zeros_like(damping), where=robot.kp > 0)
@@ -104,8 +104,8 @@ def _torque(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     low, high = np.min([t.low for _, t in told], axis=0), np.max([t.high for _, t in told], axis=0)
     used = np.max([s.qpos_range for s, _ in told], axis=0) > 0.05
-    dead, alive = names(robot, used & (low == high)), names(robot, used & (low < high))
-    unsigned = names(robot, used & (low < high) & (low >= 0))
+    dead, alive = masked_names(robot, used & (low == high)), masked_names(robot, used & (low < high))
+    unsigned = masked_names(robot, used & (low < high) & (low >= 0))
     found = []
     if dead:
         found.append(Finding("warning", "torque", f"torque of {', '.join(dead)} never changes; ignore it", dead))
@@ -126,7 +126,8 @@ def _spikes(spiky: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Fi
     k, i = np.unravel_index(height.argmax(), height.shape)
     samples = sum(int(t.spikes.sum()) for _, t in spiky)
     text = (
-        f"torque spikes: {samples} samples in {some([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} N·m on "
+        f"torque spikes: {samples} samples in {abbreviate([s.motion for s, _ in spiky])}; worst {height[k, i]:.2f} "
+        "N·m on "
         f"{robot.joint_names[i]} in {spiky[k][0].motion}"
     )
     yield Finding("warning", "torque", text, (robot.joint_names[i],), {"samples": samples, "worst": height[k, i]})

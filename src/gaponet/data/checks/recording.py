@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gaponet.data.survey import Survey, Torque
-from gaponet.robot.finding import Finding, names, some
+from gaponet.robot.finding import Finding, abbreviate, masked_names
 from gaponet.robot.spec import RobotSpec
 
 COARSE = 3e-3  # rad
@@ -29,7 +29,7 @@ def _rate(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     yield Finding(level, "rate", told + hint, values={f"{r:.2f}": count for r, count in groups.items()})
     moved = [s.motion for s in surveys if "resampled" in str(s.entry.meta.notes.get("rows", ""))]
     if moved:
-        yield Finding("note", "rate", f"{len(moved)} sequence(s) were put on a uniform grid: {some(moved)}")
+        yield Finding("note", "rate", f"{len(moved)} sequence(s) were put on a uniform grid: {abbreviate(moved)}")
 
 
 def _regularity(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
@@ -60,14 +60,16 @@ def _jumps(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         if hit:
             text = (
                 f"{name} jumps and comes back faster than any motor in {sum(int(s.jumps[i]) for s in hit)} rows of "
-                f"{some([s.motion for s in hit])}: a misread sample or a wrap of the encoder; repair or cut these rows"
+                f"{abbreviate([s.motion for s in hit])}: a misread sample or a wrap of the encoder; repair or cut "
+                "these rows"
             )
             found.append(Finding("warning", "jumps", text, (name,), {"rows": sum(int(s.jumps[i]) for s in hit)}))
     dropped = [s for s in surveys if s.dropped]
     if dropped:
         rows = sum(s.dropped for s in dropped)
         text = (
-            f"all joints are exactly 0 for {rows} rows of {some([s.motion for s in dropped])}, and far from it a row "
+            f"all joints are exactly 0 for {rows} rows of {abbreviate([s.motion for s in dropped])}, and far from it "
+            "a row "
             "before or after: nothing was read there; repair or cut these rows"
         )
         found.append(Finding("warning", "jumps", text, values={"rows": rows}))
@@ -85,8 +87,9 @@ def _nonsense(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         rows, done = sum(n["rows"] for n in notes), ", ".join(dict.fromkeys(n["done"] for n in notes))
         joints = tuple(dict.fromkeys(j for n in notes for j in n["joints"]))
         text = (
-            f"{channel} of {some(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in {rows} rows "
-            f"of {some([s.motion for s in found])}, a counter or a bad read: there it is {done}"
+            f"{channel} of {abbreviate(list(joints))} was what no joint does (first {notes[0]['worst']:.4g}) in "
+            f"{rows} rows "
+            f"of {abbreviate([s.motion for s in found])}, a counter or a bad read: there it is {done}"
         )
         yield Finding("warning", "nonsense", text, joints, {"rows": rows})
     if not told:
@@ -101,7 +104,7 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         worst = max(held, key=lambda s: s.halted_s)
         text = (
             f"all joints stand still for up to {worst.halted_s:.1f} s while their commands move on in "
-            f"{some([s.motion for s in held])}: an emergency stop, brakes, or drives that were off; cut it out"
+            f"{abbreviate([s.motion for s in held])}: an emergency stop, brakes, or drives that were off; cut it out"
         )
         found.append(Finding("warning", "stop", text, (), {"seconds": worst.halted_s}))
     for i, name in enumerate(robot.joint_names):
@@ -110,7 +113,8 @@ def _blocked(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             worst = max(hit, key=lambda s: s.blocked_s[i])
             text = (
                 f"{name} stood at {worst.blocked_at[i]:.2f} rad for {worst.blocked_s[i]:.1f} s, far from its command, "
-                f"in {some([s.motion for s in hit])}: a stop, an obstacle, too little torque, or not read; leave it "
+                f"in {abbreviate([s.motion for s in hit])}: a stop, an obstacle, too little torque, or not read; "
+                "leave it "
                 "out or cut it"
             )
             values = {"at_rad": float(worst.blocked_at[i]), "seconds": float(worst.blocked_s[i])}
@@ -130,7 +134,7 @@ def _saturation(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     i = int((worst / robot.effort_limit).argmax())
     rows = sum(int(t.over_limit.sum()) for _, t in over)
     text = (
-        f"torque beyond the limit of robot.toml in {rows} rows of {some([s.motion for s, _ in over])}; worst "
+        f"torque beyond the limit of robot.toml in {rows} rows of {abbreviate([s.motion for s, _ in over])}; worst "
         f"{worst[i]:.2f} N·m on {robot.joint_names[i]} (limit {robot.effort_limit[i]:.2f}): a collision, a spike or a "
         "wrong limit"
     )
@@ -146,7 +150,8 @@ def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Findi
         if top > 0.01 * robot.effort_limit[i] and rows >= ENOUGH:
             text = (
                 f"torque of {name} is cut off flat at {top:.3g} N·m in {rows} rows of "
-                f"{some([s.motion for s, _ in near])}: the motor or its driver gives no more. Write effort_limit = "
+                f"{abbreviate([s.motion for s, _ in near])}: the motor or its driver gives no more. Write "
+                "effort_limit = "
                 f"{top:.3g} in robot.toml, or leave these out"
             )
             yield Finding("warning", "saturation", text, (name,), {"rows": rows, "limit": top})
@@ -155,7 +160,9 @@ def _flat(told: list[tuple[Survey, Torque]], robot: RobotSpec) -> Iterator[Findi
 def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     """Are positions told finely enough?"""
     step = np.max([s.step for s in surveys], axis=0)
-    degrees = names(robot, np.abs(np.radians(step) / np.median(step[step > 0]) - 1) < ALIKE) if step.any() else ()
+    degrees = (
+        masked_names(robot, np.abs(np.radians(step) / np.median(step[step > 0]) - 1) < ALIKE) if step.any() else ()
+    )
     if degrees and len(degrees) < (step > 0).sum() / 2:
         text = f"{', '.join(degrees)} is told in steps 57.3 times as coarse as other joints: degrees beside radians?"
         yield Finding("warning", "unit", f"{text} Import again with the right unit", degrees)
@@ -165,7 +172,8 @@ def _resolution(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         return
     worst, name = max(coarse)
     text = (
-        f"positions of {some([name for _, name in coarse])} come in steps of up to {worst * 1e3:.1f} mrad ({name}): "
+        f"positions of {abbreviate([name for _, name in coarse])} come in steps of up to {worst * 1e3:.1f} mrad "
+        f"({name}): "
         "rounded when logged, or a coarse encoder (12 bits: 1.5 mrad). No error below half of that can be seen; log "
         "more digits"
     )
@@ -181,7 +189,8 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         still = [s for s in asked if s.qpos_range[i] < 0.03 and s.qpos_range[i] < 0.05 * s.ctrl_range[i]]
         if still:
             text = (
-                f"{name} does not move when commanded in {some([s.motion for s in still])}: unplugged, torque off or "
+                f"{name} does not move when commanded in {abbreviate([s.motion for s in still])}: unplugged, torque "
+                "off or "
                 "not read; leave these out"
             )
             found.append(Finding("error" if len(still) == len(asked) else "warning", "stuck", text, (name,)))
@@ -192,7 +201,7 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
             worst = max(stopped, key=lambda s: s.stopped_s[i])
             text = (
                 f"{name} repeats one number for up to {worst.stopped_s[i]:.2f} s while its command moves on in "
-                f"{some([s.motion for s in stopped])}: it was not read; cut these logs there"
+                f"{abbreviate([s.motion for s in stopped])}: it was not read; cut these logs there"
             )
             found.append(Finding("warning", "stuck", text, (name,)))
     frozen = [s for s in surveys if s.frozen_s > 0.25]
@@ -200,7 +209,7 @@ def _stuck(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
         worst = max(frozen, key=lambda s: s.frozen_s)
         text = (
             f"the whole state repeats itself for up to {worst.frozen_s:.2f} s while the command moves in "
-            f"{some([s.motion for s in frozen])}: samples were lost; cut the logs there"
+            f"{abbreviate([s.motion for s in frozen])}: samples were lost; cut the logs there"
         )
         found.append(Finding("warning", "stuck", text))
     yield from found or [Finding("ok", "stuck", "every channel changes when it should")]

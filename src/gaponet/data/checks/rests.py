@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.offsets import Gravity
 from gaponet.data.survey import Survey
-from gaponet.robot.finding import Finding, some
+from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 FEW = 12  # rests of a joint that say nothing
@@ -92,7 +92,8 @@ def rests(surveys: list[Survey], robot: RobotSpec, model: Gravity) -> Iterator[F
     if soft:
         softness = float(np.median(list(soft.values())))
         text = (
-            f"{some(list(soft))} sag {softness:.2f} times as far as the stated kp says: were these logs recorded at "
+            f"{abbreviate(list(soft))} sag {softness:.2f} times as far as the stated kp says: were these logs "
+            "recorded at "
             "other gains, or with another payload than their label? Import again with --kp or --payload-mass"
         )
         wrong.append(Finding("warning", "gains", text, tuple(soft), {"softness": soft}))
@@ -217,7 +218,8 @@ def _two_units(
         return []
     motions = [[surveys[i].motion for i in told if (i in best[3]) == side] for side in (True, False)]
     text = (
-        f"{some(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {some(motions[1])} do ({some(best[2])}): "
+        f"{abbreviate(motions[0])} rest up to {best[1] * 1e3:.0f} mrad from where {abbreviate(motions[1])} do "
+        f"({abbreviate(best[2])}): "
         "two robots under one name, or zeros set in between? Import one part with another --unit-id"
     )
     return [Finding("warning", "unit_id", text, tuple(best[2]), {"apart": best[1], "motions": motions[0]})]
@@ -270,7 +272,8 @@ def _told(
         worst = max(apart, key=lambda name: abs(apart[name]))
         text = (
             f"{meta.motion} rests {apart[worst] * 1e3:+.0f} mrad from where the other recordings of unit "
-            f"{meta.unit_id} say ({some(list(apart))}): another robot, or zeros set in between? Import it with another "
+            f"{meta.unit_id} say ({abbreviate(list(apart))}): another robot, or zeros set in between? Import it with "
+            "another "
             "--unit-id"
         )
         return far, Finding("warning", "unit_id", text, tuple(apart), {"motion": meta.motion, "apart": apart})

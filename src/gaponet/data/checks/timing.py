@@ -10,7 +10,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.signals import Response
 from gaponet.data.survey import HERTZ, Survey
-from gaponet.robot.finding import Finding, some
+from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 ROUNDS = 6  # of shifts and of what all follow
@@ -105,7 +105,7 @@ def _late(surveys: list[Survey]) -> Iterator[Finding]:
             ms = sorted(abs(late) * 1e3 for _, late in part)
             by = f"{ms[0]:.0f} ms" if alone else f"{ms[0]:.0f} to {ms[-1]:.0f} ms"
             text = (
-                f"{some(which)} {'follows its' if alone else 'follow their'} commands {by} {word} than the other "
+                f"{abbreviate(which)} {'follows its' if alone else 'follow their'} commands {by} {word} than the other "
                 "recordings: clocks of command and state that are apart, another servo, or friction in slow motions; "
                 "leave them out if it is the clocks"
             )

@@ -14,7 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.data.offsets import Gravity
 from gaponet.data.sequence import Sequence
-from gaponet.robot.finding import Finding, some
+from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 Heights = Callable[[Array], Array]  # lowest tip in postures (k, n), (k,) m
@@ -81,7 +81,7 @@ def touching(found: list[Standing], every: Callable[[], Iterable[Standing]]) -> 
         return
     worst = sorted(pressed, key=lambda motion: -pressed[motion])
     text = (
-        f"{len(pressed)} motion(s) press a tip on something about {lowest + LOW / 2:.2f} m high ({some(worst)}): "
+        f"{len(pressed)} motion(s) press a tip on something about {lowest + LOW / 2:.2f} m high ({abbreviate(worst)}): "
         "standing arms are further from their commands there than they sag, and draw more current; gaponet identify "
         "looks for a table"
     )

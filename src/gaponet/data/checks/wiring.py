@@ -9,7 +9,7 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.survey import Survey
-from gaponet.robot.finding import Finding, some
+from gaponet.robot.finding import Finding, abbreviate
 from gaponet.robot.spec import RobotSpec
 
 SCALE = (0.5, 1.25)  # a loaded joint falls short of its commands, and beyond them where its load stands on it
@@ -42,7 +42,7 @@ def _order(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     idle = tuple(name for name, count in zip(robot.joint_names, asked, strict=True) if not count)
     if idle:
         level = "warning" if set(idle) & set(robot.operated) else "note"
-        text = f"no motion commands {some(list(idle))} over more than {MOVED:g} rad: nothing can be learned there"
+        text = f"no motion commands {abbreviate(list(idle))} over more than {MOVED:g} rad: nothing can be learned there"
         yield Finding(level, "order", text, idle)
     if not swapped:
         yield Finding("ok", "order", "each command moves the joint of its name")
@@ -118,7 +118,8 @@ def _copied(surveys: list[Survey], robot: RobotSpec) -> Iterator[Finding]:
     if copies:
         where = [motion for motions in copies.values() for motion in motions]
         text = (
-            f"command and state of {some(list(copies))} are the same numbers in {some(where)}: one was logged as both; "
+            f"command and state of {abbreviate(list(copies))} are the same numbers in {abbreviate(where)}: one was "
+            "logged as both; "
             "log the command that the servo was sent"
         )
         found.append(Finding("error", "copied", text, tuple(copies)))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 from gaponet.base.errors import JointMismatchError
-from gaponet.robot.spec import RobotSpec, available, load_robot
+from gaponet.robot.spec import RobotSpec, load_robot, packaged_robots
 
 
 def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: dict[str, str] | None) -> list[str]:
@@ -29,7 +29,7 @@ def resolve_all(names: Sequence[str], robot: RobotSpec, where: str, joint_map: d
             strange.append((name, error))
     if len(strange) == 1:
         raise strange[0][1]
-    kin = [] if found or joint_map else [name for name in available() if _all_of(name, names)]
+    kin = [] if found or joint_map else [name for name in packaged_robots() if _all_of(name, names)]
     if strange and kin:
         raise JointMismatchError(
             f"{where} names joints {', '.join(names)}: no joint of robot '{robot.name}', all of robot '{kin[0]}': "

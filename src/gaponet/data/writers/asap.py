@@ -16,7 +16,7 @@ import numpy as np
 from gaponet.data.sequence import OPTIONAL
 from gaponet.data.store import Dataset
 from gaponet.data.writers import Tell, Written, stated
-from gaponet.robot.mjcf import compiled, read_mjcf
+from gaponet.robot.mjcf import compile_spec, read_mjcf
 from gaponet.robot.spec import RobotSpec
 
 SCALE = 0.25  # in ASAP's configuration
@@ -24,7 +24,7 @@ SCALE = 0.25  # in ASAP's configuration
 
 def write(dataset: Dataset, robot: RobotSpec, folder: Path, tell: Tell) -> list[Written]:
     """One file per recording, with one motion in it."""
-    model = compiled(read_mjcf(robot.mjcf), robot.mjcf)
+    model = compile_spec(read_mjcf(robot.mjcf), robot.mjcf)
     axes = np.array([model.joint(name).axis for name in dataset.joint_names])  # (n, 3)
     written = []
     for entry in dataset.entries:

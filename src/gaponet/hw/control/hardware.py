@@ -14,7 +14,7 @@ import numpy as np
 from gaponet.base.arrays import Array
 from gaponet.base.errors import RobotError
 from gaponet.robot.collision import read_shapes
-from gaponet.robot.spec import BUILTIN, SERVO, RobotSpec, load_robot
+from gaponet.robot.spec import PACKAGE_FOLDER, SERVO_FIELDS, RobotSpec, load_robot
 from gaponet.sim.model import model_hash
 
 ROBOT_OF_DRIVER = {"unitree": "h1_2", "so101": "so101"}
@@ -28,7 +28,7 @@ BEYOND_RANGE_RAD = 0.051  # a joint may be found 0.05 rad outside its range, and
 
 def known_robot(driver: str, limits_from: str | None) -> RobotSpec:
     """The robot whose limits hold for a driver: the package's own, or the folder that the user names."""
-    robot = load_robot(limits_from or BUILTIN / ROBOT_OF_DRIVER[driver])
+    robot = load_robot(limits_from or PACKAGE_FOLDER / ROBOT_OF_DRIVER[driver])
     return robot.before_identification
 
 
@@ -47,7 +47,7 @@ def for_hardware(robot: RobotSpec, known: RobotSpec) -> RobotSpec:
     require_plausible(robot)
     if robot.nominal is None:
         return known
-    return replace(known, **{name: getattr(robot, name) for name in SERVO}, nominal=known)
+    return replace(known, **{name: getattr(robot, name) for name in SERVO_FIELDS}, nominal=known)
 
 
 def robot_hash(robot: RobotSpec) -> str:
@@ -110,7 +110,7 @@ def require_motor_limits(robot: RobotSpec, packaged: str) -> None:
     Raises:
         RobotError: With the folder, the joint and the bound.
     """
-    nominal, motors = robot.before_identification, load_robot(BUILTIN / packaged)
+    nominal, motors = robot.before_identification, load_robot(PACKAGE_FOLDER / packaged)
     effort = motors.effort_limit[motors.index(robot.joint_names)]
     for name, values, most in (
         ("kp", nominal.kp, np.full(len(effort), MAX_KP)),

@@ -49,7 +49,7 @@ from gaponet.nn.training.ppo import PPO, Update
 from gaponet.nn.training.pretraining import Pretraining, recipe
 from gaponet.nn.training.sensor_fit import fit_inputs, refit_sensors
 from gaponet.nn.training.validation import added, choose_gain, errors
-from gaponet.robot.folder import KEPT, keeps_robot, kept_robot, save_robot
+from gaponet.robot.folder import STORED_ROBOT, has_stored_robot, load_stored_robot, save_robot
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.batch import Condition
 from gaponet.sim.model import model_hash
@@ -79,8 +79,8 @@ class Trainer:
             raise UsageError(f"{out}: holds a run already; add --resume to go on with it, or choose another --out")
         if resume and not (out / "checkpoint.pt").is_file():
             raise UsageError(f"{out}: nothing to resume (no checkpoint.pt); train without --resume")
-        if resume and keeps_robot(out) and model_hash(kept_robot(out, robot.name)) != model_hash(robot):
-            raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / KEPT}")
+        if resume and has_stored_robot(out) and model_hash(load_stored_robot(out, robot.name)) != model_hash(robot):
+            raise UsageError(f"{out}: was trained in another simulator; resume with --robot {out / STORED_ROBOT}")
         self.dataset, self.robot, self.out, self.config = dataset, robot, out, config
         self.budget, self.show, self.own = budget, show, ranks.share(config)
         rule = (holdout_units, config.holdout_payloads, config.rates, config.train_share)
@@ -336,8 +336,8 @@ class Trainer:
             "dataset": data.address or os.path.relpath(data.path, self.out), "dataset_hash": dataset_hash(data.entries),
         }  # fmt: skip
         write_text(self.out / "config.json", json.dumps(config, indent=1) + "\n")
-        kept = self.out / KEPT
-        if self.robot.folder.resolve() != kept.resolve() and not (resume and keeps_robot(self.out)):
+        kept = self.out / STORED_ROBOT
+        if self.robot.folder.resolve() != kept.resolve() and not (resume and has_stored_robot(self.out)):
             save_robot(self.robot, kept)
         split = {part: {e.id: e.hash for e in entries} for part, entries in self.parts.items()}
         write_text(self.out / "split.json", json.dumps(split, indent=1, ensure_ascii=False) + "\n")

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from gaponet.base.arrays import Array
-from gaponet.robot.collision import FINE
+from gaponet.robot.collision import POSTURE_STEP_RAD
 from gaponet.sysid.motion.minjerk import PEAK_ACCELERATION, blend, move_time
 
 Free = Callable[[Array], bool]  # whether all postures (T, n) rad are
@@ -64,7 +64,7 @@ class Trajectory:
 
 def line(a: Array, b: Array) -> Array:
     """Postures from a to b (n,) rad, both included, none further than FINE from the next, (T, n)."""
-    return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / FINE)) + 1))
+    return np.linspace(a, b, max(2, int(np.ceil(np.abs(b - a).max() / POSTURE_STEP_RAD)) + 1))
 
 
 def finish_search(search: Search[_T]) -> _T:

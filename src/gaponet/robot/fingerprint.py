@@ -32,7 +32,7 @@ GEOM = ("type", "contype", "conaffinity", "condim", "priority", "friction", "mar
         "solmix", "fluid")  # fmt: skip
 
 
-def lines(model: mujoco.MjModel) -> Iterator[str]:
+def model_fingerprint(model: mujoco.MjModel) -> Iterator[str]:
     """Everything that decides how the model moves, one thing per line; the time step is left to the caller."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0

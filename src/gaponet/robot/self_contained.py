@@ -16,8 +16,8 @@ import mujoco
 import numpy as np
 
 from gaponet.base.errors import RobotError
-from gaponet.robot.identity import lines
-from gaponet.robot.mjcf import compiled, read_mjcf
+from gaponet.robot.fingerprint import model_fingerprint
+from gaponet.robot.mjcf import compile_spec, read_mjcf
 
 Places = dict[str, Iterator[int]]  # tag → number of the next one in the model
 
@@ -27,19 +27,19 @@ LOOKS = ("class", "childclass", "material", "mesh", "density", "shellinertia", "
 DYNAMICS = ("armature", "frictionloss", "margin")
 
 
-def bare_mjcf(path: Path) -> str:
+def self_contained_mjcf(path: Path) -> str:
     """The MJCF at path in one text; its actuators are left out, since robot.toml has them.
 
     Raises:
         RobotError: It does not compile, or has what such a text cannot hold (tendons with odd figures, plugins).
     """
-    return bare_text(read_mjcf(path), path)
+    return self_contained_text(read_mjcf(path), path)
 
 
-def bare_text(spec: mujoco.MjSpec, path: Path) -> str:
+def self_contained_text(spec: mujoco.MjSpec, path: Path) -> str:
     """The same of a specification that was read from `path`."""
     spec.compiler.discardvisual = spec.compiler.fusestatic = False
-    model = compiled(spec, path)
+    model = compile_spec(spec, path)
     root = ET.fromstring(spec.to_xml())
     for child in [c for c in root if c.tag in (*DROPPED, "compiler")]:
         root.remove(child)
@@ -51,7 +51,7 @@ def bare_text(spec: mujoco.MjSpec, path: Path) -> str:
     _fill(world, 0, model, asset, {tag: count() for tag in ("joint", "geom", "site")}, count(1))
     ET.indent(root)
     text = ET.tostring(root, encoding="unicode") + "\n"
-    if _moves(model) != _moves(compiled(mujoco.MjSpec.from_string(text), path)):
+    if _moves(model) != _moves(compile_spec(mujoco.MjSpec.from_string(text), path)):
         raise RobotError(
             f"{path}: does not fit into one file that moves the same; write it without <include> and files"
         )
@@ -59,7 +59,7 @@ def bare_text(spec: mujoco.MjSpec, path: Path) -> str:
 
 
 def _moves(model: mujoco.MjModel) -> list[str]:
-    return [line for line in lines(model) if not line.startswith("actuator ")]
+    return [line for line in model_fingerprint(model) if not line.startswith("actuator ")]
 
 
 def _fill(
@@ -70,10 +70,10 @@ def _fill(
     for child in [c for c in element if c.tag not in ("joint", "geom", "site", "body")]:
         element.remove(child)
     if body:
-        put(element, pos=model.body_pos[body], quat=model.body_quat[body])
+        set_attributes(element, pos=model.body_pos[body], quat=model.body_quat[body])
         if model.body_mass[body]:
             inertial = ET.Element("inertial")
-            put(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
+            set_attributes(inertial, pos=model.body_ipos[body], quat=model.body_iquat[body], mass=model.body_mass[body],
                  diaginertia=model.body_inertia[body])  # fmt: skip
             element.insert(0, inertial)
     for child in element:
@@ -84,7 +84,7 @@ def _fill(
         elif child.tag == "site":
             s = next(next_["site"])
             child.attrib.pop("material", None)
-            put(child, pos=model.site_pos[s], quat=model.site_quat[s])
+            set_attributes(child, pos=model.site_pos[s], quat=model.site_quat[s])
     for child in [c for c in element if c.tag == "body"]:
         _fill(child, next(bodies), model, asset, next_, bodies)
 
@@ -98,18 +98,22 @@ def _unwrap(element: ET.Element) -> None:
 
 def _joint(element: ET.Element, model: mujoco.MjModel, j: int) -> None:
     dof, at = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
-    put(element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at])
-    put(element, **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in DYNAMICS})
+    set_attributes(
+        element, pos=model.jnt_pos[j], axis=model.jnt_axis[j], ref=model.qpos0[at], springref=model.qpos_spring[at]
+    )
+    set_attributes(
+        element, **{name: getattr(model, f"{'jnt' if name == 'margin' else 'dof'}_{name}")[dof] for name in DYNAMICS}
+    )
     for name, kind, i in (("stiffness", "jnt", j), ("damping", "dof", dof)):
         higher = getattr(model, f"{kind}_{name}poly", np.zeros((model.nv, 0)))[i]
         first = getattr(model, f"{kind}_{name}")[i]
-        put(element, **{name: [first, *higher] if np.any(higher) else first})
+        set_attributes(element, **{name: [first, *higher] if np.any(higher) else first})
     element.attrib.pop("springdamper", None)  # stiffness and damping were made of it
     for ours, theirs in (("", ""), ("actfrc", "actuatorfrc")):
         limited = bool(getattr(model, f"jnt_{ours}limited")[j])
         element.set(f"{theirs}limited", str(limited).lower())
         if limited:
-            put(element, **{f"{theirs}range": getattr(model, f"jnt_{ours}range")[j]})
+            set_attributes(element, **{f"{theirs}range": getattr(model, f"jnt_{ours}range")[j]})
 
 
 def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element) -> None:
@@ -129,12 +133,14 @@ def _geom(element: ET.Element, model: mujoco.MjModel, g: int, asset: ET.Element)
             size = np.maximum(model.geom_aabb[g, 3:], 1e-4)
     element.set("type", kind)
     rgba = model.geom_rgba[g] if model.geom_matid[g] < 0 else model.mat_rgba[model.geom_matid[g]]
-    put(element, pos=pos, quat=model.geom_quat[g], mass=0.0, rgba=rgba, friction=model.geom_friction[g])
+    set_attributes(element, pos=pos, quat=model.geom_quat[g], mass=0.0, rgba=rgba, friction=model.geom_friction[g])
     for name in ("contype", "conaffinity", "condim", "group", "priority"):
         element.set(name, str(int(getattr(model, f"geom_{name}")[g])))
-    put(element, **{n: getattr(model, f"geom_{n}")[g] for n in ("solmix", "solref", "solimp", "margin", "gap")})
+    set_attributes(
+        element, **{n: getattr(model, f"geom_{n}")[g] for n in ("solmix", "solref", "solimp", "margin", "gap")}
+    )
     if kind != "mesh":
-        put(element, size=size)
+        set_attributes(element, size=size)
     else:
         element.attrib.pop("size", None)
 
@@ -146,12 +152,12 @@ def _mesh(model: mujoco.MjModel, mesh: int, asset: ET.Element) -> str:
         vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
         faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
         element = ET.SubElement(asset, "mesh", {"name": name, "inertia": "shell"})
-        put(element, vertex=model.mesh_vert[vertices].astype(float))
+        set_attributes(element, vertex=model.mesh_vert[vertices].astype(float))
         element.set("face", " ".join(map(str, model.mesh_face[faces].ravel())))
     return name
 
 
-def put(element: ET.Element, **figures: object) -> None:
+def set_attributes(element: ET.Element, **figures: object) -> None:
     """Attributes with all digits."""
     for name, values in figures.items():
         element.set(name, " ".join(repr(float(x)) for x in np.ravel(np.asarray(values, float))))
