@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Two pools of busy-waiting threads on two cores cost a factor of five.
 export OMP_WAIT_POLICY := PASSIVE
 
-.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills workers lerobot check workflows windows resolve wheels ends site clean
+.PHONY: setup demo test slow faults live peers engines buckets browser adversary tournament fuzz hostile kills lerobot check workflows windows resolve wheels ends site clean
 
 setup: $(VENV)/.done
 
@@ -87,12 +87,7 @@ hostile: setup
 # of torchrun killed and frozen: five minutes.
 kills: setup
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kills.py kills_work
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks --only kills
-
-# A worker killed in the middle of collect, gap and a study, on local processes and Ray: less than ten minutes.
-workers: setup
-	$(BIN)/pip install -q -e ".[dev,ray]"
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/kill_workers.py workers_work
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/ranks.py kills_work/ranks
 
 # LeRobot 0.6 with our plug-in (Python 3.12, torch; made in ~/.cache/gaponet, 5 GB) on a virtual servo bus: ten minutes.
 LEROBOT ?= $(HOME)/.cache/gaponet/lerobot-0.6.1
@@ -143,4 +138,4 @@ site: setup
 	$(BIN)/zensical build --strict --clean
 
 clean:
-	rm -rf $(VENV) .tools .ends dist site demo_run kills_work workers_work lerobot_work .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) .tools .ends dist site demo_run kills_work lerobot_work .pytest_cache .ruff_cache .mypy_cache

@@ -19,17 +19,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import warp
 
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.batch import BatchSim, Condition
-from gaponet.sim.warp import WarpSim
 
 LAW = {"stribeck": 0.02, "stribeck_speed": 0.05, "friction_motor": 0.1, "friction_external": 0.1}
 
 
 def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Control steps a second of all simulations, after a first period that compiles."""
+    """Return the control steps per second of all simulations, after a first period that compiles."""
+    import warp
+
     period()
     warp.synchronize()
     periods, began = 0, time.perf_counter()
@@ -43,7 +43,9 @@ def rate(period: Callable[[], object], num_envs: int, seconds: float) -> float:
 
 
 def measure(robot: RobotSpec, num_envs: int, device: str, seconds: float) -> dict[str, float]:
-    """Speeds by name, control steps/s."""
+    """Measure the speeds by name, control steps/s."""
+    from gaponet.sim.warp import WarpSim
+
     sim = WarpSim(BatchSim(robot, [Condition(0.0, "both", robot.dt)] * num_envs, 1), device)
     home = sim.array(np.tile(robot.qpos_home, (num_envs, 1)))
     some = sim.array(np.arange(0, num_envs, 100))

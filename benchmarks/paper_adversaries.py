@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from virtual_h1_2 import run
 
 from gaponet.base.result_table import ResultTable
+from gaponet.cli.main import main as gaponet
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
 from gaponet.nn.artifact import GapModel
@@ -88,7 +88,20 @@ def main(dataset: Path, work: Path, budget: str, unit: str) -> None:
         PaperNet.sensors = noise if name == "sensors are noise" else sensors  # type: ignore[method-assign]
         if not (folder / "model" / "card.json").is_file():
             limit = () if "--budget" in options else ("--budget", budget)
-            run("train", learned.path, "--out", folder, "--holdout-units", unit, "--threads", 1, *options, *limit)
+            command = [
+                "train",
+                learned.path,
+                "--out",
+                folder,
+                "--holdout-units",
+                unit,
+                "--threads",
+                1,
+                *options,
+                *limit,
+            ]
+            if gaponet(list(map(str, [*command, *options, *limit]))):
+                raise SystemExit(2)
         found = errors(GapModel.load(folder).corrector(robot))
         rows.append((name, *found, *(e / n for e, n in zip(found, nominal, strict=True))))
         columns = ("training", "units trained on, mrad", f"{unit}, mrad", "of nominal", "of nominal ")

@@ -44,7 +44,6 @@ from gaponet.sim.replay import idle_limbs, replay
 
 Turn = Callable[[], object]
 Speeds = dict[str, dict[str, float]]
-Others = Callable[[DeltaEnv, TrainConfig], dict[str, tuple[Turn, int]]]  # name → a turn, its control steps
 
 EPISODE_S = 10.0
 TURN_STEPS = 40  # control periods of a turn
@@ -77,21 +76,17 @@ def bench_sim(robot: RobotSpec, num_envs: int, rounds: int, steps: int = TURN_ST
     return _speeds({name: (num_envs * steps, s) for name, s in seconds.items()}, "bare Batch loop")
 
 
-def bench_train(
-    robot: RobotSpec, config: TrainConfig, num_envs: int, rounds: int, others: Others | None = None
-) -> dict[str, Any]:
-    """Control steps per second of each part of PPO training, of the whole, and of other trainers on the same task.
+def bench_train(robot: RobotSpec, config: TrainConfig, num_envs: int, rounds: int) -> dict[str, Any]:
+    """Control steps per second of each part of PPO training, and of the whole.
 
     Args:
         robot: Limbs without an operated joint are locked, as in training.
         config: Model, PPO and threads.
         rounds: Turns of each part, after one that is not counted.
-        others: Makes the turns of other trainers, and says how many control steps one of each is (sb3.py).
 
     Returns:
         speeds by name; expected (control steps/s, if physics, inference and update ran without overhead) and the share
-        of it that PPO reaches; times_others (PPO's speed over that of each other trainer); parameters;
-        peak_memory_bytes.
+        of it that PPO reaches; parameters; peak_memory_bytes.
     """
     import resource  # not on Windows
 
@@ -113,18 +108,13 @@ def bench_train(
         "PPO": learner.update,
         "PPO, fast preset": quick_learner.update,
     }
-    counts = dict.fromkeys(turns, batch)
-    theirs = {} if others is None else others(env, config)
-    counts |= {name: count for name, (_, count) in theirs.items()}
-    turns |= {name: turn for name, (turn, _) in theirs.items()}
     seconds = take_turns(turns, rounds, median)
     expected = batch / sum(seconds[part] for part in ("bare Batch loop", "inference", "update"))
-    speeds = _speeds({name: (counts[name], s) for name, s in seconds.items()}, "bare Batch loop")
+    speeds = _speeds({name: (batch, s) for name, s in seconds.items()}, "bare Batch loop")
     return {
         "speeds": speeds,
         "expected": expected,
         "share_of_expected": speeds["PPO"]["control_steps_per_s"] / expected,
-        "times_others": {name: speeds["PPO"]["ratio"] / speeds[name]["ratio"] for name in theirs},
         "parameters": size(net),
         "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
     }

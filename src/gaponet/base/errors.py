@@ -58,7 +58,7 @@ class UsageError(GAPONetError):
 EXTRAS = {
     "torch": "train", "onnx": "train", "onnxruntime": "deploy",
     "matplotlib": "report", "markupsafe": "report", "cyclonedds": "dds", "serial": "so101", "gymnasium": "gym",
-    "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view", "stable_baselines3": "bench",
+    "PIL": "view", "imageio_ffmpeg": "view", "viser": "view", "trimesh": "view",
     "rosbags": "ros", "h5py": "hdf5", "huggingface_hub": "hub", "fsspec": "hub", "s3fs": "s3", "gcsfs": "gs",
     "tensorboard": "tensorboard", "wandb": "wandb", "zmq": "zmq", "warp": "warp", "mujoco_warp": "warp", "ray": "ray",
 }  # fmt: skip

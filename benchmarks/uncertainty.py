@@ -1,14 +1,13 @@
-"""Is what is known of a robot honest? Intervals of parameters and of predicted motion, and what gaponet check says.
+"""Coverage of the standard errors and prediction bands, and verdicts of gaponet check: docs/results/know.md.
 
-    python benchmarks/known.py virtual WORK --robots 100 --form right|wrong   VIRTUAL two-joint arms, a line each
-    python benchmarks/known.py real ROBOT DAY OTHER_DAY WORK                  datasets of two days; ROBOT of the first
-    python benchmarks/known.py halves ROBOT DAY OTHER_DAY WORK                a fit on half of a day asked on the other
-    python benchmarks/known.py drawn ROBOT DAY                                how far units of today move the path
-    python benchmarks/known.py table WORK                                     the tables of docs/results/known.md
+    python benchmarks/uncertainty.py virtual WORK --robots 100 --form right|wrong   VIRTUAL two-joint arms, a line each
+    python benchmarks/uncertainty.py real ROBOT DAY OTHER_DAY WORK                  datasets of two days
+    python benchmarks/uncertainty.py table WORK                                     tables of the virtual arms
 
-A virtual arm is drawn from the hard fleet; with the right form only its gain, damping, dry friction, delay and encoder
-noise are hidden. It is identified, every joint on its own, from eight motions of 15 s; three more judge. Then it plays
-eight others on days on which nothing changed, or one thing did.
+A virtual arm is drawn from the fleet `hard`. With the right form, only its gain, damping, dry friction, delay and
+encoder noise are hidden. Each joint is identified on its own from eight motions of 15 s; three more are the validation
+set. Then the arm plays eight other motions per day: on some days nothing changed, on the others one parameter did.
+ROBOT was identified from the training motions of DAY.
 """
 
 from __future__ import annotations
@@ -27,18 +26,15 @@ from gaponet.base.progress import no_progress
 from gaponet.data.sequence import Sequence, SequenceMeta
 from gaponet.data.split import split_entries
 from gaponet.data.store import Dataset
-from gaponet.export.ranges import ranges
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sim.replay import replay
-from gaponet.sysid.axes import CLASSIC, Bounds, first_values
+from gaponet.sysid.axes import CLASSIC, Bounds
 from gaponet.sysid.drift import drift
-from gaponet.sysid.evidence import WINDOWS, estimate_uncertainty
+from gaponet.sysid.evidence import estimate_uncertainty
 from gaponet.sysid.fit import Clock, Fit
-from gaponet.sysid.identify import identify
 from gaponet.sysid.joint_rollouts import JointRollouts
 from gaponet.sysid.robot_rollouts import cut
-from gaponet.sysid.table_contact import tip_heights, touching_below
 from gaponet.sysid.uncertainty import ParameterUncertainty
 from gaponet.testing.fleet import draw, load_fleet
 from gaponet.testing.physics import Physics
@@ -55,7 +51,7 @@ NORMAL_90 = 1.645
 
 
 def commands(seed: int, dt: float) -> np.ndarray:
-    """Two joints: slow and faster sines on ways from rest to rest, (ROWS, 2) rad."""
+    """Draw commands of two joints: slow and fast sines on moves between rests, (ROWS, 2) rad."""
     rng, t = np.random.default_rng([seed, 77]), np.arange(ROWS)[:, None] * dt
     pace = np.exp(rng.uniform(np.log(0.1), np.log(1.5), (3, 2)))
     waves = sum(
@@ -69,7 +65,7 @@ def commands(seed: int, dt: float) -> np.ndarray:
 
 
 def changed(p: Physics, what: str) -> Physics:
-    """The unit on that day; friction of the arm's file counts as its own."""
+    """Return the unit on that day; the friction of the arm's file counts as the unit's own."""
     if what == "friction +20 %":
         return replace(p, friction=1.2 * (p.friction + 0.05) - 0.05)
     if what == "delay +5 ms":
@@ -80,7 +76,7 @@ def changed(p: Physics, what: str) -> Physics:
 
 
 def play(robot: RobotSpec, units: list[Physics], first: int, day: int) -> list[list[Sequence]]:
-    """Motions of one day of every unit, side by side."""
+    """Simulate the motions of one day for every unit."""
     n = len(units)
     ctrl = np.stack(
         [commands(100_000 * day + 100 * (first + k) + m, robot.dt) for k in range(n) for m in range(MOTIONS)], 1
@@ -109,7 +105,7 @@ def play(robot: RobotSpec, units: list[Physics], first: int, day: int) -> list[l
 
 
 def virtual(work: Path, robots: int, form: str) -> None:
-    """Draw, play, identify, ask: lines of work/FORM.jsonl; what is there is not done again."""
+    """Draw, simulate, identify and check arms; append one line each to work/FORM.jsonl. Resumes after an interrupt."""
     robot = write_arm(work / "arm")
     fleet = load_fleet("hard", robot)
     file = work / f"{form}.jsonl"
@@ -121,14 +117,16 @@ def virtual(work: Path, robots: int, form: str) -> None:
             units = [replace(u.only(RIGHT), friction_asymmetry=0 * u.friction) for u in units]
         days = [play(robot, [changed(u, what) for u in units], first, d) for d, what in enumerate(DAYS)]
         for k, unit in enumerate(units):
-            line = _asked(robot, unit, [day[k] for day in days], days[2][(k + 1) % len(units)])
+            line = _evaluated(robot, unit, [day[k] for day in days], days[2][(k + 1) % len(units)])
             with file.open("a") as out:
                 out.write(json.dumps(line) + "\n")
         print(f"{last} of {robots}", flush=True)
 
 
-def _asked(robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another: list[Sequence]) -> dict[str, object]:
-    """One arm identified and checked."""
+def _evaluated(
+    robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another: list[Sequence]
+) -> dict[str, object]:
+    """Identify one arm and check it on every day."""
     train, val, began = days[0], days[1][:3], time.monotonic()
     bounds = Bounds(robot, train)
     fit = Fit(JointRollouts(cut(train, 12), robot, nthread=1), robot, bounds)
@@ -158,7 +156,7 @@ def _asked(robot: RobotSpec, unit: Physics, days: list[list[Sequence]], another:
 
 
 def real(folder: Path, day: Path, other: Path, work: Path) -> None:
-    """Parts of two days of a real robot; the robot was identified from the training part of the first."""
+    """Evaluate bands and verdicts of a real robot, identified from the training set of the first day."""
     data, robot = Dataset(day), load_robot(folder)
     parts = split_entries(data, ())
     train, val, test = (data.sequences(parts[part]) for part in ("train", "val", "test"))
@@ -194,41 +192,8 @@ def real(folder: Path, day: Path, other: Path, work: Path) -> None:
     (work / "real.json").write_text(json.dumps(facts, indent=1))
 
 
-def halves(folder: Path, day: Path, other: Path, work: Path) -> None:
-    """Identified from each half of a day's motions and asked of the other, and of both days' logs under one name."""
-    data, there = Dataset(day), Dataset(other)
-    robot, logs = load_robot(str(folder)), data.sequences(data.entries)  # a name or a folder
-    later, file = there.sequences(there.entries), work / "halves.json"
-    lines = json.loads(file.read_text()) if file.is_file() else []
-    for k in range(len(lines), 2):
-        mine, rest = logs[k::2], logs[1 - k :: 2]
-        fitted = identify(mine[::4] + mine[1::4] + mine[2::4], robot, mine[3::4], table=False, nthread=1)
-        save_robot(fitted.robot, work / f"half{k}")
-        half = load_robot(work / f"half{k}")
-        sure = estimate_uncertainty(half, mine[::4] + mine[1::4] + mine[2::4], mine[3::4], fitted.covariance, nthread=1)
-        sure.save(work / f"half{k}")
-        op, twins = half.operated_index, replay(rest, half, nthread=1)
-        error = np.concatenate([np.abs(t.qpos - s.qpos)[1:, op] for s, t in zip(rest, twins, strict=True)])
-        asked = {"other half": rest, "half of it, half of another day": rest[::2] + later[1 - k :: 4]}
-        asked |= {"three quarters, a quarter of another day": rest[: len(rest) * 3 // 4] + later[1 - k :: 8]}
-        said = {}
-        for what, of in asked.items():
-            found = drift(half, sure, [replace(s, meta=replace(s.meta, motion=f"{s.meta.motion} {i}"))
-                                       for i, s in enumerate(of)], 1)  # fmt: skip
-            mine_too = {f"{s.meta.motion} {i}" for i, s in enumerate(of) if any(s is r for r in rest)}
-            aside = {a.recording for a in found.against}
-            moved = [(m.joint, m.field, m.by, m.sigmas) for m in found.moved]
-            said[what] = {"verdict": found.verdict, "moved": moved, "of": len(of)}
-            said[what] |= {"aside": len(aside), "aside, of the other day": len(aside - mine_too)}
-        inside = (error <= [j.residual_p90 for j in sure.joints.values()]).mean(axis=0)
-        alone = (error <= [NORMAL_90 * j.parameter_rms for j in sure.joints.values()]).mean(axis=0)
-        lines.append({"inside": inside.tolist(), "alone": alone.tolist(), "said": said})
-        file.write_text(json.dumps(lines, indent=1))
-        print(lines[-1], flush=True)
-
-
 def table(work: Path) -> None:
-    """What was found, in Markdown."""
+    """Print the tables of the virtual arms in Markdown."""
     for form in ("right", "wrong"):
         file = work / f"{form}.jsonl"
         if not file.is_file():
@@ -255,41 +220,19 @@ def table(work: Path) -> None:
             print(f"| {what} | {count} | {named if what in right else ''} |")
 
 
-def drawn(folder: Path, day: Path) -> None:
-    """How far 100 units of today are from the robot's path in 40 windows of the training motions, RMS over each."""
-    data, robot = Dataset(day), load_robot(folder)
-    train, mine = data.sequences(split_entries(data, ())["train"]), ParameterUncertainty.load(robot)
-    assert mine is not None
-    below = touching_below(robot, tip_heights(train, robot))
-    runs, own = JointRollouts(cut(train, WINDOWS), robot, below, 1), first_values(robot)
-    units = ranges(robot, samples=100).units
-    own = {f: np.repeat(own[f][None], 100, axis=0) for f in units}
-    path = runs.errors({f: v[:1] for f, v in own.items()})
-    print("| joint | the robot leaves, mrad | half of the units | 9 of 10 | all | 9 of 10, the limit stays |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: |")
-    each = [1e3 * np.sqrt(np.square(runs.errors(v) - path).sum(axis=(2, 3)) / runs.rows)
-            for v in (units, units | {"effort_limit": own["effort_limit"]})]  # fmt: skip
-    for i, (joint, k) in enumerate(mine.joints.items()):
-        shares = [*np.quantile(each[0][:, i], (0.5, 0.9, 1.0)), np.quantile(each[1][:, i], 0.9)]
-        print(f"| {joint} | {1e3 * k.residual_rms:.1f} | {' | '.join(f'{x:.1f}' for x in shares)} |")
-
-
 def main() -> None:
-    """As above."""
+    """Run one part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("virtual", "real", "halves", "drawn", "table"))
+    parser.add_argument("what", choices=("virtual", "real", "table"))
     parser.add_argument("paths", nargs="+", type=Path)
     parser.add_argument("--robots", type=int, default=100)
     parser.add_argument("--form", choices=("right", "wrong"), default="wrong")
     args = parser.parse_args()
-    if args.what == "drawn":
-        drawn(*args.paths)
-        return
     args.paths[-1].mkdir(parents=True, exist_ok=True)
     if args.what == "virtual":
         virtual(args.paths[0], args.robots, args.form)
-    elif args.what in ("real", "halves"):
-        {"real": real, "halves": halves}[args.what](*args.paths)
+    elif args.what == "real":
+        real(*args.paths)
     else:
         table(args.paths[0])
 
