@@ -42,7 +42,7 @@ from scipy.optimize import linear_sum_assignment
 from gaponet.base.arrays import Array
 from gaponet.data.split import one_motion
 from gaponet.experiments.real.cards import prepare, read_cards
-from gaponet.experiments.real.rivals import Answer
+from gaponet.experiments.real.methods import FittedSim
 from gaponet.nn.loop import DeltaCorrector, DeltaLoop
 from gaponet.nn.paper import PaperNet, released_inputs, released_network
 from gaponet.nn.sensor import ProbeOracle
@@ -170,7 +170,7 @@ def on_logs(net: PaperNet, logs: Path) -> None:
         recordings, lead = dataset.sequences(dataset.entries), one_motion(dataset)
         command = np.array([lead[e.meta.motion] for e in dataset.entries])
 
-    def errors(answer: Answer) -> Array:
+    def errors(answer: FittedSim) -> Array:
         each = 1e3 * np.array(answer.errors(recordings))
         return np.array([each[command == c].mean() for c in np.unique(command)])
 
@@ -178,7 +178,7 @@ def on_logs(net: PaperNet, logs: Path) -> None:
     order, match = inferred_order(net, *states[0.02])
     for j, each in zip(order, match, strict=True):
         print(f"{robot.operated[j]}: correlation {each[j]:.2f}, with another joint {np.delete(each, j).max():.2f}")
-    nominal = errors(Answer(robot))
+    nominal = errors(FittedSim(robot))
     print(f"{len(recordings)} recordings of {len(nominal)} commands\n")
     print("| reading | predictor, correlation | RMS, mrad | MPJAE, mrad | more than nominal | commands improved |")
     print(f"|---|---|---|---|---|---|\n| nominal | – | – | {shown(nominal)} | – | – |")
@@ -186,7 +186,7 @@ def on_logs(net: PaperNet, logs: Path) -> None:
         x, answers = states[reading.dt]
         predicted, score = reading.outputs(partial(predicted_sensors, net), x), "– | – | –"
         if reading.dt == robot.dt:
-            error = errors(Answer(robot, reading.corrector(net, robot)))
+            error = errors(FittedSim(robot, reading.corrector(net, robot)))
             score = f"{shown(error)} | {shown(error - nominal)} | {(error < nominal).sum()}"
         share, rms = np.corrcoef(predicted.ravel(), answers.ravel())[0, 1], np.sqrt(((predicted - answers) ** 2).mean())
         print(f"| {reading.name} | {share:.2f} | {1e3 * rms:.0f} | {score} |", flush=True)

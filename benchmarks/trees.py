@@ -17,8 +17,8 @@ import numpy as np
 
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import Sequence
-from gaponet.experiments.real.questions import Question, rehearsal
-from gaponet.experiments.real.rivals import LEFT_OUT, Answer, identified
+from gaponet.experiments.real.methods import LEFT_OUT, FittedSim, identified
+from gaponet.experiments.real.questions import Question, train_val
 from gaponet.nn.training.labels import trajectory_labels
 from gaponet.nn.training.validation import added
 from gaponet.report.verdict import Added
@@ -79,9 +79,9 @@ class Trees:
         return np.clip(out, *self.robot.qpos_range.T)
 
 
-def on_identified(question: Question) -> Answer:
+def on_identified(question: Question) -> FittedSim:
     """Trees on the identified robot, which stays as it is where validation says that they add nothing."""
-    start, (train, val) = identified(question), rehearsal(question)
+    start, (train, val) = identified(question), train_val(question)
     labels = trajectory_labels(train, start.robot, LIMIT)
     answer = replace(start, corrector=Trees.trained(train, start.robot, labels, 0))
     before, after = (np.array(one.errors(val)) for one in (start, answer))

@@ -7,10 +7,10 @@ import os
 import time
 
 from gaponet.base.errors import ModelError
-from gaponet.experiments.pool import Cell, Tell
+from gaponet.experiments.cells import Cell, Report
 
 
-def note_threads(cell: Cell, tell: Tell) -> None:
+def note_threads(cell: Cell, report: Report) -> None:
     """Leave a file that says how many threads this process was given; seed 1 fails, seed 2 is a bug, seed 3
     dies, seed 4 meets a full disk, seed 5 lacks a package."""
     if cell.seed == 1:
@@ -23,17 +23,17 @@ def note_threads(cell: Cell, tell: Tell) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "checkpoint.pt")
     if cell.seed == 5:
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
-    tell(0.5, "half")
+    report(0.5, "half")
     cell.folder.mkdir(parents=True)
     (cell.folder / "threads").write_text(os.environ["OMP_NUM_THREADS"])
 
 
-def wait_for_the_end(cell: Cell, tell: Tell) -> None:
+def wait_for_the_end(cell: Cell, report: Report) -> None:
     """Work until interrupted, then keep what was reached."""
     cell.folder.mkdir(parents=True)
     try:
         while True:
-            tell(0.1, "busy")
+            report(0.1, "busy")
             time.sleep(0.01)
     except KeyboardInterrupt:
         (cell.folder / "kept").touch()

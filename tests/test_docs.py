@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import gaponet as gp
-from gaponet.experiments.options import TRAINING
+from gaponet.experiments.study import TRAINING
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.config import TrainConfig
 from gaponet.nn.training.validation import GAINS

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gaponet.experiments.played.trained import Trained
 from gaponet.experiments.result import Result
+from gaponet.experiments.virtual.trained_models import TrainedModel
 from gaponet.nn.artifact import GapModel, make_card
 from gaponet.nn.config import ModelConfig
 from gaponet.robot.spec import RobotSpec
@@ -35,9 +35,9 @@ def weak_unit() -> Physics:
     return replace(neutral(2), kp_scale=np.full(2, WEAK))
 
 
-def trained(robot: RobotSpec) -> list[Trained]:
+def trained(robot: RobotSpec) -> list[TrainedModel]:
     """An operator that knows half (called mlp) and one that knows all."""
-    make = lambda method, seed, share: Trained(  # noqa: E731
+    make = lambda method, seed, share: TrainedModel(  # noqa: E731
         method,
         seed,
         Path("none"),

@@ -66,7 +66,7 @@ def test_what_is_no_executor_is_refused_and_the_answer_names_ray_and_python(wher
 
 
 def test_ray_is_loaded_only_where_it_is_asked_for_and_named_where_it_is_missing(tmp_path, capsys, monkeypatch):
-    code = "import sys, gaponet.base.executor, gaponet.experiments.found; print('ray' in sys.modules)"
+    code = "import sys, gaponet.base.executor, gaponet.experiments.outcomes; print('ray' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout == "False\n"
     monkeypatch.setitem(sys.modules, "ray", None)

@@ -1,8 +1,5 @@
 """benchmarks/speed.py measures what it says."""
 
-import importlib
-from pathlib import Path
-
 import pytest
 
 from gaponet.nn.config import ModelConfig
@@ -15,8 +12,7 @@ SMALL = TrainConfig(
 )
 
 
-def test_the_speed_without_overhead_follows_from_the_speeds_of_the_parts(arm, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    result = importlib.import_module("speed").bench_train(arm, SMALL, num_envs=8, rounds=2)
+def test_the_speed_without_overhead_follows_from_the_speeds_of_the_parts(arm, load):
+    result = load("speed").bench_train(arm, SMALL, num_envs=8, rounds=2)
     parts = [result["speeds"][p]["control_steps_per_s"] for p in ("bare Batch loop", "inference", "update")]
     assert result["expected"] == pytest.approx(1 / sum(1 / p for p in parts))

@@ -1,4 +1,4 @@
-"""A study of the small arm: recordings, and nothing trained yet."""
+"""A study of the small arm: recordings, nothing trained yet."""
 
 from dataclasses import replace
 
@@ -6,9 +6,8 @@ import pytest
 from arm import commands, record
 
 from gaponet.data.store import Dataset
-from gaponet.experiments.found import Found
-from gaponet.experiments.options import Options
-from gaponet.experiments.study import Study
+from gaponet.experiments.outcomes import StudyOutcomes
+from gaponet.experiments.study import Options, Study
 
 
 @pytest.fixture
@@ -24,17 +23,16 @@ def make_study(arm, tmp_path):
                     for unit in units:
                         ctrl = commands(40, seed, 1 / rate)
                         data.append(record(robot, ctrl, f"motion{seed}", payload, kp=0.5, delay=2, unit=unit))
-        return Study.of(data, arm, tmp_path / "out", Options(**how))
+        return Study.from_options(data, arm, tmp_path / "out", Options(**how))
 
     return make
 
 
 @pytest.fixture
-def make_found():
-    """make_found({word or (word, unit left out): outcomes}, baselines): what cells would have given."""
+def make_outcomes():
+    """make_outcomes({word: outcomes}, baselines, cells): the outcomes of finished cells."""
 
     def make(runs, base, cells=None):
-        runs = {key if isinstance(key, tuple) else (key, ""): part for key, part in runs.items()}
-        return Found(runs, lambda key: base.get(key, base), cells or {})
+        return StudyOutcomes(runs, lambda word: base, cells or {})
 
     return make

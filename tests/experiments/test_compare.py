@@ -7,7 +7,7 @@ import pytest
 
 from gaponet.experiments import compare as module
 from gaponet.experiments.compare import MEASURES, Compare
-from gaponet.experiments.page import write
+from gaponet.experiments.result_files import write
 
 
 def metrics(value):
@@ -21,14 +21,14 @@ def summary(light, heavy, unit="a"):
 
 
 @pytest.fixture
-def result(make_study, make_found, monkeypatch, tmp_path):
+def result(make_study, make_outcomes, monkeypatch, tmp_path):
     study = make_study()
     new = {"new": summary(0.03, 0.03, "b")}
     runs = [{"seed": i, "known": summary(0.005, 0.01 * i), "parameters": 1234, "seconds": 90.0} | new for i in (1, 3)]
-    cells = {("mlp", ""): [SimpleNamespace(folder=tmp_path)]}
+    cells = {"mlp": [SimpleNamespace(folder=tmp_path)]}
     monkeypatch.setattr(module, "choose", lambda runs, data: (study.data.entries[:6], True))
     base = {"nominal": {"known": summary(0.01, 0.03)} | new, "delay_offset": {"known": summary(0.01, 0.02)} | new}
-    return Compare(("mlp",)).result(study, make_found({"mlp": runs}, base, cells))
+    return Compare(("mlp",)).result(study, make_outcomes({"mlp": runs}, base, cells))
 
 
 def table(result, name):

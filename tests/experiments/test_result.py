@@ -9,10 +9,10 @@ from arm import recordings
 from gaponet.base.errors import DatasetError, FolderError
 from gaponet.base.result_table import MeanStd, ResultTable, format_cell
 from gaponet.data.store import Dataset
-from gaponet.experiments.page import write, write_report
 from gaponet.experiments.result import Result, command_line, facts
+from gaponet.experiments.result_files import write, write_report
 from gaponet.report.figures.style import figure
-from gaponet.report.whose import label
+from gaponet.report.provenance import describe_provenance
 
 
 def drawing():
@@ -90,8 +90,8 @@ def test_a_folder_without_results_and_a_result_without_its_figure_are_named(resu
 
 
 def test_a_command_does_not_tell_where_its_folders_lie():
-    assert command_line(["experiment", "unit", "/home/me/data", "out", "--seeds", "3"]) == (
-        "gaponet experiment unit data out --seeds 3"
+    assert command_line(["experiment", "compare", "/home/me/data", "out", "--seeds", "3"]) == (
+        "gaponet experiment compare data out --seeds 3"
     )
 
 
@@ -105,4 +105,4 @@ def test_facts_and_label_come_from_the_dataset(arm, tmp_path):
     assert found["budget"] == "1m"
     assert found["units"] == ["a"]
     assert set(found["versions"]) == {"gaponet", "mujoco", "numpy", "torch"}
-    assert label(data) == "VIRTUAL arm: these numbers say nothing about real hardware."
+    assert describe_provenance(data) == "VIRTUAL arm: these numbers say nothing about real hardware."

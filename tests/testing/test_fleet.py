@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gaponet.base.errors import UsageError
-from gaponet.experiments.played.goals import Planner
+from gaponet.experiments.virtual.goals import GoalPlanner
 from gaponet.robot.spec import load_robot
 from gaponet.testing.draw import MARK
 from gaponet.testing.fleet import FLEETS, draw, load_fleet, to_toml
@@ -74,14 +74,14 @@ def test_units_of_the_hard_fleet_differ_as_motors_and_friction_do():
 
 def test_a_raw_hand_of_the_firm_fleet_sags_about_2_cm_under_3_kg():
     robot = load_robot("h1_2")
-    fleet, planner = load_fleet("firm", robot), Planner(robot, 3.0, 0)
+    fleet, planner = load_fleet("firm", robot), GoalPlanner(robot, 3.0, 0)
     assert fleet.digest() == load_fleet("hard", robot).digest()
     plans = planner.plans(3)
     held = np.repeat([plan.ctrl[-1] for plan in plans], len(fleet.units), axis=0)
     units = [*fleet.units.values()] * len(plans)
     robots = VirtualRobot(robot.with_gain_scale(fleet.gain_scale), units, [(3.0, "both")] * len(units))
     robots.reset(held, list(range(len(units))))
-    sag = (planner.places(held) - planner.places(robots.true_qpos()))[..., 2]
+    sag = (planner.hand_positions(held) - planner.hand_positions(robots.true_qpos()))[..., 2]
     assert 0.015 < sag.mean() < 0.025
 
 

@@ -19,7 +19,6 @@ def bench(
     questions: tuple[str, ...] = (),
     method: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     networks: int = 0,
-    adversary: Literal["", "labels", "asked_labels", "late", "all_late", "joints"] = "",
     json: Json = False,
 ) -> None:
     """Compare methods on public recordings of real robots.
@@ -32,14 +31,11 @@ def bench(
         questions: Only these questions, such as "3 kg left out".
         method: A method of your own, FILE.py:FUNCTION; may be repeated.
         networks: Train networks too, for so many control steps each; 0 for none.
-        adversary: What is done to the recordings that are learned from: labels dealt out anew, or those of
-            the recordings asked (asked_labels); late, 40 ms of delay added to one in ten, or to all of them and to
-            those asked (all_late); joints in another order.
     """
     from gaponet.experiments.real.bench import Bench, load_method
     from gaponet.experiments.real.cards import data_folder, read_cards
-    from gaponet.experiments.real.page import COLUMNS, table, write_page
-    from gaponet.experiments.real.rivals import METHODS
+    from gaponet.experiments.real.methods import METHODS
+    from gaponet.experiments.real.page import result_table, write_page
 
     screen = Out(json)
     methods = METHODS | {name: (name, function) for name, function in map(load_method, method)}
@@ -47,10 +43,10 @@ def bench(
         from gaponet.experiments.real.networks import networks as trained
 
         methods |= trained(networks)
-    found = Bench(read_cards(), data_folder(data), out, methods, adversary, screen.say).run(sets, questions)
-    screen.table("Real robots, recordings that no method was fitted to", list(COLUMNS), table(found["rows"]))
-    for name, remarks in found["labels"].items():
+    result = Bench(read_cards(), data_folder(data), out, methods, screen.say).run(sets, questions)
+    screen.show("Real robots, recordings that no method was fitted to", result_table(result["rows"]))
+    for name, remarks in result["labels"].items():
         screen.say(f" of {name}: {'; '.join(remarks)}", "labels")
-    for path in write_page(found, out):
+    for path in write_page(result, out):
         screen.say(f"written: {path!s}")
-    screen.result(found)
+    screen.result(result)

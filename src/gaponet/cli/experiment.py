@@ -1,4 +1,4 @@
-"""gaponet experiment: one question each, from trainings to tables, figures and a report."""
+"""gaponet experiment: from trainings to tables, figures and a report."""
 
 from __future__ import annotations
 
@@ -13,18 +13,15 @@ import tyro
 from gaponet.base.errors import ModelError, UsageError
 from gaponet.base.progress import progress_bar, progress_bars
 from gaponet.cli.out import Out, writes
-from gaponet.experiments.compare import Compare, identified
-from gaponet.experiments.data import Data
-from gaponet.experiments.found import Question, answer, train_all
-from gaponet.experiments.options import Options
-from gaponet.experiments.played.delivery import Delivery
-from gaponet.experiments.played.paper import Paper
-from gaponet.experiments.played.session import Playing, Session, study_to_play
-from gaponet.experiments.played.tracking import Tracking
-from gaponet.experiments.pool import Cell
-from gaponet.experiments.study import Study, expected_s
-from gaponet.experiments.unit import Unit
+from gaponet.experiments.cells import Cell
+from gaponet.experiments.compare import Compare, with_identified
+from gaponet.experiments.outcomes import train_all
+from gaponet.experiments.study import Options, Study, expected_seconds
 from gaponet.experiments.variant import parse_variant
+from gaponet.experiments.virtual.delivery import Delivery
+from gaponet.experiments.virtual.paper import Paper
+from gaponet.experiments.virtual.session import Session, UnitExperiment
+from gaponet.experiments.virtual.tracking import Tracking
 from gaponet.nn.training.config import TrainConfig
 from gaponet.share.reading import open_dataset
 
@@ -34,104 +31,95 @@ if TYPE_CHECKING:
 
 FLAT = tyro.conf.arg(name="")
 Shared = Annotated[Options, FLAT]
-PLAYED = (Paper, Tracking, Delivery)
+EXPERIMENTS = (Compare, Paper, Tracking, Delivery)
 DEFAULTS = {Compare: Options(budget="10m", config=TrainConfig())}
 
 
-def _carry_out(question: Question, study: Study, json: bool) -> None:
-    """Say how long it will take, train, and show what came out."""
-    from gaponet.cli.show import show_result  # needs an extra, whose lack is told before anything is trained
+def _compare(experiment: Compare, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+    """Estimate the time, train, and show the result."""
+    from gaponet.cli.show import show_result  # needs an extra; without it nothing is trained
 
-    screen, cells = Out(json), question.cells(study)
+    study = Study.from_options(data, robot, out, options, holdout_units=experiment.holdout_units, one_rate=False)
+    if experiment.identify:
+        study = _identified(experiment, study)
+    screen, cells = Out(options.json), experiment.cells(study)
     with _trainings(cells, study, screen) as show:
-        result = answer(question, study, show)
+        result = experiment.run(study, show)
     show_result(result, study.out, screen)
     if failed := sum(not c.done for c in cells):
         raise ModelError(f"{failed} trainings failed; the tables are of the others. Run it again to retry")
 
 
-def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
-    todo = sum(not c.done for c in cells)
-    minutes = expected_s(cells, study) / 60
-    rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
-    screen.say(
-        f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
-        + (f"; the others take {rest}, {study.at_once} at a time" if todo else "")
-    )
-    return progress_bars("trainings", todo)
-
-
-def _ask(kind: type[Any], dataset: str, out: Path, question: Any, options: Options) -> None:
-    data, robot = open_dataset(dataset, options.robot)
-    if kind in PLAYED:
-        _play(question, data, robot, out, options)
-        return
-    study = Study.of(data, robot, out, options, question.holdout_units, one_rate=kind is not Compare)
-    if kind is Compare:
-        study = _prepared(question, study)
-    _carry_out(question, study, options.json)
-
-
-def _prepared(question: Compare, study: Study) -> Study:
-    """The study with what is asked to be identified first; models that cannot be are refused before that."""
-    if not question.identify:
-        return study
+def _identified(experiment: Compare, study: Study) -> Study:
+    """Check the models, then identify the simulator."""
     if study.robot.nominal is not None:
         raise UsageError(f"--identify: robot {study.robot.folder} is an identified one; all models start from it")
-    for word in question.models:
+    for word in experiment.models:
         parse_variant(word, study.config)
     with progress_bar("identifying") as update:
-        return identified(study, update)
+        return with_identified(study, update)
 
 
-def _play(question: Playing, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
-    """Train GAPONet and an MLP where no runs are given, play, and show what came out."""
+def _on_unit(experiment: UnitExperiment, data: Dataset, robot: RobotSpec, out: Path, options: Options) -> None:
+    """Train GAPONet and an MLP if no runs are given, run the experiment, and show the result."""
     from gaponet.cli.show import show_result
 
     data.require_robot(robot)
-    question.require(data)
-    screen, runs, part = Out(options.json), question.runs, data
+    experiment.require(data)
+    screen, runs = Out(options.json), experiment.runs
     study, cells = None, list[Cell]()
     if not runs:
-        study = study_to_play(question, data, robot, out, options)
-        cells = question.cells(study)
+        study = experiment.study(data, robot, out, options)
+        cells = experiment.cells(study)
         with _trainings(cells, study, screen) as show:
             failed = train_all(cells, study, show)
         if failed:
             raise UsageError(f"{failed[0]}; run it again to retry")
-        runs, part, out = question.played(cells), study.data, study.out
-    how = out, options.quick, study, tuple(cells)
-    session = Session.of(question, part, data, robot.nominal or robot, runs, *how)
+        runs = experiment.evaluated(cells)
+    session = Session.load(experiment, data, robot.nominal or robot, runs, study, tuple(cells))
     with progress_bar("playing") as update:
-        result = question.play(session, lambda what, share: update(share, 1.0, what))
+        result = experiment.run(session, lambda step, share: update(share, 1.0, step))
     show_result(result, out, screen)
 
 
+def _trainings(cells: list[Cell], study: Study, screen: Out) -> Any:
+    """Say how long the trainings will take, and open their progress bars."""
+    todo = sum(not c.done for c in cells)
+    minutes = expected_seconds(cells, study) / 60
+    rest = f"about {minutes:.0f} minutes" if minutes > 1.5 else "about a minute"
+    screen.say(
+        f"{len(cells)} trainings ({len({c.variant.name for c in cells})} settings), {len(cells) - todo} there already"
+        + (f"; the others take {rest}, {study.concurrency} at a time" if todo else "")
+    )
+    return progress_bars("trainings", todo)
+
+
 def _command(kind: type[Any]) -> Any:
-    """A question's command: its fields are options."""
+    """Return the command of an experiment: its fields are options."""
     usual = DEFAULTS.get(kind, Options())
 
-    def ask(dataset: Any, out: Any, question: Any, options: Any = usual) -> None:
+    def run(dataset: Any, out: Any, experiment: Any, options: Any = usual) -> None:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.default_int_handler)  # options are understood (__main__.py)
-        _ask(kind, dataset, out, question, options)
+        data, robot = open_dataset(dataset, options.robot)
+        (_compare if kind is Compare else _on_unit)(experiment, data, robot, out, options)
 
     place = tyro.conf.Positional[str]
-    ask.__annotations__ = {"dataset": place, "out": Path, "question": Annotated[kind, FLAT], "options": Shared}
-    trained_on = " that the models were trained on" if kind in PLAYED else ""
-    ask.__doc__ = "\n    ".join((
+    run.__annotations__ = {"dataset": place, "out": Path, "experiment": Annotated[kind, FLAT], "options": Shared}
+    trained_on = "" if kind is Compare else " that the models were trained on"
+    run.__doc__ = "\n    ".join((
         f"{inspect.getdoc(kind)}\n\nArgs:",
         f"dataset: Dataset folder{trained_on}, or the address (s3://, gs://) of one that was pushed.",
-        "out: Folder of the results; its report.html shows all experiments in it.", "question: What is asked.",
+        "out: Folder of the results; its report.html shows all experiments in it.", "experiment: Its options.",
         "options: Shared.",
     ))  # fmt: skip
-    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=writes("experiments")(ask))]
+    return Annotated[None, tyro.conf.subcommand(kind.__name__.lower(), constructor=writes("experiments")(run))]
 
 
 def experiment(action: None) -> None:
-    """Run a study: the paper's tables, comparisons, units left out."""
+    """Run an experiment: the paper's figures and tables, comparisons of models."""
 
 
-# Each is run while the command line is parsed; what is left to call is nothing.
-ACTION: Any = Union[tuple(_command(kind) for kind in (Compare, Unit, Data, *PLAYED))]  # noqa: UP007
+# Each is run while the command line is parsed; the function that remains to be called does nothing.
+ACTION: Any = Union[tuple(map(_command, EXPERIMENTS))]  # noqa: UP007
 experiment.__annotations__["action"] = Annotated[ACTION, tyro.conf.OmitSubcommandPrefixes, FLAT]

@@ -47,6 +47,8 @@ COMMANDS = {
 REMOVED = {
     "prune": "gaponet push --prune",
     "calibrate": "gaponet adapt",
+    "experiment unit": "gaponet experiment compare --holdout-units UNIT",
+    "experiment data": "gaponet experiment compare --models gaponet:train_share=0.25 gaponet:train_share=0.5 gaponet",
     **{f"bench {part}": f"python benchmarks/speed.py {part}" for part in ("sim", "train", "latency", "aligned")},
 }
 ABOUT = "Close the gap between simulated and real motors from joint logs."

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from gaponet.cli.out import Out
-from gaponet.experiments.page import write
 from gaponet.experiments.result import Result
+from gaponet.experiments.result_files import write
 
 
 def show_result(result: Result, out: Path, screen: Out) -> None:

@@ -1,1 +1,1 @@
-"""Questions: each trains or plays, and becomes tables, figures and sentences in one folder."""
+"""Experiments: trainings and measurements that become tables, figures and sentences in one folder."""

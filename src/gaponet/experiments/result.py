@@ -1,4 +1,4 @@
-"""What a question found: tables, figures and sentences, and what it takes to repeat it."""
+"""The result of an experiment: tables, figures, sentences, and the facts that are needed to repeat it."""
 
 from __future__ import annotations
 
@@ -22,24 +22,27 @@ VERSIONS = ("gaponet", "mujoco", "numpy", "torch")
 
 @dataclass(frozen=True)
 class Result:
-    """Everything that one experiment found."""
+    """The result of one experiment.
+
+    Attributes:
+        name: Stem of the names of its files.
+        virtual: Provenance of the recordings, a sentence (report.provenance).
+        facts: What is needed to repeat the experiment (`facts`).
+        figures: Figures by name.
+        sentences: Conclusions, made from the numbers.
+    """
 
     name: str
-    """Stem of the names of its files."""
     title: str
     virtual: str
-    """Whose numbers these are, as a sentence (label())."""
     facts: Mapping[str, Any]
-    """Facts that a reader needs to repeat it (facts())."""
     tables: tuple[ResultTable, ...] = ()
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    """Figures by name."""
     sentences: tuple[str, ...] = ()
-    """What the numbers say, made from them."""
 
 
 def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str, Any]:
-    """What it takes to repeat an experiment: command, date, versions, data, seeds, and what else is to be said."""
+    """Return what is needed to repeat an experiment: command, date, versions, data, seeds, and `more`."""
     entries = dataset.entries
     seeds = list(seeds)
     return {
@@ -55,16 +58,16 @@ def facts(dataset: Dataset, seeds: Iterable[int] = (), **more: Any) -> dict[str,
 
 
 def command_line(words: list[str]) -> str:
-    """The command as typed, files and folders by their last name: where they lay is nobody's business."""
+    """Return the command with the last names of its files and folders, so that no private path is published."""
     return shlex.join(["gaponet", *(Path(w).name if "/" in w else w for w in words)])
 
 
-def fact_rows(found: Mapping[str, Any]) -> list[list[str]]:
-    """Facts as two columns of text."""
+def fact_rows(facts: Mapping[str, Any]) -> list[list[str]]:
+    """Return facts as two columns of text."""
 
     def words(value: Any) -> str:
         if isinstance(value, Mapping):
             return ", ".join(f"{k} {v}" for k, v in value.items())
         return ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
 
-    return [[key.replace("_", " "), words(value)] for key, value in found.items()]
+    return [[key.replace("_", " "), words(value)] for key, value in facts.items()]

@@ -1,61 +1,78 @@
-"""A study: what all of its cells share, and how long they will take."""
+"""The data, settings and options that all trainings of an experiment share. Docstrings of options are help texts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence as ListOf
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from gaponet.base.errors import UsageError
 from gaponet.base.executor import LOCAL, MAX_WORKERS, Pool
 from gaponet.data.store import Dataset
-from gaponet.experiments.kept import read_kept
-from gaponet.experiments.options import (
-    BUDGET,
-    QUICK_BUDGET,
-    QUICK_PPO,
-    QUICK_SEEDS,
-    QUICK_SENSORS,
-    QUICK_WARM_START,
-    SEEDS,
-    TRAINING,
-    Options,
-)
-from gaponet.experiments.pool import RESULT, Cell, plan
-from gaponet.experiments.rehearsal import rehearsal, take
+from gaponet.experiments.cells import RESULT_FILE, Cell, plan_cells, read_record
 from gaponet.experiments.variant import Variant, parse_variant
 from gaponet.nn.training.budget import Budget
-from gaponet.nn.training.config import TrainConfig
+from gaponet.nn.training.config import PretrainingConfig, TrainConfig
 from gaponet.report.methods import IDENTIFIED
-from gaponet.report.whose import who
+from gaponet.report.provenance import robot_label
 from gaponet.robot.spec import RobotSpec
 
-# s on one core, virtual H1-2: whatever the budget, and per control step.
-FIXED_S, STEP_S = 50.0, 6e-4
-REHEARSAL = 0.25  # of FIXED_S, on a slice
+# Small rounds, fitted until the labels are fitted (progress.jsonl: label_rmse). With 200 gradient steps a product
+# network has the advantage.
+TRAINING = TrainConfig(warm_start=PretrainingConfig(rounds=2, num_envs=128, steps=300, gradient_steps=800))
+DEFAULT_MODELS = ("gaponet", "shared_mlp", "mlp:mlp_match=on")
+DEFAULT_BUDGET, DEFAULT_SEEDS = "76800", 3  # control steps of two rounds
+# Measured on one core with the virtual H1-2: s per training whatever its budget, and s per control step.
+SECONDS_PER_TRAINING, SECONDS_PER_STEP = 50.0, 6e-4
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of all experiments that train."""
+
+    seeds: int = DEFAULT_SEEDS
+    """Number of seeds, counted from --seed."""
+    budget: str = DEFAULT_BUDGET
+    """Length of each training: time such as 90s or 10m, or control steps."""
+    workers: int = 0
+    """Trainings at a time, each on --threads (here 1 by default) threads; 0 for as many as there are cores."""
+    executor: str = LOCAL
+    """Where they run: local, ray or ray:ADDRESS (docs/scale.md)."""
+    robot: str | None = None
+    """Robot name or folder, if not the one that the dataset keeps; all models correct it."""
+    json: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Print one JSON object on stdout."""
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")] = TRAINING
+    """Settings of all models; rows of a table change one of them."""
 
 
 @dataclass(frozen=True)
 class Study:
-    """What all cells of an experiment share."""
+    """What the cells of an experiment share.
+
+    Attributes:
+        robot: The simulator that models correct.
+        out: Folder of the results.
+        budget: Control steps or time of each training, as gaponet.nn.training.budget reads it.
+        seeds: Number of seeds, counted from config.seed.
+        workers: Trainings at a time; 0 for as many as there are cores.
+        executor: Where they run (gaponet.base.executor).
+        identified: The identified robot, for words with identified+ in front and as a baseline.
+    """
 
     data: Dataset
     robot: RobotSpec
-    """The simulator corrected."""
     out: Path
     config: TrainConfig = TRAINING
-    budget: str = BUDGET
-    seeds: int = SEEDS
-    """How many seeds, counted from config.seed."""
+    budget: str = DEFAULT_BUDGET
+    seeds: int = DEFAULT_SEEDS
     holdout_units: tuple[str, ...] = ()
     workers: int = 0
-    """Trainings at once; 0 for as many as there are cores."""
     executor: str = LOCAL
-    """Where they run (gaponet.base.executor)."""
-    rehearsal: bool = False
-    """Whether its numbers mean nothing."""
     identified: RobotSpec | None = None
-    """What was identified from robot, for words with identified+ in front and as a baseline."""
 
     def __post_init__(self) -> None:
         if self.seeds < 1 or self.workers < 0:
@@ -63,49 +80,42 @@ class Study:
         self.data.require_robot(self.robot)
 
     @classmethod
-    def of(
-        cls, data: Dataset, robot: RobotSpec, out: Path, options: Options, holdout_units: tuple[str, ...] = (),
-        one_rate: bool = True,
+    def from_options(
+        cls, data: Dataset, robot: RobotSpec, out: Path, options: Options, *,
+        holdout_units: tuple[str, ...] = (), one_rate: bool = True,
     ) -> Study:  # fmt: skip
-        """The study that the options ask for.
+        """Return the study that the options describe.
 
-        With one_rate at the slowest rate where the dataset holds several and none was asked for, so that rates are
-        compared where they are meant to be. A rehearsal is on a slice of the dataset, in OUT/rehearsal; of the units
-        held out it knows those that are in the slice.
+        With one_rate, a dataset of several control rates is used at its slowest one unless the options name rates.
+        Rates are then compared in those comparisons alone that are about rates.
         """
-        config, quick, rates = options.config, options.quick, rates_of(data)
+        config, rates = options.config, control_rates(data)
         if one_rate and len(rates) > 1 and not config.rates:
             config = replace(config, rates=rates[:1])
-        if quick:
-            out = out / "rehearsal"
-            model = replace(config.model, sensor_hidden=QUICK_SENSORS)
-            config = replace(config, model=model, warm_start=QUICK_WARM_START, ppo=QUICK_PPO)
-            data = take(data, robot, rehearsal(data), out / "slice")
-            kept = {e.meta.unit_id for e in data.entries}
-            holdout_units = tuple(u for u in holdout_units if u in kept and len(kept) > 1)
-        return cls(
-            data, robot, out, config, options.budget or (QUICK_BUDGET if quick else BUDGET),
-            options.seeds if options.seeds is not None else QUICK_SEEDS if quick else SEEDS,
-            holdout_units, options.workers, options.executor, quick,
-        )  # fmt: skip
+        return cls(data, robot, out, config, options.budget, options.seeds, holdout_units, options.workers,
+                   options.executor)  # fmt: skip
 
     @property
-    def who(self) -> str:
-        """ "VIRTUAL h1_2" where any of it was not recorded on hardware."""
-        return who(self.data.entries) + (", REHEARSAL" if self.rehearsal else "")
+    def label(self) -> str:
+        """The robot's name; "VIRTUAL h1_2" where any recording is virtual."""
+        return robot_label(self.data.entries)
 
     @property
     def threads(self) -> int:
-        """The numbers of one training."""
+        """Threads of one training."""
         return self.config.threads or 1
 
     @property
-    def at_once(self) -> int:
-        """Trainings, as far as is known before a cluster is asked."""
+    def concurrency(self) -> int:
+        """Trainings at a time; a guess for a cluster, whose size is not known yet."""
         return self.workers or (Pool.cores(self.threads) if self.executor == LOCAL else MAX_WORKERS)
 
     def variant(self, word: str) -> Variant:
-        """A model as written, on this configuration."""
+        """Parse a model's word with this study's settings as defaults.
+
+        Raises:
+            UsageError: No such model or setting; or identified+ without an identified robot.
+        """
         if word.startswith(IDENTIFIED) and self.identified is None:
             raise UsageError(
                 f"--models {word}: add --identify to gaponet experiment compare, or give an identified robot with "
@@ -113,36 +123,36 @@ class Study:
             )
         return parse_variant(word, self.config)
 
-    def cells(self, words: ListOf[str], seeds: int | None = None, into: str = "") -> list[Cell]:
-        """Every word with every seed, in OUT/cells, or in OUT/into/cells."""
-        numbers = range(self.config.seed, self.config.seed + (seeds or self.seeds))
+    def cells(self, words: ListOf[str]) -> list[Cell]:
+        """Return a cell for every model word and seed, in OUT/cells."""
+        numbers = range(self.config.seed, self.config.seed + self.seeds)
         variants = [self.variant(w) for w in words]
-        return plan(
-            self.data, variants, numbers, self._simulator, self.out / into, self.budget, self.holdout_units,
-            self.threads,
+        return plan_cells(
+            self.data, variants, numbers, robots=self._simulator, out=self.out, budget=self.budget,
+            holdout_units=self.holdout_units, threads=self.threads,
         )  # fmt: skip
 
     def _simulator(self, variant: Variant) -> RobotSpec:
         return self.identified if variant.identified and self.identified is not None else self.robot
 
 
-def rates_of(data: Dataset) -> tuple[float, ...]:
-    """Control rates of the recordings, Hz."""
+def control_rates(data: Dataset) -> tuple[float, ...]:
+    """Control rates of the recordings in ascending order, Hz."""
     return tuple(sorted({float(round(1 / e.dt)) for e in data.entries}))
 
 
-def expected_s(cells: ListOf[Cell], study: Study) -> float:
-    """Wall time of what is not there yet, s: from cells of this experiment that are done, else from the H1-2's."""
+def expected_seconds(cells: ListOf[Cell], study: Study) -> float:
+    """Estimate the wall time of the unfinished cells, s, from the finished ones or from the virtual H1-2."""
     done = [c for c in cells if c.done]
-    taken = [read_kept(c.folder / RESULT)["seconds"] for c in done]
-    factor = sum(taken) / sum(_cost(c) for c in done) if done else REHEARSAL if study.rehearsal else 1.0
+    seconds = sum(read_record(c.folder / RESULT_FILE)["seconds"] for c in done)
+    factor = seconds / sum(_cost(c) for c in done) if done else 1.0
     todo = [_cost(c) * factor for c in cells if not c.done]
-    return max(sum(todo) / study.at_once, max(todo, default=0.0))
+    return max(sum(todo) / study.concurrency, max(todo, default=0.0))
 
 
 def _cost(cell: Cell) -> float:
-    """s on one core, roughly."""
+    """Rough processor time of a cell, s."""
     budget = Budget.parse(cell.budget)
     if budget.seconds is not None:
-        return FIXED_S + budget.seconds
-    return FIXED_S + STEP_S * (budget.steps or 0)
+        return SECONDS_PER_TRAINING + budget.seconds
+    return SECONDS_PER_TRAINING + SECONDS_PER_STEP * (budget.steps or 0)

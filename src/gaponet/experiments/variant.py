@@ -16,19 +16,22 @@ from gaponet.nn.training.config import TrainConfig
 from gaponet.report.methods import IDENTIFIED
 
 KINDS: tuple[str, ...] = get_args(get_type_hints(ModelConfig)["kind"])
-OURS = ("kind", "model", "seed", "threads")  # said by the word itself, or by the comparison
+RESERVED = ("kind", "model", "seed", "threads")  # set by the word itself or by the comparison
 SWITCH = {"on": True, "true": True, "yes": True, "off": False, "false": False, "no": False}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One method of a comparison."""
+    """One method of a comparison.
+
+    Attributes:
+        name: The word as the user wrote it.
+        identified: True if it corrects the identified simulator.
+    """
 
     name: str
-    """The word as the user wrote it."""
     config: TrainConfig
     identified: bool = False
-    """Whether it corrects the identified simulator instead of the one given."""
 
     @property
     def kind(self) -> str:
@@ -42,10 +45,10 @@ class Variant:
 
 
 def parse_variant(text: str, base: TrainConfig) -> Variant:
-    """Read one word; what it does not say is as in base.
+    """Parse one word; settings that it does not name come from base.
 
     Raises:
-        UsageError: No such kind or field, or a value of another type; names those there are.
+        UsageError: No such kind or field, or a value of another type; the message names the existing ones.
     """
     kind, *settings = text.removeprefix(IDENTIFIED).split(":")
     if kind not in KINDS:
@@ -75,12 +78,12 @@ def _set(config: TrainConfig, setting: str, text: str) -> TrainConfig:
 
 
 def _places(config: TrainConfig) -> Iterator[tuple[str, tuple[str, str]]]:
-    """(as written, (part of the config or "", field)) of everything that may be set."""
+    """Yield (name as written, (part of the config or "", field)) of every setting."""
     for field in fields(config.model):
-        if field.name not in OURS:
+        if field.name not in RESERVED:
             yield field.name, ("model", field.name)
     for field in fields(config):
-        if field.name in OURS:
+        if field.name in RESERVED:
             continue
         value = getattr(config, field.name)
         if is_dataclass(value):

@@ -1,16 +1,17 @@
-"""One name and one colour per method, in every figure, table and scene.
+"""One title and one colour per method, in every figure, table and scene.
 
-A method is a key of METHODS, or a word of study.variant: [identified+]KIND[:FIELD=VALUE]…
+A method is a key of METHODS, or a word of experiments/variant.py: [identified+]KIND[:FIELD=VALUE]…
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gaponet.robot.spec import RobotSpec
 
-METHODS = {  # name, colour
+METHODS = {  # title, colour
     "target": ("target", "#00838f"),
     "command": ("command", "#00838f"),
     "recorded": ("recorded", "#111111"),
@@ -39,19 +40,44 @@ METHODS = {  # name, colour
     "feedforward": ("nominal model's feed-forward alone", "#c9b28f"),
     "identified feedforward": ("identified model's feed-forward alone", "#2a9d6f"),
 }
-SAID = {"mlp_match=on": "as many weights", "payload_input=off": "mass not told"}
+CHANGE_TITLES = {"mlp_match=on": "as many weights", "payload_input=off": "payload unobserved"}
 IDENTIFIED = "identified+"  # in front of the kind of a model that corrects an identified simulator
+OTHER_COLOUR = "#777777"
 
 
 def method(kind: str, simulator: RobotSpec) -> str:
-    """The method that a model of this kind is: identified+KIND where it corrects an identified simulator."""
+    """Return the method of a model: its kind, with identified+ in front where it corrects an identified simulator."""
     return (IDENTIFIED if simulator.nominal is not None else "") + kind
 
 
 def title(method: str) -> str:
-    """The method's name for people: identification + MLP, as many weights (history 8)."""
+    """Return the method's name for people: identification + MLP, as many weights (history 8)."""
     kind, *changes = method.removeprefix(IDENTIFIED).split(":")
     start = f"{METHODS['identified'][0]} + " if method.startswith(IDENTIFIED) else ""
-    name = ", ".join([start + METHODS.get(kind, (kind,))[0], *(SAID[c] for c in changes if c in SAID)])
-    others = ", ".join(c.replace("=", " ") for c in changes if c not in SAID)
+    titled = [CHANGE_TITLES[c] for c in changes if c in CHANGE_TITLES]
+    name = ", ".join([start + METHODS.get(kind, (kind,))[0], *titled])
+    others = ", ".join(c.replace("=", " ") for c in changes if c not in CHANGE_TITLES)
     return f"{name} ({others})" if others else name
+
+
+def colour(method: str) -> str:
+    """Return the colour of the method's kind, #rrggbb, darker where it corrects an identified simulator."""
+    base = METHODS.get(method.removeprefix(IDENTIFIED).split(":")[0], ("", OTHER_COLOUR))[1]
+    return shade(base, -0.4) if method.startswith(IDENTIFIED) else base
+
+
+def palette(methods: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each method; several models of one kind get shades of its colour."""
+    colours: dict[str, str] = {}
+    for method in methods:
+        base = colour(method)
+        before = sum(colour(other) == base for other in colours)
+        colours[method] = shade(base, 1 - 0.62**before)
+    return colours
+
+
+def shade(base: str, share: float) -> str:
+    """Return a colour, #rrggbb, mixed with white by a share, or with black where the share is negative."""
+    end = 255 if share > 0 else 0
+    parts = (int(base[i : i + 2], 16) for i in (1, 3, 5))
+    return "#" + "".join(f"{round(p + (end - p) * abs(share)):02x}" for p in parts)

@@ -9,13 +9,12 @@ from logs import arm_sequence, late, wave
 
 from gaponet.base.errors import UsageError
 from gaponet.data.store import Dataset
-from gaponet.experiments.real import networks as brief
-from gaponet.experiments.real.adversaries import ADVERSARIES
+from gaponet.experiments.real import networks as module
 from gaponet.experiments.real.bench import Bench, load_method
 from gaponet.experiments.real.cards import CARDS, ROBOTS, read_cards
-from gaponet.experiments.real.page import by_joint
-from gaponet.experiments.real.questions import floor, questions
-from gaponet.experiments.real.rivals import LEFT_OUT, METHODS
+from gaponet.experiments.real.methods import LEFT_OUT, METHODS
+from gaponet.experiments.real.page import joint_tables
+from gaponet.experiments.real.questions import questions, repeatability
 from gaponet.robot.folder import save_robot
 from gaponet.robot.spec import load_robot, packaged_robots
 
@@ -57,46 +56,28 @@ def test_a_unit_left_out_is_learned_from_by_adaptation_alone_and_never_asked_wha
 
 def test_repetitions_are_no_motions_set_the_floor_and_are_measured_once(arm, played, tmp_path):
     (question,) = questions("new motions", played, arm, None)
-    assert floor(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
+    assert repeatability(question) == pytest.approx(0.002 * 4 / 3, rel=1e-3)  # 1, 1 and 2 steps of 2 mrad
     methods = {k: METHODS[k] for k in ("nominal", "delay_offset")}
     card = next(c for c in read_cards().set if c.name == "so101")
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=lambda text: None)
-    told = [row.as_dict() for row in bench.ask(card, "new motions", [question])]
+    told = [row.as_dict() for row in bench.evaluate(card, "new motions", [question])]
     assert [(r["motions"], r["recordings"]) for r in told] == [(1, 6), (1, 6)]
     assert told[0]["standard_error"] is None
     assert told[1]["of_nominal"] < 1.0
     stopped = Bench(
         read_cards(), tmp_path, tmp_path / "work", dict.fromkeys(methods, ("", None)), say=lambda text: None
     )
-    assert [row.as_dict()["mrad"] for row in stopped.ask(card, "new motions", [question])] == [r["mrad"] for r in told]
-
-
-def test_adversaries_change_what_is_learned_from_and_say_what_is_asked(arm, played):
-    (question,) = questions("new motions", played, arm, None)
-    changed = {name: change(question) for name, change in ADVERSARIES.items()}
-    mixed = changed["labels"]
-    assert sorted(s.meta.unit_id for s in mixed.known) == sorted(s.meta.unit_id for s in question.known)
-    assert [s.meta.unit_id for s in mixed.known] != [s.meta.unit_id for s in question.known]
-    was, later = question.test[0], changed["all_late"].test[0]
-    rows = len(was) - len(later)
-    assert rows * was.dt == pytest.approx(0.04)
-    assert (later.ctrl == was.ctrl[rows:]).all()
-    assert (later.qpos == was.qpos[:-rows]).all()
-    assert sum(len(s) < len(was) for s in changed["late"].known) == -(-len(question.known) // 10)
-    assert (changed["joints"].train[0].qpos == question.train[0].qpos[:, ::-1]).all()
-    asked = changed["asked_labels"]
-    assert asked.train is question.train
-    assert [s.meta.payload_mass for s in asked.test] != [s.meta.payload_mass for s in question.test]
-    assert sorted(s.meta.payload_mass for s in asked.test) == sorted(s.meta.payload_mass for s in question.test)
-    assert all(q.test is question.test for name, q in changed.items() if name not in ("all_late", "asked_labels"))
+    assert [row.as_dict()["mrad"] for row in stopped.evaluate(card, "new motions", [question])] == [
+        r["mrad"] for r in told
+    ]
 
 
 def test_networks_are_trained_once_and_left_out_where_they_add_nothing_to_an_identified_robot(
     arm, played, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(brief, "BRIEF", replace(brief.BRIEF, num_envs=12, gradient_steps=0, sensor_states=16))
+    monkeypatch.setattr(module, "ONE_ROUND", replace(module.ONE_ROUND, num_envs=12, gradient_steps=0, sensor_states=16))
     (question,) = questions("new motions", played, arm, None)
-    methods = {title: method for title, method in brief.networks(240).values() if "MLP" not in title}
+    methods = {title: method for title, method in module.networks(240).values() if "MLP" not in title}
     with pytest.raises(UsageError, match="networks need a folder"):
         methods["GAPONet"](question)
     question = replace(question, work=tmp_path)
@@ -143,9 +124,9 @@ def test_a_method_that_fails_loses_its_own_row_and_joints_that_were_recorded_alo
     said, methods = [], {"nominal": METHODS["nominal"], "mine": ("mine", lambda question: 1 / 0)}
     bench = Bench(read_cards(), tmp_path, tmp_path / "work", methods, say=said.append)
     card = next(c for c in read_cards().set if c.name == "so101")
-    (row,) = (row.as_dict() for row in bench.ask(card, question.name, [question]))
+    (row,) = (row.as_dict() for row in bench.evaluate(card, question.name, [question]))
     assert any("mine: ZeroDivisionError" in text for text in said)
     ((mrad, count),) = row["by_joint_mrad"][arm.operated[0]].values()
     assert (mrad, count) == (pytest.approx(row["mrad"]), 12)
-    told = by_joint([row])
-    assert told[-1] == f"| 0.5 kg left out | {arm.operated[0]} | 0.5 | 12 | {mrad:.1f} |"
+    (table,) = joint_tables([row])
+    assert table.markdown().splitlines()[2] == f"| 0.5 kg left out | {arm.operated[0]} | 0.5 | 12 | {mrad:.1f} |"

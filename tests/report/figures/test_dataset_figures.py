@@ -11,7 +11,7 @@ from gaponet.report.evaluate import evenly
 from gaponet.report.figures import dataset_figures as draw
 from gaponet.report.figures.draw_dataset import PICTURES, draw_all, liveliest, swing
 from gaponet.report.figures.style import save
-from gaponet.report.whose import who
+from gaponet.report.provenance import robot_label
 from gaponet.sim.model import model_hash
 
 
@@ -84,10 +84,10 @@ def test_virtual_stands_in_the_title(dataset, arm):
     real = dataset.entries
     virtual = Dataset.create(dataset.path.parent / "virtual", arm)
     virtual.append(recordings(arm, 1, rows=20)[0])
-    assert who(real) == "arm"
-    assert who(virtual.entries) == "VIRTUAL arm"
-    assert who([*real, *virtual.entries]) == "partly VIRTUAL arm"
-    fig = draw.composition(virtual.entries, f"{who(virtual.entries)}: 1 h")
+    assert robot_label(real) == "arm"
+    assert robot_label(virtual.entries) == "VIRTUAL arm"
+    assert robot_label([*real, *virtual.entries]) == "partly VIRTUAL arm"
+    fig = draw.composition(virtual.entries, f"{robot_label(virtual.entries)}: 1 h")
     assert fig.legends[0].get_title().get_text().startswith("VIRTUAL arm")
 
 

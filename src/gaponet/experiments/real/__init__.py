@@ -1,1 +1,1 @@
-"""Real logs that are public: labels that they lack, splits that are frozen, and one table over all of them."""
+"""Benchmark on public recordings of real robots: data cards, fixed splits, and one table over all of them."""

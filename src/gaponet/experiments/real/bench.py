@@ -1,4 +1,4 @@
-"""One table over every public recording that is present: what each method leaves, beside the robot's own spread."""
+"""The benchmark's run: every method on every question of every public data set that is present."""
 
 from __future__ import annotations
 
@@ -17,23 +17,29 @@ import numpy as np
 from gaponet import plugins
 from gaponet.base.errors import GAPONetError, UsageError
 from gaponet.base.files import json_compatible, write_text
-from gaponet.experiments.real.adversaries import ADVERSARIES, Adversary
 from gaponet.experiments.real.cards import Card, Cards, prepare
-from gaponet.experiments.real.questions import Question, floor, questions, recorded
-from gaponet.experiments.real.rivals import Method, identified
+from gaponet.experiments.real.methods import Method, identified
+from gaponet.experiments.real.questions import Question, questions, recorded_joints, repeatability
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.metrics import standard_error
 
-Said = Callable[[str], None]
+Change = Callable[[Question], Question]
+Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Row:
-    """What a method leaves of a question: mean |error| of each independent motion, (motions,) rad.
+    """Errors of one method on one question.
 
-    `nominal` is the same of the nominal simulator, in the same order; `seconds` is what fitting and asking took;
-    `notes` are the answers' own; `by_joint` says of joints that were recorded one at a time what is left with each
-    payload, mrad, the mean over motions, and of how many recordings.
+    Attributes:
+        error: Mean |error| of each independent motion, (motions,) rad.
+        nominal: The same of the nominal simulator, in the same order.
+        floor: Mean difference between repetitions, rad; NaN if unknown.
+        splits: Hashes of the recordings, one per fold.
+        seconds: Time of fitting and evaluation.
+        notes: Notes of the method, one per fold.
+        by_joint: Joint → payload, kg → (mean error over motions, mrad; number of recordings), of data sets in which
+            joints were recorded one at a time.
     """
 
     set: str
@@ -49,7 +55,7 @@ class Row:
     by_joint: dict[str, dict[str, tuple[float, int]]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: mrad, with the standard error over motions, of differences paired."""
+        """Return the row for JSON: mrad, standard errors over motions, of differences paired."""
         less = 1e3 * (self.nominal - self.error)
         return json_compatible({
             "set": self.set, "question": self.question, "method": self.method, "mrad": 1e3 * self.error.mean(),
@@ -60,159 +66,189 @@ class Row:
         })  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Evaluated:
+    """Evaluation of a method on one fold: mean |error| of each test recording, rad; s; a note."""
+
+    errors: list[float]
+    seconds: float
+    note: str
+
+
 @dataclass
 class Bench:
-    """One measuring: what is done once lies below `work` and is not done again.
+    """A run of the benchmark. Datasets, trainings and evaluations below `work` are reused.
 
     Attributes:
-        cards: What there may be; folders that are not there are left out.
+        cards: Data cards; data sets that are not present are left out.
         data: Folder of the public recordings.
-        work: Folder for datasets, trainings and answers.
+        work: Folder for datasets, trainings and evaluations.
         methods: Name → title and method.
-        adversary: Name of what was done to the recordings, or "".
-        say: Told what was done.
+        say: Called with a line about each step.
+        adversary: Name of the change to the recordings, or "".
+        change: Change of each question, as benchmarks/real_adversaries.py makes it.
     """
 
     cards: Cards
     data: Path
     work: Path
     methods: dict[str, tuple[str, Method]]
+    say: Say = print
     adversary: str = ""
-    say: Said = print
+    change: Change = lambda question: question
 
-    def run(self, only: tuple[str, ...] = (), asked: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Import, split, fit and measure some sets, by default all, of which some questions are asked, by default all.
+    def run(self, sets: tuple[str, ...] = (), names: tuple[str, ...] = ()) -> dict[str, Any]:
+        """Import, split, fit and measure.
+
+        Args:
+            sets: Data sets; default all.
+            names: Questions; default all.
 
         Returns:
-            rows (Row.as_dict), cards, labels (set → sentences), left_out (folder → why), seconds (set →).
+            rows (Row.as_dict), cards, labels (set → sentences), left_out (folder → reason), adversary, seconds (set →).
+
+        Raises:
+            UsageError: No such data set or question.
         """
-        unknown = set(only) - {c.name for c in self.cards.set}
+        unknown = set(sets) - {c.name for c in self.cards.set}
         if unknown:
             raise UsageError(f"no set '{min(unknown)}'; there are {', '.join(c.name for c in self.cards.set)}")
-        here = [c for c in self.cards.set if self._is_there(c) and (not only or c.name in only)]
-        every = {q for c in here for q in c.questions}
-        if set(asked) - every:
-            raise UsageError(f"no question '{min(set(asked) - every)}'; there are {', '.join(sorted(every))}")
+        present = [c for c in self.cards.set if self._is_present(c) and (not sets or c.name in sets)]
+        every = {q for c in present for q in c.questions}
+        if set(names) - every:
+            raise UsageError(f"no question '{min(set(names) - every)}'; there are {', '.join(sorted(every))}")
         left_out = {f.folder: f.why for f in self.cards.left_out if (self.data / f.folder).exists()}
-        left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_there(c)}
+        left_out |= {c.folder: "not there" for c in self.cards.set if not self._is_present(c)}
         rows: list[Row] = []
         labels: dict[str, list[str]] = {}
         seconds: dict[str, float] = {}
-        for card in here:
-            began = time.monotonic()
+        for card in present:
+            start = time.monotonic()
             try:
-                dataset, robot, told = prepare(card, self.data, self.work)
+                dataset, robot, estimated = prepare(card, self.data, self.work)
             except GAPONetError as error:
                 self.say(f"{card.name}: {error}")
                 left_out[card.folder] = str(error)
                 continue
-            seconds[card.name] = time.monotonic() - began
+            seconds[card.name] = time.monotonic() - start
             self.say(
                 f"{card.name}: {len(dataset)} recordings, {dataset.hours() * 60:.1f} min, from file to dataset in "
                 f"{seconds[card.name]:.0f} s"
             )
-            if told:
-                labels[card.name] = told.remarks
-            for name in (q for q in card.questions if not asked or q in asked):
-                rows += self.ask(card, name, list(questions(name, dataset, robot, self.before(card))))
+            if estimated:
+                labels[card.name] = estimated.remarks
+            for name in (q for q in card.questions if not names or q in names):
+                rows += self.evaluate(card, name, list(questions(name, dataset, robot, self._elsewhere(card))))
             seconds[card.name] += sum(r.seconds for r in rows if r.set == card.name)
-        return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in here}, "labels": labels,
+        return {"rows": [r.as_dict() for r in rows], "cards": {c.name: c.title for c in present}, "labels": labels,
                 "left_out": left_out, "adversary": self.adversary,
                 "seconds": {k: round(v) for k, v in seconds.items()}}  # fmt: skip
 
-    def _is_there(self, card: Card) -> bool:
-        return (self.data / card.folder).exists()
-
-    def before(self, card: Card) -> Callable[[], RobotSpec] | None:
-        """What makes the robot as it was identified on the data set that a card names; None where that is not there."""
-        other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_there(c)), None)
-        return functools.partial(self._elsewhere, other.name) if other else None
-
-    @functools.cache  # noqa: B019
-    def _elsewhere(self, name: str) -> RobotSpec:
-        card = next(c for c in self.cards.set if c.name == name)
-        dataset, robot, _ = prepare(card, self.data, self.work)
-        first = next(questions(card.questions[0], dataset, robot, None))
-        return identified(self._at_work(card, first, "")).robot
-
-    __hash__ = object.__hash__
-
-    def _at_work(self, card: Card, question: Question, adversary: str) -> Question:
-        """The question with a folder of its own, so that what was identified or trained for it is not again."""
-        name = "-".join(filter(None, (card.name, question.split, adversary)))
-        return replace(question, work=self.work / "made" / name)
-
-    def ask(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
-        """Every method on every fold; those that have nothing to go on are left out."""
+    def evaluate(self, card: Card, name: str, folds: list[Question]) -> list[Row]:
+        """Evaluate every method on every fold of a question; methods without the data that they need are left out."""
         rows: list[Row] = []
-        noise = float(np.mean([f for q in folds if (f := floor(q)) == f] or [np.nan]))
-        splits = tuple(q.split for q in folds)
-        change: Adversary = ADVERSARIES.get(self.adversary, lambda q: q)
-        pairs = [(q, change(q)) for q in folds]  # where what is learned from stays, so does what was learned
-        folds = [self._at_work(card, new, self.adversary * (new.train is not q.train)) for q, new in pairs]
-        for method, (title, answer) in self.methods.items():
-            if _nothing_to_go_on(method, folds):
+        floors = [f for q in folds if (f := repeatability(q)) == f]
+        floor = float(np.mean(floors or [np.nan]))
+        splits = tuple(q.split_hash for q in folds)
+        changed = [(q, self.change(q)) for q in folds]
+        # Where the change keeps the training recordings, fits without the change are reused.
+        folds = [self._with_folder(card, new, self.adversary * (new.train is not old.train)) for old, new in changed]
+        for method, (title, fit) in self.methods.items():
+            if _lacks_data(method, folds):
                 continue
-            found: list[tuple[list[float], float, str]] = []
             try:
-                for q in folds:
-                    found.append(self._once(card, q, method, answer))
-            except Exception as error:  # a method may be anybody's: it loses its own row and no other
+                evaluated = [self._evaluate_fold(card, q, method, fit) for q in folds]
+            except Exception as error:  # anybody's method: it loses its own row and no other
                 kind = "" if isinstance(error, GAPONetError) else f"{type(error).__name__}: "
                 self.say(f"{card.name}, {name}, {title}: {kind}{error}")
                 continue
-            by_motion: dict[str, list[float]] = {}
-            cells: dict[tuple[str, str], dict[str, list[float]]] = {}
-            for q, (errors, _, _) in zip(folds, found, strict=True):
-                for s, motion, e in zip(q.test, q.motion, errors, strict=True):
-                    by_motion.setdefault(motion, []).append(e)
-                    if len(columns := recorded(s, q.robot)) == 1 < len(q.robot.operated):
-                        cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
-                        cells.setdefault(cell, {}).setdefault(motion, []).append(1e3 * e)
-            left = np.array([np.mean(v) for v in by_motion.values()])
-            first = rows[0].error if rows else left
-            count, took = sum(len(errors) for errors, _, _ in found), sum(s for _, s, _ in found)
-            notes = tuple(note for _, _, note in found if note)
-            by_joint: dict[str, dict[str, tuple[float, int]]] = {}
-            for (joint, kg), motions in sorted(cells.items()):
-                mean = float(np.mean([np.mean(v) for v in motions.values()]))
-                by_joint.setdefault(joint, {})[kg] = mean, sum(map(len, motions.values()))
-            rows.append(Row(card.name, name, title, left, first, count, noise, splits, took, notes, by_joint))
-            self.say(f"{card.name}, {name}: {title} leaves {1e3 * left.mean():.2f} of {1e3 * first.mean():.2f} mrad")
+            by_motion, by_joint = _averages(folds, evaluated)
+            nominal = rows[0].error if rows else by_motion
+            rows.append(Row(
+                card.name, name, title, by_motion, nominal, sum(len(e.errors) for e in evaluated), floor, splits,
+                sum(e.seconds for e in evaluated), tuple(e.note for e in evaluated if e.note), by_joint,
+            ))  # fmt: skip
+            self.say(
+                f"{card.name}, {name}: {title}: {1e3 * by_motion.mean():.2f} mrad, nominal {1e3 * nominal.mean():.2f}"
+            )
         return rows
 
-    def _once(self, card: Card, question: Question, method: str, answer: Method) -> tuple[list[float], float, str]:
-        """Mean |error| of each test recording, rad, over the joints that it holds, s, and a note; kept below `work`."""
-        words = (card.name, question.name, question.split, method, self.adversary)
+    def _is_present(self, card: Card) -> bool:
+        return (self.data / card.folder).exists()
+
+    def _elsewhere(self, card: Card) -> Callable[[], RobotSpec] | None:
+        """Return a function that identifies the robot on the other data set of a card; None if that is not present."""
+        other = next((c for c in self.cards.set if c.name == card.elsewhere and self._is_present(c)), None)
+        return functools.partial(self._identified_on, other.name) if other else None
+
+    @functools.cache  # noqa: B019
+    def _identified_on(self, name: str) -> RobotSpec:
+        card = next(c for c in self.cards.set if c.name == name)
+        dataset, robot, _ = prepare(card, self.data, self.work)
+        first = next(questions(card.questions[0], dataset, robot, None))
+        return identified(self._with_folder(card, first, "")).robot
+
+    __hash__ = object.__hash__
+
+    def _with_folder(self, card: Card, question: Question, adversary: str) -> Question:
+        """Return the question with a folder of its own for identified robots and trainings."""
+        name = "-".join(filter(None, (card.name, question.split_hash, adversary)))
+        return replace(question, work=self.work / "made" / name)
+
+    def _evaluate_fold(self, card: Card, question: Question, method: str, fit: Method) -> Evaluated:
+        """Fit and evaluate, or read the stored evaluation."""
+        words = (card.name, question.name, question.split_hash, method, self.adversary)
         file = self.work / "answers" / (re.sub(r"[^A-Za-z0-9]+", "-", " ".join(words).strip()) + ".json")
         if file.is_file():
-            kept = json.loads(file.read_text(encoding="utf-8"))
-            return kept["errors"], kept["seconds"], kept.get("note", "")
-        began = time.monotonic()
-        answered = answer(question)
-        errors = answered.errors(question.test)
-        seconds = time.monotonic() - began
-        file.parent.mkdir(parents=True, exist_ok=True)
-        found = answered.robot  # for whoever wants to know what was found
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            return Evaluated(stored["errors"], stored["seconds"], stored.get("note", ""))
+        start = time.monotonic()
+        fitted = fit(question)
+        evaluated = Evaluated(fitted.errors(question.test), time.monotonic() - start, fitted.note)
+        robot = fitted.robot
         servos = {
-            j: {f: float(getattr(found, f)[found.joint_names.index(j)]) for f in ("kp", "delay", "offset")}
-            for j in found.operated
+            j: {f: float(getattr(robot, f)[robot.joint_names.index(j)]) for f in ("kp", "delay", "offset")}
+            for j in robot.operated
         }
-        mounts = [m.pos for m in found.payload_mounts]
-        told = {"errors": errors, "seconds": seconds, "note": answered.note, "servos": servos, "mounts": mounts}
-        write_text(file, json.dumps(told))
-        return errors, seconds, answered.note
+        record = {"errors": evaluated.errors, "seconds": evaluated.seconds, "note": evaluated.note, "servos": servos,
+                  "mounts": [m.pos for m in robot.payload_mounts]}  # fmt: skip
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, json.dumps(record))
+        return evaluated
 
 
-def _nothing_to_go_on(method: str, folds: list[Question]) -> bool:
+def _averages(
+    folds: list[Question], evaluated: list[Evaluated]
+) -> tuple[np.ndarray, dict[str, dict[str, tuple[float, int]]]]:
+    """Return the mean error of each independent motion, rad, and Row.by_joint."""
+    by_motion: dict[str, list[float]] = {}
+    by_cell: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for q, fold in zip(folds, evaluated, strict=True):
+        for s, motion, error in zip(q.test, q.test_motions, fold.errors, strict=True):
+            by_motion.setdefault(motion, []).append(error)
+            if len(columns := recorded_joints(s, q.robot)) == 1 < len(q.robot.operated):
+                cell = q.robot.joint_names[columns[0]], f"{s.meta.payload_mass:g}"
+                by_cell.setdefault(cell, {}).setdefault(motion, []).append(1e3 * error)
+    by_joint: dict[str, dict[str, tuple[float, int]]] = {}
+    for (joint, kg), motions in sorted(by_cell.items()):
+        mean = float(np.mean([np.mean(v) for v in motions.values()]))
+        by_joint.setdefault(joint, {})[kg] = mean, sum(map(len, motions.values()))
+    return np.array([np.mean(v) for v in by_motion.values()]), by_joint
+
+
+def _lacks_data(method: str, folds: list[Question]) -> bool:
     first = folds[0]
     if method == "constant":
         return len({(s.meta.payload_mass, s.meta.unit_id) for s in first.train}) < 2
-    return (method == "elsewhere" and first.before is None) or (method == "adapted" and not first.few)
+    return (method == "elsewhere" and first.elsewhere is None) or (method == "adapted" and not first.few)
 
 
 def load_method(where: str) -> tuple[str, Method]:
-    """FILE.py:FUNCTION, or an extension's name → name and function, which is given a Question and returns an Answer."""
+    """Load a method, given as FILE.py:FUNCTION or as the name of a plug-in. Return its name and function.
+
+    Raises:
+        UsageError: No such file or function.
+    """
     if where in plugins.registry(plugins.METHODS, {}):
         return where, plugins.require(plugins.METHODS, where, {}, "method")
     file, _, name = where.rpartition(":")

@@ -1,9 +1,9 @@
-"""Data cards: which public recordings the benchmark takes, and how each becomes a dataset."""
+"""Data cards: the public recordings of the benchmark, and the import of each as a dataset."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,13 +19,13 @@ from gaponet.robot.spec import RobotSpec, load_robot
 from gaponet.sysid.labels import Labels, estimate, write
 
 CARDS = Path(__file__).with_name("cards.toml")
-ROBOTS = Path(__file__).with_name("robots")  # of data sets alone
-DATA = "GAPONET_DATA"  # names the folder of the data sets
+ROBOTS = Path(__file__).with_name("robots")  # robots of the data sets that the package does not have
+DATA_VARIABLE = "GAPONET_DATA"  # environment variable: folder of the data sets
 
 
 @dataclass(frozen=True)
 class MissingLabels:
-    """Payloads that were in the room, kg, and how many units: who carried what is estimated."""
+    """The payloads, kg, and the number of units in recordings whose labels have to be estimated."""
 
     payloads: list[float]
     units: int
@@ -33,7 +33,15 @@ class MissingLabels:
 
 @dataclass(frozen=True)
 class Card:
-    """One data set: where it lies, what it is, what is asked of it; `inferred` is what nobody states."""
+    """One data set.
+
+    Attributes:
+        folder: Place below the data folder.
+        known, inferred: Facts that the source states, and facts that were read off the data.
+        questions: Names of questions (questions.py).
+        elsewhere: Data set of the same robot that `elsewhere` methods identify on.
+        labels: Given if payload and unit have to be estimated.
+    """
 
     name: Name
     folder: str
@@ -46,7 +54,7 @@ class Card:
     questions: Annotated[list[str], Len(1)]
     unit: str | None = None
     payload: float | None = None
-    elsewhere: str = ""  # data set of the same robot that is identified first
+    elsewhere: str = ""
     rate: float | None = None
     cut: float | None = None
     position_unit: str | None = None
@@ -58,7 +66,7 @@ class Card:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A folder of which nothing is asked, and why."""
+    """A folder without questions, and the reason."""
 
     folder: str
     why: str
@@ -66,31 +74,37 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Cards:
-    """cards.toml."""
+    """Contents of cards.toml."""
 
     set: list[Card]
     left_out: list[LeftOut] = field(default_factory=list)
 
 
 def read_cards(file: Path = CARDS) -> Cards:
-    """The cards of a file."""
+    """Read the cards of a file."""
     return read_toml(Cards, file, UsageError, "docs/benchmark.md lists the fields")
 
 
 def data_folder(given: Path | None) -> Path:
-    """Where the data sets lie: given, or GAPONET_DATA, or ../shared/data."""
-    folder = given or Path(os.environ.get(DATA, "../shared/data"))
+    """Return the folder of the data sets: given, or GAPONET_DATA, or ../shared/data.
+
+    Raises:
+        UsageError: No such folder.
+    """
+    folder = given or Path(os.environ.get(DATA_VARIABLE, "../shared/data"))
     if not folder.is_dir():
-        raise UsageError(f"{folder}: no such folder; say where the public recordings lie with --data or {DATA}")
+        raise UsageError(
+            f"{folder}: no such folder; name the folder of the public recordings with --data or {DATA_VARIABLE}"
+        )
     return folder
 
 
 def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Labels | None]:
-    """The dataset of a card below `work`, imported where it is not there yet, and the labels that were estimated."""
+    """Import a card's recordings below `work` once. Return dataset, robot, and the estimated labels if any."""
     own = ROBOTS / card.robot
     robot, place, labels = load_robot(own if own.is_dir() else card.robot), work / card.name, None
-    told: dict[str, Any] = {k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))}
-    told |= {"position_unit": card.position_unit} if card.position_unit else {}
+    options: dict[str, Any] = {k: v for k in ("rate", "joints", "ignore", "posture") if (v := getattr(card, k))}
+    options |= {"position_unit": card.position_unit} if card.position_unit else {}
     place.mkdir(parents=True, exist_ok=True)
     if card.labels:
         gain = dict(zip(robot.joint_names, robot.kp.tolist(), strict=True))
@@ -98,11 +112,11 @@ def prepare(card: Card, data: Path, work: Path) -> tuple[Dataset, RobotSpec, Lab
             read_logs(data / card.folder, robot, rate=card.rate), card.labels.payloads, card.labels.units, gain
         )
         write(labels, place)
-        told["manifest"] = "labels.csv"
+        options["manifest"] = "labels.csv"
     logs = place / "logs.toml"
-    write_text(logs, "".join(f"{k} = {_toml(v)}\n" for k, v in told.items()))
+    write_text(logs, "".join(f"{k} = {_toml(v)}\n" for k, v in options.items()))
     report = import_logs(
-        data / card.folder, robot, card.unit, card.payload, place / "data", logs=logs if told else None, cut=card.cut
+        data / card.folder, robot, card.unit, card.payload, place / "data", logs=logs if options else None, cut=card.cut
     )
     report.dataset.state(licence=card.licence, source=card.source)
     return report.dataset, robot, labels
@@ -112,8 +126,3 @@ def _toml(value: Any) -> str:
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{k} = {_toml(v)}" for k, v in value.items()) + " }"
     return str(value) if isinstance(value, float) else repr(value).replace("'", '"')
-
-
-def as_table(card: Card) -> dict[str, Any]:
-    """What a page says of a data set."""
-    return {k: v for k, v in asdict(card).items() if k in ("title", "source", "licence", "known", "inferred")}

@@ -1,4 +1,4 @@
-"""Networks among the benchmark's methods: each is trained on a question's own recordings, briefly, and kept."""
+"""Networks as methods of the benchmark: each is trained once on a question's training recordings."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from gaponet.base.errors import UsageError
 from gaponet.base.files import write_text
 from gaponet.data.store import Dataset
-from gaponet.experiments.real.questions import Question, rehearsal
-from gaponet.experiments.real.rivals import LEFT_OUT, Answer, Method, fitted, identified, nominal
+from gaponet.experiments.real.methods import LEFT_OUT, FittedSim, Method, fit_delay_offset, identified, nominal
+from gaponet.experiments.real.questions import Question, train_val
 from gaponet.nn.artifact import GapModel
 from gaponet.nn.config import ModelConfig
 from gaponet.nn.training.budget import Budget
@@ -22,31 +22,29 @@ from gaponet.report.verdict import Added
 
 BASES = {"": nominal, "identification + ": identified}
 TITLES = {"gaponet": "GAPONet", "shared_mlp": "shared MLP"}
-TRAINED = tuple((base, kind) for base in BASES for kind in ("shared_mlp", "gaponet"))
-WHOLE = 600_000  # control steps from which training is that of gaponet train
-# Fewer are one round of its supervised start.
-BRIEF = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
+FULL_RECIPE_STEPS = 600_000  # control steps from which the recipe is that of gaponet train
+# Fewer steps are one round of the supervised start.
+ONE_ROUND = PretrainingConfig(rounds=1, num_envs=256, gradient_steps=200, sensor_states=512)
 
 
 def networks(steps: int) -> dict[str, tuple[str, Method]]:
-    """Methods that train for so many control steps."""
-    made: dict[str, tuple[str, Method]] = {}
-    for base, kind in TRAINED if steps else ():
-        title = base + TITLES[kind]
-        made[f"{title} {steps}"] = title, partial(_trained, base=base, kind=kind, steps=steps)
-    return made
+    """Return methods that train a network for this number of control steps: name → title and method."""
+    return {
+        f"{base}{TITLES[kind]} {steps}": (base + TITLES[kind], partial(_train, base=base, kind=kind, steps=steps))
+        for base in BASES for kind in ("shared_mlp", "gaponet")
+    }  # fmt: skip
 
 
 def _recipe(steps: int) -> TrainConfig:
-    """How a network is trained for so many control steps; a brief training labels no more rows than that."""
+    """Return the training settings for a number of control steps; a short training labels no more rows than that."""
     warm = PretrainingConfig()
-    if steps < WHOLE:
-        warm = replace(BRIEF, steps=max(steps // BRIEF.num_envs, 1), rows=steps)
+    if steps < FULL_RECIPE_STEPS:
+        warm = replace(ONE_ROUND, steps=max(steps // ONE_ROUND.num_envs, 1), rows=steps)
     return TrainConfig(warm_start=warm, mixed_gains=True)
 
 
-def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
-    """The simulator with its network; the identified one without where `gaponet train` says that it adds nothing."""
+def _train(question: Question, base: str, kind: str, steps: int) -> FittedSim:
+    """Train a network on top of a simulator; leave it out if validation shows no gain over identification."""
     if question.work is None:
         raise UsageError(f"{question.name}: networks need a folder to be trained in")
     start = BASES[base](question)
@@ -55,20 +53,20 @@ def _trained(question: Question, base: str, kind: str, steps: int) -> Answer:
     if not (training / "model" / "card.json").is_file():
         dataset = Dataset.create(run / "recordings", question.robot)
         parts: dict[str, dict[str, str]] = {"test": {}}
-        for part, mine in zip(("train", "val"), rehearsal(question), strict=True):
-            hashes = {s.content_hash(): s for s in mine}
-            found = [dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()]
-            parts[part] = {e.id: e.hash for e in found}
+        for part, sequences in zip(("train", "val"), train_val(question), strict=True):
+            hashes = {s.content_hash(): s for s in sequences}
+            entries = [dataset.find(h) or dataset.append(s, content_hash=h) for h, s in hashes.items()]
+            parts[part] = {e.id: e.hash for e in entries}
         write_text(split, json.dumps({"parts": parts}))
         config = replace(_recipe(steps), model=ModelConfig(kind), split=str(split))  # type: ignore[arg-type]
-        half_way = (training / "checkpoint.pt").is_file()
-        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), half_way)
-        trainer.baseline = fitted(question)
+        resume = (training / "checkpoint.pt").is_file()
+        trainer = Trainer(dataset, start.robot, training, config, Budget(steps=steps), resume)
+        trainer.baseline = fit_delay_offset(question)
         trainer.run()
     model = GapModel.load(training)
     val = model.card["val_mpjae"]
-    worth = Added(base, val["added"], val.get("error", np.nan), val["start"])
-    told = f"{100 * worth.less / worth.left:.0f} % less on validation"
-    if base and not worth.helps:
-        return replace(start, note=f"{LEFT_OUT}: {told}")
-    return replace(start, corrector=model.corrector(start.robot), note=told)
+    gain = Added(base, val["added"], val.get("error", np.nan), val["start"])
+    note = f"{100 * gain.less / gain.left:.0f} % less on validation"
+    if base and not gain.helps:
+        return replace(start, note=f"{LEFT_OUT}: {note}")
+    return replace(start, corrector=model.corrector(start.robot), note=note)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gaponet.base.files import write_text
-from gaponet.experiments.real.rivals import LEFT_OUT
-from gaponet.report.figures.colours import colour, shade
+from gaponet.base.result_table import ResultTable
+from gaponet.experiments.real.methods import LEFT_OUT
 from gaponet.report.figures.style import figure, legend, save, styled
+from gaponet.report.methods import colour, shade
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,114 +27,104 @@ LOOKS = {  # method's title → colour, marker
     "GAPONet": (colour("gaponet"), "^"),
     "identification + GAPONet": (colour("identified+gaponet"), "v"),
 }
-WIDEST = 1.6  # of nominal: what lies beyond stands at the edge
-COLUMNS = (
-    "set",
-    "question",
-    "method",
-    "mrad",
-    "of nominal",
-    "less than nominal, mrad",
-    "floor",
-    "motions",
-    "recordings",
-)
-NAME = "real"
-TITLE = """# Real robots
+MAX_OF_NOMINAL = 1.6  # end of the figure's axis; larger values are drawn at it
+COLUMNS = ("set", "question", "method", "mrad", "of nominal", "less than nominal, mrad", "floor", "motions",
+           "recordings")  # fmt: skip
+STEM = "real"
+HEADING = """# Real robots
 
 `gaponet bench real` ([benchmark](../benchmark.md)): recordings that no method was fitted to, in free run from the
 recorded start. ± is the standard error over independent motions, of differences to the nominal simulator paired;
 "floor" is what two recordings of one command differ by."""
 
 
-def table(rows: list[dict[str, Any]]) -> list[list[str]]:
-    """Cells; ± is the standard error over independent motions, of differences paired."""
-    return [
-        [r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
-         _pm(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
-         "" if i == 0 or not r["less_than_nominal"] else _pm(r["less_than_nominal"], r["less_standard_error"]),
-         "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", str(r["motions"]), str(r["recordings"])]
+def result_table(rows: list[dict[str, Any]]) -> ResultTable:
+    """One row per data set, question and method, from Row.as_dict."""
+    return ResultTable(STEM, COLUMNS, tuple(
+        (r["set"], r["question"], r["method"] + _left_out(r.get("notes", ())),
+         _plus_minus(r["mrad"], r["standard_error"]), f"{r['of_nominal']:.2f}",
+         "" if i == 0 or not r["less_than_nominal"] else _plus_minus(r["less_than_nominal"], r["less_standard_error"]),
+         "–" if r["floor_mrad"] is None else f"{r['floor_mrad']:.1f}", r["motions"], r["recordings"])
         for i, r in enumerate(rows)
-    ]  # fmt: skip
+    ))  # fmt: skip
 
 
-def by_joint(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: what each method leaves by joint and payload, of sets that were recorded joint by joint."""
-    lines = []
+def joint_tables(rows: list[dict[str, Any]]) -> list[ResultTable]:
+    """One table by joint and payload for each data set in which joints were recorded one at a time."""
+    tables = []
     for name in dict.fromkeys(r["set"] for r in rows if r.get("by_joint_mrad")):
-        mine = [r for r in rows if r["set"] == name]
-        methods = list(dict.fromkeys(r["method"] for r in mine))
+        of_set = [r for r in rows if r["set"] == name]
+        methods = list(dict.fromkeys(r["method"] for r in of_set))
         heads = [m.partition(" by ")[0].removesuffix(" simulator") for m in methods]
-        lines += ["", f"{name} by joint and payload, mrad (means over motions, few in a cell, so no ±):", ""]
-        lines += ["| question | joint | kg | recordings | " + " | ".join(heads) + " |"]
-        lines += ["| --- | --- | ---: | ---: |" + " ---: |" * len(heads)]
-        for question in dict.fromkeys(r["question"] for r in mine):
-            found = {r["method"]: r["by_joint_mrad"] for r in mine if r["question"] == question}
-            first = next(iter(found.values()))
-            for joint, kg, count in ((j, kg, n) for j, each in first.items() for kg, (_, n) in each.items()):
-                cells = [f"{found[m][joint][kg][0]:.1f}" if m in found else "–" for m in methods]
-                lines += ["| " + " | ".join([question, joint, kg, str(count), *cells]) + " |"]
-    return lines
+        cells: list[tuple[Any, ...]] = []
+        for question in dict.fromkeys(r["question"] for r in of_set):
+            errors = {r["method"]: r["by_joint_mrad"] for r in of_set if r["question"] == question}
+            first = next(iter(errors.values()))
+            for joint, kg, count in (
+                (j, kg, n) for j, by_payload in first.items() for kg, (_, n) in by_payload.items()
+            ):
+                values = [f"{errors[m][joint][kg][0]:.1f}" if m in errors else "–" for m in methods]
+                cells.append((question, joint, kg, count, *values))
+        caption = f"{name} by joint and payload, mrad: means over motions, too few for standard errors."
+        tables.append(ResultTable(name, ("question", "joint", "kg", "recordings", *heads), tuple(cells), caption))
+    return tables
 
 
 def _left_out(notes: tuple[str, ...]) -> str:
-    """That validation left a network out, of so many that were trained."""
+    """Say in how many folds validation left the network out."""
     count = sum(note.startswith(LEFT_OUT) for note in notes)
     return f" ({LEFT_OUT} in {count} of {len(notes)})" if count else ""
 
 
-def _pm(value: float, error: float | None) -> str:
+def _plus_minus(value: float, error: float | None) -> str:
     return f"{value:.2f}" + (f" ± {error:.2f}" if error is not None else "")
 
 
-def write_page(found: dict[str, Any], out: Path) -> list[Path]:
-    """JSON, Markdown and figure in a folder."""
+def write_page(result: dict[str, Any], out: Path) -> list[Path]:
+    """Write JSON, Markdown and figure of Bench.run into a folder. Return the files."""
     out.mkdir(parents=True, exist_ok=True)
-    rows, name = found["rows"], f"{NAME}-{found['adversary']}".rstrip("-")
-    write_text(out / f"{name}.json", json.dumps(found, indent=1, ensure_ascii=False) + "\n")
-    lines = [TITLE, "", f"![What methods leave of the nominal error]({name}.png)", ""]
-    if found["adversary"]:
-        lines += [f"ADVERSARY: {found['adversary']}.", ""]
-    lines += ["| " + " | ".join(COLUMNS) + " |", "| --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |"]
-    lines += ["| " + " | ".join(cells) + " |" for cells in table(rows)]
-    lines += by_joint(rows)
-    spent = ", ".join(f"{what} {seconds:,} s" for what, seconds in found["seconds"].items())
-    lines += ["", f"From file to table, on this machine: {spent}."]
-    for what, remarks in found["labels"].items():
-        lines += ["", f"Labels of {what} (`gaponet data labels`):", "", *(f"- {remark}" for remark in remarks)]
-    write_text(out / f"{name}.md", "\n".join(lines) + "\n")
-    figures = save(draw(rows, found["cards"]), out / name) if rows else []
-    return [out / f"{name}.md", out / f"{name}.json", *figures]
+    rows, stem = result["rows"], f"{STEM}-{result['adversary']}".rstrip("-")
+    write_text(out / f"{stem}.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    parts = [HEADING, f"![Error of each method as a share of the nominal error]({stem}.png)"]
+    parts += [f"ADVERSARY: {result['adversary']}."] if result["adversary"] else []
+    parts += [table.markdown() for table in (result_table(rows), *joint_tables(rows))]
+    seconds = ", ".join(f"{name} {value:,} s" for name, value in result["seconds"].items())
+    parts.append(f"From file to table, on this machine: {seconds}.")
+    for name, remarks in result["labels"].items():
+        parts += [f"Labels of {name} (`gaponet data labels`):", "\n".join(f"- {remark}" for remark in remarks)]
+    write_text(out / f"{stem}.md", "\n\n".join(parts) + "\n")
+    figures = save(draw(rows, result["cards"]), out / stem) if rows else []
+    return [out / f"{stem}.md", out / f"{stem}.json", *figures]
 
 
 @styled
 def draw(rows: list[dict[str, Any]], titles: dict[str, str]) -> Figure:
-    """What each method leaves of the nominal error, a line for each question, what the robot itself leaves shaded."""
-    asked = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
-    fig = figure(7.2, 0.5 * len(asked) + 1.5)
+    """Draw each method's share of the nominal error, a line for each question; shaded: repeatability of the robot."""
+    keys = list(dict.fromkeys((r["set"], r["question"]) for r in rows))
+    fig = figure(7.2, 0.5 * len(keys) + 1.5)
     ax = fig.subplots()
-    names = [titles.get(name, name).partition(",")[0] + f": {question}" for name, question in asked]
-    shown = {y: [r for r in rows if (r["set"], r["question"]) == key] for y, key in enumerate(asked)}
-    for y, (first, *_) in shown.items():
+    names = [titles.get(name, name).partition(",")[0] + f": {question}" for name, question in keys]
+    lines = {y: [r for r in rows if (r["set"], r["question"]) == key] for y, key in enumerate(keys)}
+    for y, (first, *_) in lines.items():
         if first["floor_mrad"] is not None:
             ax.barh(y, first["floor_mrad"] / first["mrad"], 0.86, color="#111111", alpha=0.1, lw=0,
                     label="repetitions differ by")  # fmt: skip
-    for method, (own, marker) in LOOKS.items():  # the nominal simulator is the line
-        for y, (first, *others) in shown.items():
-            lanes = [r for r in others if r["method"] in LOOKS]
-            for i, r in enumerate(lanes):
+    for method, (own, marker) in LOOKS.items():  # the nominal simulator is the vertical line
+        for y, (first, *others) in lines.items():
+            drawn = [r for r in others if r["method"] in LOOKS]
+            for i, r in enumerate(drawn):
                 if r["method"] == method:
                     x, error = r["of_nominal"], (r["standard_error"] or 0.0) / first["mrad"]
-                    ax.errorbar(min(x, WIDEST), y + 0.76 * ((i + 0.5) / len(lanes) - 0.5), xerr=error or None,
-                                fmt=marker if x <= WIDEST else ">", ms=4, color=own, elinewidth=0.8,
+                    ax.errorbar(min(x, MAX_OF_NOMINAL), y + 0.76 * ((i + 0.5) / len(drawn) - 0.5), xerr=error or None,
+                                fmt=marker if x <= MAX_OF_NOMINAL else ">", ms=4, color=own, elinewidth=0.8,
                                 label=method.partition(" by ")[0])  # fmt: skip
-    for y in range(1, len(asked)):
+    for y in range(1, len(keys)):
         ax.axhline(y - 0.5, color="#111111", alpha=0.08, lw=0.6, zorder=0)
     ax.axvline(1.0, color=colour("nominal"), lw=1.2, zorder=0, label="nominal simulator")
-    ax.set_yticks(np.arange(len(asked)), names)
+    ax.set_yticks(np.arange(len(keys)), names)
     ax.tick_params(axis="y", length=0)
-    ax.set_ylim(len(asked) - 0.5, -0.5)
-    ax.set_xlim(0.0, max(1.05, min(1.05 * max(r["of_nominal"] for r in rows), WIDEST)))
+    ax.set_ylim(len(keys) - 0.5, -0.5)
+    ax.set_xlim(0.0, max(1.05, min(1.05 * max(r["of_nominal"] for r in rows), MAX_OF_NOMINAL)))
     ax.grid(axis="y", visible=False)
     ax.set_xlabel("mean |error|, of the nominal simulator's")
     legend(fig)

@@ -1,4 +1,4 @@
-"""What is asked of a data set: recordings to learn from, and others to be right about, of the same robot."""
+"""Questions of the benchmark: recordings of a robot to fit, and other recordings of it to be evaluated on."""
 
 from __future__ import annotations
 
@@ -20,19 +20,25 @@ from gaponet.data.store import Dataset, Entry, dataset_hash
 from gaponet.robot.spec import RobotSpec
 
 FOLDS = 3
-FEW = 6  # recordings of a unit, of each joint, to adapt with
-ALIKE = 0.02  # rad that repetitions' commands differ by in the mean: one may begin a part of a period later
-VAL = 8  # one in so many pairs of motion and payload judges, where motions are too few for a part of their own
-Made = TypeVar("Made")
+FEW_RECORDINGS = 6  # per joint, of a unit that is new, for adaptation
+# rad: mean difference of the commands of two repetitions, one of which may begin a part of a period later.
+MAX_COMMAND_DIFFERENCE = 0.02
+VALIDATION_STRIDE = 8  # one in so many pairs of motion and payload validates, where motions are few
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Question:
-    """One question: name; recordings for training, validation and testing; `few` of the test's own, to adapt with.
+    """A split of the recordings of one robot.
 
-    `motion` says of each test recording which independent motion it is of; `split` is the hash of both sides; `before`
-    makes the robot as it was identified elsewhere; `made` is what methods share, `work` a folder of the question's own
-    where they may keep it.
+    Attributes:
+        train, val, test: Recordings for fitting, validation and evaluation.
+        test_motions: Independent motion of each test recording.
+        split_hash: Hash of the recordings on both sides.
+        few: Recordings of the test's unit or session, for adaptation.
+        elsewhere: Returns the robot as it was identified on other data.
+        shared: Results that several methods use.
+        work: Folder of the question for identified robots and trainings.
     """
 
     name: str
@@ -40,118 +46,124 @@ class Question:
     train: list[Sequence]
     val: list[Sequence]
     test: list[Sequence]
-    motion: list[str]
-    split: str
+    test_motions: list[str]
+    split_hash: str
     few: list[Sequence] = field(default_factory=list)
-    before: Callable[[], RobotSpec] | None = None
-    made: dict[str, object] = field(default_factory=dict)
+    elsewhere: Callable[[], RobotSpec] | None = None
+    shared: dict[str, object] = field(default_factory=dict)
     work: Path | None = None
 
     @property
-    def known(self) -> list[Sequence]:
-        """All that may be learned from, for methods that choose nothing."""
+    def fitted(self) -> list[Sequence]:
+        """Training and validation recordings, for methods without validation."""
         return self.train + self.val
 
-    def once(self, name: str, make: Callable[[], Made]) -> Made:
-        """What several methods rest on, made by the first that asks."""
-        if name not in self.made:
-            self.made[name] = make()
-        return self.made[name]  # type: ignore[return-value]
+    def once(self, name: str, make: Callable[[], T]) -> T:
+        """Return a result that several methods share; the first call makes it."""
+        if name not in self.shared:
+            self.shared[name] = make()
+        return self.shared[name]  # type: ignore[return-value]
 
 
 def questions(
-    name: str, dataset: Dataset, robot: RobotSpec, before: Callable[[], RobotSpec] | None
+    name: str, dataset: Dataset, robot: RobotSpec, elsewhere: Callable[[], RobotSpec] | None
 ) -> Iterator[Question]:
-    """The parts of a question: one, or a fold for each command or unit that is left out in turn."""
+    """Yield the folds of a question: one, or one for each command or unit that is left out in turn.
+
+    Raises:
+        UsageError: No such question.
+    """
     lead = one_motion(dataset)
     entries = dataset.entries
 
-    def ask(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
+    def split(train: list[Entry], val: list[Entry], test: list[Entry], few: list[Entry] = []) -> Question:  # noqa: B006
         if not val:
             cell = {e.id: f"{e.meta.motion} {e.meta.payload_mass:g}" for e in train}
-            judges = hash_order(cell.values())[::VAL]
+            judges = hash_order(cell.values())[::VALIDATION_STRIDE]
             val = [e for e in train if cell[e.id] in judges]
             train = [e for e in train if cell[e.id] not in judges]
         digest = hashlib.sha256(f"{dataset_hash(train + val)} {dataset_hash(test)}".encode()).hexdigest()[:8]
         read = lambda part: dataset.sequences(part)  # noqa: E731
-        motion = [lead[e.meta.motion] for e in test]
-        return Question(name, robot, read(train), read(val), read(test), motion, digest, read(few), before)
+        motions = [lead[e.meta.motion] for e in test]
+        return Question(name, robot, read(train), read(val), read(test), motions, digest, read(few), elsewhere)
 
     if name in ("new motions", "another session"):
         parts = split_entries(dataset)
         few = parts["train"] if name == "another session" else []
-        yield ask(parts["train"], parts["val"], parts["test"], few)
+        yield split(parts["train"], parts["val"], parts["test"], few)
     elif name == "later repetitions":
         parts = in_turn(dataset, "repetition")
-        yield ask(parts["train"], parts["val"], parts["test"])
+        yield split(parts["train"], parts["val"], parts["test"])
     elif name == "new commands":
         order = {
             j: hash_order({e.meta.motion for e in entries if _joint(e) == j}) for j in {_joint(e) for e in entries}
         }
         for fold in range(FOLDS):
             out = {names[fold] for names in order.values() if fold < len(names) > 1}
-            yield ask(
+            yield split(
                 [e for e in entries if e.meta.motion not in out], [], [e for e in entries if e.meta.motion in out]
             )
     elif name.endswith(" kg left out"):
         mass = float(name.split()[0])
-        away = [e for e in entries if e.meta.payload_mass == mass]
-        yield ask([e for e in entries if e not in away], [], away)
+        test = [e for e in entries if e.meta.payload_mass == mass]
+        yield split([e for e in entries if e not in test], [], test)
     elif name == "a unit left out":
         for unit in sorted({e.meta.unit_id for e in entries}):
-            away = [e for e in entries if e.meta.unit_id == unit]
+            of_unit = [e for e in entries if e.meta.unit_id == unit]
             first = {
-                j: hash_order({e.meta.motion for e in away if _joint(e) == j})[0] for j in {_joint(e) for e in away}
+                j: hash_order({e.meta.motion for e in of_unit if _joint(e) == j})[0]
+                for j in {_joint(e) for e in of_unit}
             }
-            known = [e for e in away if e.meta.motion in first.values()]
-            few = [e for j in first for e in [e for e in known if _joint(e) == j][:FEW]]
-            yield ask([e for e in entries if e not in away], [], [e for e in away if e not in known], few)
+            seen = [e for e in of_unit if e.meta.motion in first.values()]
+            few = [e for j in first for e in [e for e in seen if _joint(e) == j][:FEW_RECORDINGS]]
+            yield split([e for e in entries if e not in of_unit], [], [e for e in of_unit if e not in seen], few)
     else:
         raise UsageError(f"question '{name}' is not known; docs/benchmark.md lists them")
 
 
 def _joint(entry: Entry) -> str:
-    """What a recording of one joint is about; "" of others."""
-    unknown = entry.meta.unrecorded
-    return entry.meta.motion.split("-to")[0] if unknown else ""
+    """Return the joint of a recording of a single joint; "" for other recordings."""
+    return entry.meta.motion.split("-to")[0] if entry.meta.unrecorded else ""
 
 
-def rehearsal(question: Question) -> tuple[list[Sequence], list[Sequence]]:
-    """Recordings to learn from, and others that judge: where joints were recorded one at a time, a command of each
-    joint that has several."""
-    known, judges = question.known, set()
-    if len({s.meta.unrecorded for s in known}) == 1:
+def train_val(question: Question) -> tuple[list[Sequence], list[Sequence]]:
+    """Return training and validation recordings.
+
+    Where joints were recorded one at a time, one command of each joint with several commands validates.
+    """
+    fitted, val = question.fitted, set()
+    if len({s.meta.unrecorded for s in fitted}) == 1:
         return question.train, question.val
-    for unrecorded in {s.meta.unrecorded for s in known}:
-        motions = hash_order(s.meta.motion for s in known if s.meta.unrecorded == unrecorded)
-        judges |= set(motions[:1] if len(motions) > 1 else [])
-    return [s for s in known if s.meta.motion not in judges], [s for s in known if s.meta.motion in judges]
+    for unrecorded in {s.meta.unrecorded for s in fitted}:
+        motions = hash_order(s.meta.motion for s in fitted if s.meta.unrecorded == unrecorded)
+        val |= set(motions[:1] if len(motions) > 1 else [])
+    return [s for s in fitted if s.meta.motion not in val], [s for s in fitted if s.meta.motion in val]
 
 
-def floor(question: Question) -> float:
-    """Mean |difference| in how two recordings of one command, unit and payload follow it, rad; nan without any."""
+def repeatability(question: Question) -> float:
+    """Mean |difference| between the errors of two recordings of one command, unit and payload, rad; NaN without any."""
     groups: dict[tuple[object, ...], list[Sequence]] = {}
-    for s, motion in zip(question.test, question.motion, strict=True):
+    for s, motion in zip(question.test, question.test_motions, strict=True):
         groups.setdefault((motion, *s.meta.slot[1:], s.meta.unrecorded, s.meta.kp), []).append(s)
     pairs = [d for group in groups.values() for d in _differences(group, question.robot)]
     least = min((command for command, _ in pairs), default=0.0)
-    apart = [d for command, d in pairs if command <= max(least, SAME_COMMAND)]
-    return float(np.mean(apart)) if apart else float("nan")
+    errors = [d for command, d in pairs if command <= max(least, SAME_COMMAND)]
+    return float(np.mean(errors)) if errors else float("nan")
 
 
 def _differences(group: list[Sequence], robot: RobotSpec) -> Iterator[tuple[float, float]]:
-    """How far the commands of two recordings differ in the mean, and how far their answers do, rad."""
+    """Yield the mean differences of the commands and of the responses of each pair of recordings, rad."""
     for a, first in enumerate(group):
         for second in group[a + 1 :]:
             rows = min(len(first), len(second))
-            told = first.ctrl[:rows] - second.ctrl[:rows]
-            error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - told)[:, recorded(first, robot)]
-            if np.abs(told).mean() < ALIKE:
-                yield float(np.abs(told).mean()), float(error.mean())
+            command = first.ctrl[:rows] - second.ctrl[:rows]
+            error: Array = np.abs(first.qpos[:rows] - second.qpos[:rows] - command)[:, recorded_joints(first, robot)]
+            if np.abs(command).mean() < MAX_COMMAND_DIFFERENCE:
+                yield float(np.abs(command).mean()), float(error.mean())
 
 
-def recorded(sequence: Sequence, robot: RobotSpec) -> list[int]:
-    """Columns of the operated joints that a recording holds."""
+def recorded_joints(sequence: Sequence, robot: RobotSpec) -> list[int]:
+    """Return the columns of the operated joints that a recording holds."""
     return [
         int(i) for i, j in zip(robot.operated_index, robot.operated, strict=True) if j not in sequence.meta.unrecorded
     ]

@@ -1,4 +1,4 @@
-"""What is drawn more than once: bars by group, lines over an amount, motions against a reference."""
+"""Charts that several figures use: bars by group, lines over a quantity, trajectories against a reference."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 Bars = Mapping[str, tuple[str, ListOf[MeanStd]]]  # label → colour, value of each group
-LEAST = 0.06  # rad, of an axis of positions
+MIN_POSITION_SPAN = 0.06  # rad of a position axis, so that encoder steps of a joint at rest are not magnified
 
 
 @styled
 def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
-    """Bars with error bars, the methods of each group side by side."""
+    """Draw bars with error bars, the methods of each group side by side."""
     word = max((len(word) for group in groups for word in group.split()), default=0)
     fig = figure(max(5.2, 0.17 * len(groups) * len(methods) + 1.7, (LETTER * word + 0.05) * len(groups) + 1.3), 3.3)
     ax = fig.subplots()
@@ -35,69 +35,72 @@ def bars(groups: ListOf[str], methods: Bars, axis: str, title: str) -> Figure:
 
 
 def draw_bars(ax: Any, groups: ListOf[str], methods: Bars, size: float | None = None) -> None:
-    """The same into axes that are there, with labels of a size of their own."""
+    """Draw the bars into existing axes; size is the font size of the group labels."""
     width = 0.84 / len(methods)
     for i, (label, (colour, values)) in enumerate(methods.items()):
         x = np.arange(len(groups)) + (i - (len(methods) - 1) / 2) * width
-        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=spreads(values), color=colour, label=label,
+        ax.bar(x, [v.mean for v in values], width * 0.92, yerr=error_bars(values), color=colour, label=label,
                error_kw={"lw": 0.7, "capsize": 1.2, "capthick": 0.6})  # fmt: skip
     ax.set_xticks(np.arange(len(groups)), groups, fontsize=size)
     ax.tick_params(axis="x", length=0)
     ax.grid(axis="x", visible=False)
 
 
-def spreads(values: ListOf[MeanStd]) -> Array | None:
-    """Lengths of error bars; None where nothing was measured twice."""
+def error_bars(values: ListOf[MeanStd]) -> Array | None:
+    """Return the lengths of error bars; None if no value has a standard deviation."""
     std = np.array([v.std if v.std == v.std else 0.0 for v in values])
     return std if std.any() else None
 
 
 @dataclass(frozen=True)
-class Course:
-    """How one joint went: rad, (T,)."""
+class JointTrajectory:
+    """Positions of one joint, (T,) rad.
 
-    found: Mapping[str, Array]
-    """Positions by method."""
-    base: Array
-    """The reference's."""
+    Attributes:
+        by_method: Positions of each method.
+        reference: Positions of the reference.
+        corrections: Δa of each method, (up to T,) rad.
+        zoom: Rows that are drawn again, magnified; given for all joints or for none.
+    """
+
+    by_method: Mapping[str, Array]
+    reference: Array
     command: Array | None = None
     corrections: Mapping[str, Array] = field(default_factory=dict)
-    """Δa by method, (up to T,)."""
     zoom: slice | None = None
-    """Rows shown once more, larger; of all joints or of none."""
 
 
 @styled
 def against(
     time: Array,
-    joints: Mapping[str, Course],
+    joints: Mapping[str, JointTrajectory],
     looks: Mapping[str, tuple[str, str]],
     reference: str,
     title: str = "",
 ) -> Figure:
-    """Positions by method over time, a column per joint; below them how far each is from the reference, on one scale.
+    """Draw positions by method over time, a column per joint, and their errors below on one scale.
 
     Args:
         time: (T,) s.
-        joints: What the column is called → what it shows.
+        joints: Title of a column → its trajectories.
         looks: Label and colour of each method, of the reference, and of "command".
     """
-    some = next(iter(joints.values()))
-    rows = {"position, rad": 1.8, "zoom, rad": 1.6 * (some.zoom is not None), "error, mrad": 1.1,
-            "Δa, mrad": 0.9 * bool(some.corrections)}  # fmt: skip
+    first = next(iter(joints.values()))
+    rows = {"position, rad": 1.8, "zoom, rad": 1.6 * (first.zoom is not None), "error, mrad": 1.1,
+            "Δa, mrad": 0.9 * bool(first.corrections)}  # fmt: skip
     rows = {label: height for label, height in rows.items() if height}
     fig = figure(3.6 * len(joints), 1.0 + 1.1 * sum(rows.values()))
     axes = fig.subplots(len(rows), len(joints), squeeze=False, height_ratios=list(rows.values()))
-    for column, (joint, course) in zip(axes.T, joints.items(), strict=True):
+    for column, (joint, trajectory) in zip(axes.T, joints.items(), strict=True):
         ax = dict(zip(rows, column, strict=True))
-        _positions(ax["position, rad"], time, course, looks, reference)
-        if course.zoom is not None:
-            _positions(ax["zoom, rad"], time, course, looks, reference, course.zoom)
-            ax["position, rad"].axvspan(*time[course.zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
-        for method, values in course.found.items():
-            ax["error, mrad"].plot(time, (values - course.base) * 1e3, color=looks[method][1], lw=1.0)
+        _positions(ax["position, rad"], time, trajectory, looks, reference)
+        if trajectory.zoom is not None:
+            _positions(ax["zoom, rad"], time, trajectory, looks, reference, trajectory.zoom)
+            ax["position, rad"].axvspan(*time[trajectory.zoom][[0, -1]], color="#000000", alpha=0.06, lw=0)
+        for method, values in trajectory.by_method.items():
+            ax["error, mrad"].plot(time, (values - trajectory.reference) * 1e3, color=looks[method][1], lw=1.0)
         ax["error, mrad"].axhline(0, color="#111111", lw=0.6)
-        for method, values in course.corrections.items():
+        for method, values in trajectory.corrections.items():
             ax["Δa, mrad"].plot(time[: len(values)], values * 1e3, color=looks[method][1], lw=0.9)
         column[0].set_title(joint)
         column[-1].set_xlabel("time, s")
@@ -106,8 +109,8 @@ def against(
     for row, label in zip(axes, rows, strict=True):
         row[0].set_ylabel(label)
         if label in ("error, mrad", "Δa, mrad"):
-            seen = max(abs(v) for ax in row for v in ax.dataLim.intervaly)
-            end = 1.08 * seen or 1.0
+            largest = max(abs(v) for ax in row for v in ax.dataLim.intervaly)
+            end = 1.08 * largest or 1.0
             for ax in row:
                 ax.set_ylim(-end, end)
     fig.align_ylabels(axes[:, 0])
@@ -118,23 +121,23 @@ def against(
 def _positions(
     ax: Any,
     time: Array,
-    course: Course,
+    trajectory: JointTrajectory,
     looks: Mapping[str, tuple[str, str]],
     reference: str,
     rows: slice = slice(None),
 ) -> None:
-    """Command, methods and reference; a joint that stands still is not magnified until its encoder's steps fill all."""
-    if course.command is not None:
+    """Draw command, methods and reference."""
+    if trajectory.command is not None:
         label, colour = looks["command"]
-        ax.step(time[rows], course.command[rows], where="post", color=colour, ls=DOTTED, lw=1.1, label=label)
-    for method, values in course.found.items():
+        ax.step(time[rows], trajectory.command[rows], where="post", color=colour, ls=DOTTED, lw=1.1, label=label)
+    for method, values in trajectory.by_method.items():
         label, colour = looks[method]
         ax.plot(time[rows], values[rows], color=colour, label=label)
     label, colour = looks[reference]
-    ax.plot(time[rows], course.base[rows], color=colour, ls=DASHED, lw=1.0, label=label)
+    ax.plot(time[rows], trajectory.reference[rows], color=colour, ls=DASHED, lw=1.0, label=label)
     low, high = ax.get_ylim()
-    if high - low < LEAST:
-        ax.set_ylim((low + high - LEAST) / 2, (low + high + LEAST) / 2)
+    if high - low < MIN_POSITION_SPAN:
+        ax.set_ylim((low + high - MIN_POSITION_SPAN) / 2, (low + high + MIN_POSITION_SPAN) / 2)
 
 
 @styled
@@ -144,23 +147,24 @@ def lines(
     ticks: ListOf[tuple[float, str]] = (),
     log: bool = False,
 ) -> Figure:
-    """Values over an amount, with error bars, one line per method; those with error bars are drawn a little apart where
-    x is not logarithmic, so that equal ones are all seen.
+    """Draw values over a quantity, one line with error bars per method.
+
+    On a linear x axis, lines with error bars are shifted apart a little, so that equal values remain visible.
 
     Args:
         panels: (title, {label: (colour, x, values)}), beside each other on one scale.
         axes: Labels of x and y.
-        ticks: Where x is labelled, and how; default matplotlib's.
-        log: Whether x is logarithmic.
+        ticks: (x, label) of the ticks; default matplotlib's.
+        log: Use a logarithmic x axis.
     """
     fig = figure(3.6 * len(panels) + 0.6, 3.2)
     for ax, (title, methods) in zip(fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels, strict=True):
         spacing = np.diff(sorted({v for _, x, _ in methods.values() for v in x}))
         apart = 0.0 if log or not spacing.size else 0.08 * float(spacing.min())
-        drawn = 0  # of those with error bars
-        spreading = sum(spreads(values) is not None for _, _, values in methods.values())
+        drawn = 0  # lines with error bars so far
+        spreading = sum(error_bars(values) is not None for _, _, values in methods.values())
         for label, (colour, x, values) in methods.items():
-            std = spreads(values)
+            std = error_bars(values)
             shift = 0.0 if std is None else (drawn - (spreading - 1) / 2) * apart
             drawn += std is not None
             ax.errorbar(
@@ -174,7 +178,7 @@ def lines(
             ax.set_xticks([x for x, _ in ticks], [t for _, t in ticks])
         ax.set_xlabel(axes[0])
         ax.set_title(title)
-    fig.axes[0].set_ylim(bottom=0)  # shared, and from now on no longer found from what is drawn
+    fig.axes[0].set_ylim(bottom=0)  # shared by all panels; switches autoscaling off
     fig.axes[0].set_ylabel(axes[1])
     legend(fig)
     return fig

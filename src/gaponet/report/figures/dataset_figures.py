@@ -12,8 +12,8 @@ from matplotlib.ticker import MultipleLocator
 from gaponet.base.arrays import Array
 from gaponet.data.sequence import LEVELS, Sequence
 from gaponet.data.store import Entry
-from gaponet.report.figures.colours import colour
 from gaponet.report.figures.style import figure, joint_label, legend, styled
+from gaponet.report.methods import colour
 
 SIDES = {"left": "#3b7dd8", "right": "#d9662b", "": "#4d8f5b"}
 LEVEL_COLOURS = dict(zip(LEVELS, ("#9ecae1", "#4292c6", "#084594"), strict=True))

@@ -19,7 +19,7 @@ from gaponet.data.store import Dataset, Entry
 from gaponet.report.evaluate import evenly
 from gaponet.report.figures import dataset_figures as draw
 from gaponet.report.figures.style import save
-from gaponet.report.whose import who
+from gaponet.report.provenance import robot_label
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.model import model_hash
 from gaponet.sim.replay import pair_dataset
@@ -91,14 +91,14 @@ def joint_ranges(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     positions = {joint: np.concatenate(kept[joint]) for joint in robot.operated if joint in kept}
     limits = {j: tuple(robot.qpos_range[robot.joint_names.index(j)]) for j in positions}
     part = f"{len(entries)} of " if len(entries) < len(dataset) else ""
-    title = f"{who(entries)}: where joints were while commanded to move, {part}{len(dataset):,} sequences"
+    title = f"{robot_label(entries)}: where joints were while commanded to move, {part}{len(dataset):,} sequences"
     return draw.joint_ranges(positions, limits, title)
 
 
 def composition(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     """Hours by payload, unit, rate and level."""
     motions = len({e.meta.motion for e in dataset.entries})
-    title = f"{who(dataset.entries)}: {dataset.hours():.2f} h, {motions} motions"
+    title = f"{robot_label(dataset.entries)}: {dataset.hours():.2f} h, {motions} motions"
     return draw.composition(dataset.entries, title)
 
 
@@ -111,7 +111,7 @@ def torque_temperature(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     assert heaviest.tau is not None
     joints = most(robot, swing(heaviest.tau[:, robot.operated_index]))
     meta = heaviest.meta
-    return draw.torque_temperature(takes, joints, f"{who(group)}: {meta.motion}, {meta.unit_id}")
+    return draw.torque_temperature(takes, joints, f"{robot_label(group)}: {meta.motion}, {meta.unit_id}")
 
 
 def overlay(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
@@ -126,7 +126,9 @@ def overlay(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     real, meta, op = shown(pair.real), entry.meta, robot.operated_index
     moved = np.ptp(real.ctrl[:, op], axis=0) > MOVED
     joints = most(robot, np.abs(pair.gap[: len(real), op]).mean(axis=0) + 10 * moved)  # those that move, first
-    title = f"{who([entry])}: {meta.motion}, {meta.unit_id}, {meta.payload_mass:g} kg, and the nominal simulator"
+    title = (
+        f"{robot_label([entry])}: {meta.motion}, {meta.unit_id}, {meta.payload_mass:g} kg, and the nominal simulator"
+    )
     return draw.overlay(real, pair.sim.qpos[: len(real)], joints, title)
 
 
@@ -144,7 +146,7 @@ def gap_by_payload(dataset: Dataset, robot: RobotSpec, tell: Any) -> Figure:
     for entry in entries:
         gap = dataset.pair(entry, model_hash(robot)).gap[1:, robot.operated_index]
         errors[entry.meta.payload_mass].append(np.abs(gap).mean(axis=0))
-    title = f"{who(entries)}: gap to the nominal simulator, free run, {len(chosen)} takes with every payload"
+    title = f"{robot_label(entries)}: gap to the nominal simulator, free run, {len(chosen)} takes with every payload"
     return draw.gap_by_payload({p: np.array(e) for p, e in errors.items()}, list(robot.operated), title)
 
 

@@ -12,10 +12,9 @@ from gaponet.base.arrays import Array
 from gaponet.base.result_table import MeanStd
 from gaponet.data.repeatability import MOVED
 from gaponet.data.signals import busiest
-from gaponet.report.figures.charts import Course, against, bars, lines
-from gaponet.report.figures.colours import colour
+from gaponet.report.figures.charts import JointTrajectory, against, bars, lines
 from gaponet.report.figures.style import figure, joint_label, legend, styled
-from gaponet.report.methods import title
+from gaponet.report.methods import colour, title
 
 WINDOW = 20.0  # s of each motion shown: a two-minute plot shows nothing
 CORRECTED = 1e-5  # rad; a network that corrects by less draws noise
@@ -101,7 +100,7 @@ def trajectories(
         By row, those first in which the robot moved most.
     """
     looks = {n: (title(n), colour(n)) for n in (*methods, "recorded", "command")}
-    drawn: dict[int, tuple[Array, dict[str, Course]]] = {}
+    drawn: dict[int, tuple[Array, dict[str, JointTrajectory]]] = {}
     for row, facts in enumerate(shown):
         recorded, dt = arrays[f"{row}/recorded"], facts["dt"]
         start = busiest(recorded, rows := round(WINDOW / dt))
@@ -113,7 +112,7 @@ def trajectories(
 
 def _courses(
     arrays: dict[str, Array], row: int, joints: tuple[str, ...], methods: list[str], window: slice, dt: float
-) -> dict[str, Course]:
+) -> dict[str, JointTrajectory]:
     """The three joints with the largest nominal error, of those that are commanded to move while there are any."""
     command, recorded = arrays[f"{row}/command"][window], arrays[f"{row}/recorded"]
     still = np.ptp(command, axis=0) <= MOVED
@@ -123,7 +122,7 @@ def _courses(
     for j in sorted(np.lexsort((-errors, still))[:3].tolist()):
         name = joint_label(joints[j], wrapped=False) + (" (stands still)" if still[j] else "")
         asked = command[:, j]
-        courses[name] = Course(
+        courses[name] = JointTrajectory(
             {n: arrays[f"{row}/{n}"][window, j] for n in methods}, recorded[window, j], asked,
             {n: arrays[f"{row}/delta/{n}"][window, j] for n in learned}, _turn(asked, dt),
         )  # fmt: skip

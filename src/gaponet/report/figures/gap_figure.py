@@ -9,9 +9,8 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from gaponet.base.files import lock_folder, write_text
-from gaponet.report.figures.colours import colour, shade
 from gaponet.report.figures.style import figure, joint_label, save, styled
-from gaponet.report.methods import title
+from gaponet.report.methods import colour, shade, title
 
 COLUMNS = 4  # at most
 FLOOR = "#1f7a56"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from gaponet.report.figures.colours import colour
 from gaponet.report.figures.style import figure, joint_label, legend, save, styled
+from gaponet.report.methods import colour
 
 
 def write(answers: ListOf[Any], joints: ListOf[str], path: Path) -> None:

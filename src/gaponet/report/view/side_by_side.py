@@ -15,8 +15,7 @@ from gaponet.data.sequence import Sequence
 from gaponet.data.signals import busiest
 from gaponet.data.store import Dataset, Entry
 from gaponet.report.candidate import Candidate, Seen
-from gaponet.report.figures.colours import colour
-from gaponet.report.methods import title
+from gaponet.report.methods import colour, title
 from gaponet.robot.spec import RobotSpec
 from gaponet.sim.replay import Corrector, replay
 

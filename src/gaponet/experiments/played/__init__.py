@@ -1,1 +1,0 @@
-"""Questions for which a virtual unit is played, with models that exist already."""

@@ -1,0 +1,138 @@
+"""Methods of the benchmark: functions from a question to a fitted simulator (docs/benchmark.md adds one)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.data.sequence import Sequence
+from gaponet.experiments.real.questions import Question, recorded_joints, train_val
+from gaponet.nn.delay_offset import DelayOffset
+from gaponet.robot.folder import save_robot
+from gaponet.robot.spec import RobotSpec, load_robot
+from gaponet.sim.replay import Corrector, replay
+from gaponet.sysid.robot_rollouts import WINDOW
+from gaponet.sysid.identify import identify
+from gaponet.sysid.refit import refit
+
+LEFT_OUT = "left out"  # starts the note of a network that validation left out
+ADAPTATION_S = 30.0  # of the test's session
+
+
+@dataclass(frozen=True)
+class FittedSim:
+    """A fitted simulator.
+
+    Attributes:
+        corrector: Changes the targets (gaponet.sim.replay.Corrector).
+        shift: Returns an offset of a recording's simulated positions, (n,) rad.
+        note: Remark for the reader of the table.
+    """
+
+    robot: RobotSpec
+    corrector: Corrector | None = None
+    shift: Callable[[Sequence], Array] | None = None
+    note: str = ""
+
+    def positions(self, sequences: list[Sequence]) -> list[Array]:
+        """Return open-loop rollouts, (T, n) rad each."""
+        twins = replay(sequences, self.robot, self.corrector, lock_idle=True)
+        return [t.qpos + (self.shift(s) if self.shift else 0.0) for s, t in zip(sequences, twins, strict=True)]
+
+    def errors(self, sequences: list[Sequence]) -> list[float]:
+        """Return the mean |error| of each rollout over the recorded joints, rad."""
+        positions = self.positions(sequences)
+        return [
+            float(np.abs((q - s.qpos)[1:, recorded_joints(s, self.robot)]).mean())
+            for s, q in zip(sequences, positions, strict=True)
+        ]
+
+
+Method = Callable[[Question], FittedSim]
+
+
+def nominal(question: Question) -> FittedSim:
+    """The robot folder as it is."""
+    return FittedSim(question.robot)
+
+
+def delay_offset(question: Question) -> FittedSim:
+    """A delay and an offset of each joint."""
+    return FittedSim(question.robot, fit_delay_offset(question).corrector(question.robot))
+
+
+def fit_delay_offset(question: Question) -> DelayOffset:
+    """Fit delay and offset once for all methods that use them."""
+    return question.once("delay + offset", lambda: DelayOffset.fit(question.fitted, question.robot))
+
+
+def constant(question: Question) -> FittedSim:
+    """The nominal simulator plus its mean error of each joint, payload and unit.
+
+    This control needs no model of the robot. It is fitted to the recordings for adaptation too.
+    """
+    robot, n, seen = question.robot, len(question.robot.joint_names), question.fitted + question.few
+    biases: dict[tuple[object, ...], list[Array]] = {}
+    for s, q in zip(seen, FittedSim(robot).positions(seen), strict=True):
+        columns, bias = recorded_joints(s, robot), np.full(n, np.nan)
+        bias[columns] = (s.qpos - q)[1:, columns].mean(axis=0)
+        for key in ((s.meta.payload_mass, s.meta.unit_id), (s.meta.payload_mass,), ()):
+            biases.setdefault(key, []).append(bias)
+
+    def shift(s: Sequence) -> Array:
+        offset = np.zeros(n)
+        for key in ((), (s.meta.payload_mass,), (s.meta.payload_mass, s.meta.unit_id)):
+            rows = np.array(biases.get(key, np.full((1, n), np.nan)))
+            estimated = np.isfinite(rows).any(axis=0)
+            offset[estimated] = np.nanmean(rows[:, estimated], axis=0)
+        return offset
+
+    return FittedSim(robot, shift=shift)
+
+
+def identified(question: Question) -> FittedSim:
+    """gaponet identify."""
+    return FittedSim(question.once("identified", lambda: _identify(question)))
+
+
+def adapted(question: Question) -> FittedSim:
+    """The robot identified on other data, adapted on a few recordings of the test's unit or session."""
+    if not question.few:
+        raise UsageError(f"{question.name}: has no recordings for adaptation")
+    start, few = identified(question).robot if question.elsewhere is None else question.elsewhere(), question.few
+    seconds = len(few) * WINDOW if few[0].duration < WINDOW else ADAPTATION_S  # all of the short windows
+    found = refit(few, start, seconds, judge=True)
+    return FittedSim(found.robot if found.kept else start)
+
+
+def elsewhere(question: Question) -> FittedSim:
+    """The robot as it was identified on other data."""
+    if question.elsewhere is None:
+        raise UsageError(f"{question.name}: there is no other data set of this robot")
+    return FittedSim(question.elsewhere())
+
+
+METHODS: dict[str, tuple[str, Method]] = {
+    "nominal": ("nominal simulator", nominal),
+    "constant": ("constant offset by joint, payload, unit", constant),
+    "delay_offset": ("delay + offset", delay_offset),
+    "elsewhere": ("identified elsewhere", elsewhere),
+    "identified": ("identification", identified),
+    "adapted": ("identified elsewhere, adapted", adapted),
+}
+
+
+def _identify(question: Question) -> RobotSpec:
+    """Identify the robot, or load it from the question's folder."""
+    folder = question.work and question.work / "identified"
+    if folder and (folder / "robot.toml").is_file():
+        return load_robot(folder)
+    train, val = train_val(question)
+    robot = identify(train, question.robot, val).robot
+    if folder:
+        save_robot(robot, folder)
+    return robot

@@ -1,0 +1,1 @@
+"""Experiments in which a virtual unit executes motions under the commands of trained models."""

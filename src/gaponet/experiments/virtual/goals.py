@@ -1,0 +1,161 @@
+"""Goals of the hands, spread evenly over the space in which they can hold a payload, and trajectories to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.robot.spec import RobotSpec
+from gaponet.sysid.motion.arm import Arm, HandIK
+from gaponet.sysid.motion.feasible import Feasibility
+from gaponet.sysid.motion.minjerk import move_time, through
+from gaponet.sysid.motion.motion import GRID
+from gaponet.sysid.motion.posture import carriers
+from gaponet.sysid.motion.upper_body import Kit
+
+GOALS_PER_TRAJECTORY = 2  # held one after the other
+REST_S = 1.5  # at the start, for the compensator to blend in
+MAX_JOINT_SPEED = 1.5  # rad/s, about that of the recipe's reaching motions
+MIN_MOVE_S = 1.0
+VOXEL_M = 0.05  # goals cover space evenly, not joint space
+MIN_DISTANCE_M = 0.1  # between a hand and its next goal
+SAMPLED_POSTURES = 3000  # for the reachable space
+IK_TOLERANCE_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A trajectory of all hands to G goals each.
+
+    Attributes:
+        ctrl: Joint targets at the robot's control period, (T, n) rad.
+        goals: Goals of each hand, (G, hands, 3) m in the frame of the robot's base.
+        start, arrive, leave: Rows at which the move to a goal begins, the move ends, and its hold ends, (G,).
+        rise: Height gained on the move, (G, hands) m.
+    """
+
+    ctrl: Array
+    goals: Array
+    start: Array
+    arrive: Array
+    leave: Array
+    rise: Array
+
+
+def find_hands(robot: RobotSpec, model: mujoco.MjModel) -> list[Arm]:
+    """Return an arm for each payload mount: the operated joints that carry it.
+
+    Raises:
+        UsageError: The robot has no payload mount.
+    """
+    arms = []
+    for mount in robot.payload_mounts:
+        chain = carriers(model, model.body(f"payload_{mount.side}").id)
+        names = [name for name in robot.operated if int(model.joint(name).bodyid[0]) in chain]
+        arms.append(Arm(mount.side, 1.0, robot.index(names), f"payload_{mount.side}"))
+    if not arms:
+        raise UsageError(f"{robot.name} has no [[payload_mount]]: it has no hand that could deliver anything")
+    return arms
+
+
+class HandPositions:
+    """Forward kinematics of the hands."""
+
+    def __init__(self, model: mujoco.MjModel, arms: list[Arm]) -> None:
+        self.model, self.data = model, mujoco.MjData(model)
+        self.bodies = np.array([model.body(arm.hand).id for arm in arms])
+
+    def __call__(self, qpos: Array) -> Array:
+        """Return the hand positions at joint positions, (…, n) rad → (…, hands, 3) m."""
+        rows = np.asarray(qpos, float).reshape(-1, qpos.shape[-1])
+        out = np.empty((len(rows), len(self.bodies), 3))
+        for row, positions in zip(rows, out, strict=True):
+            self.data.qpos = row
+            mujoco.mj_kinematics(self.model, self.data)
+            positions[:] = self.data.xpos[self.bodies]
+        return out.reshape(*qpos.shape[:-1], len(self.bodies), 3)
+
+
+class GoalPlanner:
+    """Random trajectories for one robot, fixed by a seed."""
+
+    def __init__(self, robot: RobotSpec, max_payload: float, seed: int, hold: float = 3.0, front: float = 0.1) -> None:
+        """
+        Args:
+            max_payload: Payload that can be held at every goal, kg per hand.
+            hold: Time at each goal, s.
+            front: Least distance of the goals in front of the base, m.
+        """
+        self.robot, self.hold = robot, hold
+        self.limits = Feasibility(robot, max_payload)
+        self.rng = np.random.default_rng([seed, 7])
+        self.model = self.limits.models[0]
+        self.arms = find_hands(robot, self.model)
+        self.hand_positions = HandPositions(self.model, self.arms)
+        self.ik = [HandIK(self.limits, arm) for arm in self.arms]
+        self.ready = Kit(self.limits).ready
+        self.reachable = [self._reachable(i, front) for i in range(len(self.arms))]
+
+    def plans(self, count: int) -> list[Plan]:
+        """Return `count` trajectories.
+
+        Raises:
+            UsageError: Hardly any goal can be reached and held.
+        """
+        plans: list[Plan] = []
+        for _ in range(20 * count):
+            plan = self._plan()
+            if plan is not None:
+                plans.append(plan)
+            if len(plans) == count:
+                return plans
+        raise UsageError(
+            f"{self.robot.name}: {len(plans)} of {count} trajectories can be held with {self.limits.max_payload:g} kg; "
+            "ask for a lighter payload"
+        )
+
+    def _reachable(self, hand: int, front: float) -> Array:
+        """Return positions of one hand, (k, 3) m, one for each voxel that a sampled posture reaches."""
+        columns = self.arms[hand].columns
+        q = np.repeat(self.ready[None], SAMPLED_POSTURES, axis=0)
+        q[:, columns] = self.rng.uniform(
+            self.limits.low[columns], self.limits.high[columns], (SAMPLED_POSTURES, len(columns))
+        )
+        positions = self.hand_positions(q)[:, hand]
+        first = np.unique(np.floor(positions / VOXEL_M).astype(int), axis=0, return_index=True)[1]
+        chosen = first[positions[first, 0] >= front]
+        if not len(chosen):
+            raise UsageError(f"{self.robot.name}: no hand reaches {front:g} m in front of the base; lower --front")
+        return positions[chosen]
+
+    def _plan(self) -> Plan | None:
+        """Return a random trajectory; None if a goal is too near, cannot be held, or the move to it meets the body."""
+        postures, goals = [self.ready], []
+        for _ in range(GOALS_PER_TRAJECTORY):
+            goal = np.array([places[self.rng.integers(len(places))] for places in self.reachable])
+            q = postures[-1]
+            if np.linalg.norm(goal - self.hand_positions(q), axis=1).min() < MIN_DISTANCE_M:
+                return None
+            for ik, place in zip(self.ik, goal, strict=True):
+                q = ik.solve(q, place)
+            if np.abs(self.hand_positions(q) - goal).max() > IK_TOLERANCE_M or not self.limits.still(q):
+                return None
+            postures.append(q)
+            goals.append(goal)
+        points = np.array(postures)
+        moves = move_time(np.abs(np.diff(points, axis=0)).max(axis=1), MAX_JOINT_SPEED, MIN_MOVE_S)
+        moves = np.ceil(moves / self.robot.dt) * self.robot.dt
+        holds = np.array([REST_S, *[self.hold] * GOALS_PER_TRAJECTORY])
+        if not self.limits.demand(through(points, moves, holds, GRID), GRID).met:
+            return None
+        ctrl = through(points, moves, holds, self.robot.dt)
+        rows = [round(x / self.robot.dt) for x in (REST_S, *moves, self.hold)]
+        start = rows[0] + np.cumsum([0, *(m + rows[-1] for m in rows[1:-2])])
+        arrive = start + np.array(rows[1:-1])
+        before = [self.hand_positions(self.ready), *goals[:-1]]
+        rise = np.array([g[:, 2] - b[:, 2] for g, b in zip(goals, before, strict=True)])
+        return Plan(ctrl, np.array(goals), start, arrive, arrive + rows[-1], rise)

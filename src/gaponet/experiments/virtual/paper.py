@@ -1,0 +1,242 @@
+"""All figures and tables of the GAPONet paper, for its network and for ours, beside the printed numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from gaponet.base.errors import UsageError
+from gaponet.base.result_table import MeanStd, ResultTable
+from gaponet.data.card import count
+from gaponet.data.store import Dataset
+from gaponet.experiments.cells import Cell
+from gaponet.experiments.outcomes import StudyOutcomes, summarize
+from gaponet.experiments.paper_numbers import CARD, CLAIMS, PAYLOADS, TABLE_1, TABLE_1_METHODS, TABLE_2, Printed
+from gaponet.experiments.result import Result
+from gaponet.experiments.study import DEFAULT_MODELS, Study, control_rates
+from gaponet.experiments.virtual import delivery, tracking
+from gaponet.experiments.virtual.delivery_runs import HoldError
+from gaponet.experiments.virtual.play import Progress
+from gaponet.experiments.virtual.session import Session, UnitExperiment
+from gaponet.experiments.virtual.statistics import methods, over_seeds, payloads, reduction, select
+from gaponet.experiments.virtual.tracking_runs import Score
+from gaponet.report.methods import title
+from gaponet.robot.spec import RobotSpec
+
+PAPER_MODEL = "paper"  # the paper's network in its own setting
+SUPERVISED = f"{PAPER_MODEL}:payload_input=off:warm_start.rounds=2"  # the same network with the recipe of gaponet train
+LEARNED = ("mlp", PAPER_MODEL, "gaponet")
+AXES = delivery.AXES
+RECIPES = {"paper": "PPO alone", "labels": "supervised labels, then PPO"}
+# Comparisons of Table 2 that our network supports: change of the paper's network → of ours, which observes the payload.
+OUR_SETTINGS: dict[str, dict[str, str | None]] = {
+    "payload input": {"payload_input=on": "", "payload_input=on:payload_trunk=off": None, "": "payload_input=off"},
+    "control rate": {},
+    "history H": {},
+}
+FIGURE_2 = ("joint_ranges", "composition", "torque_temperature")
+
+
+@dataclass(frozen=True)
+class Paper(UnitExperiment):
+    """All figures and tables of the GAPONet paper: data, Figures 2 and 3, Tables 1 and 2, of its network and of ours.
+
+    Of real recordings: the data, alignment and Table 2. The same command continues interrupted trainings. About one
+    night on two cores.
+    """
+
+    recipe: Literal["paper", "labels"] = "paper"
+    """How the paper's network is trained. paper: PPO from an untrained network. labels: as gaponet train does."""
+    paper_budget: str = "1000000"
+    """Control steps of each training of the paper's network."""
+    count: int = 10
+    """Motions of Figure 3, made for the experiment."""
+    goals: int = 100
+    """Goals of Table 1, per payload."""
+
+    def require(self, data: Dataset) -> None:
+        """Refuse given runs, since rows of Table 2 must differ in one setting alone."""
+        if self.runs:
+            raise UsageError("--runs: experiment paper trains all its models; leave --runs out")
+
+    def paper_study(self, study: Study) -> Study:
+        """Return the study with the setting and training of the paper."""
+        config = study.config.paper_recipe() if self.recipe == "paper" else study.config
+        config = replace(config, model=replace(config.model, payload_input=False))
+        return replace(study, config=config, budget=self.paper_budget)
+
+    def cells(self, study: Study) -> list[Cell]:
+        """Return the models of Figure 3 and Table 1 first, then the rows of Table 2."""
+        own = self.paper_study(study)
+        theirs = [row.word for row in table_2_rows(own) if row.word != PAPER_MODEL]
+        ours = [row.word for row in table_2_rows(study) if row.word not in DEFAULT_MODELS]
+        ours += [SUPERVISED] if self.recipe == "paper" else []
+        return [*own.cells([PAPER_MODEL]), *study.cells(DEFAULT_MODELS), *own.cells(list(dict.fromkeys(theirs))),
+                *study.cells(list(dict.fromkeys(ours)))]  # fmt: skip
+
+    def evaluated(self, cells: ListOf[Cell]) -> tuple[Path, ...]:
+        """Return the models in their own settings."""
+        return tuple(c.folder for c in cells if c.variant.name in (PAPER_MODEL, *DEFAULT_MODELS))
+
+    def run(self, session: Session, progress: Progress) -> Result:
+        """Return all figures and tables in the paper's order."""
+        from gaponet.report.figures.draw_dataset import pictures  # needs the extra "report"
+
+        assert session.study is not None
+        study, data, robot = session.study, session.data, session.robot
+        figures, _ = pictures(data, robot, FIGURE_2)
+        scores = tracking.Tracking(count=self.count).measure(session, progress).scores
+        virtual = any(e.meta.virtual for e in data.entries)
+        errors, facts = list[HoldError](), dict[str, Any]()
+        if virtual:
+            delivered = delivery.Delivery(goals=self.goals).measure(session, progress)
+            errors, facts = delivered.errors, {"config": delivered.facts["config"]}
+            figures["offsets"] = delivery.draw_offsets(errors)
+        joints = tracking.joint_sets(robot)
+        source = "VIRTUAL robot" if virtual else "real robot"
+        figures["joints"] = tracking.draw_joints(scores, robot, source)
+        parts = list(dict.fromkeys(s.part for s in scores))
+        outcomes = StudyOutcomes.read(session.cells, study)
+        own = self.paper_study(study)
+        supervised = Table2Row("training", RECIPES["labels"], SUPERVISED, None)
+        tables = [card_table(data, robot), claim_table(scores, errors, joints[0])]
+        tables += [tracking.by_payload(scores, part, joints) for part in parts]
+        tables += [f(errors) for f in (delivery.paper_table, ratio_table, delivery.offset_table)] if virtual else []
+        tables += [table_2(outcomes, own, supervised), table_2(outcomes, study)]
+        tables += [replace(tracking.by_joint(scores, part, robot), shown=False) for part in parts]
+        heading = f"The GAPONet paper's figures and tables ({source})"
+        said = f"The paper's network was trained by {RECIPES[self.recipe]}, {own.budget} control steps."
+        return session.result("paper", heading, tables, figures, [said], **facts)
+
+
+@dataclass(frozen=True)
+class Table2Row:
+    """A row of Table 2: comparison, setting, model word (experiments/variant.py), printed row."""
+
+    comparison: str
+    setting: str
+    word: str
+    printed: Printed | None
+
+
+def table_2_rows(study: Study) -> list[Table2Row]:
+    """Return the rows of Table 2 that the dataset allows.
+
+    They are of the paper's network if the study's models do not observe the payload, and of ours otherwise.
+    """
+    allowed = {"payload input": len({e.meta.payload_mass for e in study.data.entries}) > 1,
+               "control rate": len(control_rates(study.data)) > 1}  # fmt: skip
+    own = not study.config.model.payload_input
+    kind = PAPER_MODEL if own else "gaponet"
+    found: list[Table2Row] = []
+    for comparison, rows in TABLE_2.items():
+        if not allowed.get(comparison, True) or not (own or comparison in OUR_SETTINGS):
+            continue
+        for setting, change, printed in rows:
+            changes = change if own else OUR_SETTINGS[comparison].get(change, change)
+            if changes is not None:
+                found.append(Table2Row(comparison, setting, f"{kind}:{changes}" if changes else kind, printed))
+    return found
+
+
+def card_table(data: Dataset, robot: RobotSpec) -> ResultTable:
+    """Counts of the dataset beside the paper's."""
+    entries = data.entries
+    here = count(entries) | {
+        "units": len({e.meta.unit_id for e in entries}), "joints": len(robot.operated),
+        "repetitions": len({e.meta.repetition for e in entries}),
+        "signals": len({c for e in entries for c in e.channels}),
+    }  # fmt: skip
+    rows: list[tuple[Any, ...]] = [(name, printed, here[name]) for name, printed in CARD.items()]
+    rows.append(("payloads, kg", ", ".join(f"{p:g}" for p in PAYLOADS), _listed(e.meta.payload_mass for e in entries)))
+    rows.append(("rates, Hz", "50, 100", _listed(round(1 / e.dt) for e in entries)))
+    caption = (
+        "The paper's counts do not agree with each other: 28.46 h at 50 Hz are 5.1 million frames, and 257,493 frames "
+        "of 11,198 sequences are 23 frames each. Signals: channels that any sequence holds."
+    )
+    return ResultTable("card", ("what", "the paper", "here"), tuple(rows), caption)
+
+
+def _listed(values: Iterable[float]) -> str:
+    return ", ".join(f"{v:g}" for v in sorted(set(values)))
+
+
+def claim_table(scores: ListOf[Score], errors: ListOf[HoldError], joints: tracking.JointSet) -> ResultTable:
+    """The paper's claims, and the same reduction of the error by each model here, %."""
+    learned = [m for m in LEARNED if m in methods(scores)]
+    rows: list[tuple[Any, ...]] = []
+
+    def reductions(measured: ListOf[Any], base: float, value: Callable[[Any], float]) -> list[MeanStd]:
+        return [over_seeds(select(measured, m), lambda one: reduction(value(one), base)) for m in learned]
+
+    for part in dict.fromkeys(s.part for s in scores):
+        of_part, base = [s for s in scores if s.part == part], tracking.BASELINE[part]
+        for name, mass in (("Q_dis, all payloads", None), ("Q_dis, heaviest payload", payloads(of_part)[-1])):
+            group = select(of_part, payload=mass)
+            error = tracking.q_dis(group, base, joints[1]).mean
+            values = reductions(group, error, lambda s: float(s.q_dis[joints[1]].mean()))
+            rows.append((f"{part}: {name}, less than {title(base)}", CLAIMS[name], *values))
+    heavy = payloads(errors)[-1:]
+    for a, axis in enumerate(AXES if heavy and "mlp" in methods(errors) else ()):
+        error = delivery.mean_offset(errors, "mlp", heavy[0], a)
+        values = reductions(select(errors, payload=heavy[0]), error, lambda e, a=a: float(e.offset[a]))  # type: ignore[misc]
+        rows.append((f"delivery: {axis} at {heavy[0]:g} kg, less than {title('mlp')}", CLAIMS[axis], *values))
+    caption = (
+        f"Per cent less error, mean ± std over seeds; Q_dis of {joints[0]}. The paper says Q_dis once of simulator and "
+        "robot (alignment) and once of target and robot (compensation)."
+    )
+    return ResultTable(
+        "claims", ("claim", "the paper, %", *(f"{title(m)}, %" for m in learned)), tuple(rows), caption, 0
+    )
+
+
+def ratio_table(errors: ListOf[HoldError]) -> ResultTable:
+    """Offsets of GAPONet as shares of the MLP's and of raw targets', in the printed Table 1 and here."""
+    shown = [m for m in (PAPER_MODEL, "gaponet") if m in methods(errors)]
+    rows: list[tuple[Any, ...]] = []
+    for p in (p for p in payloads(errors) if p in TABLE_1):
+        for base in (m for m in ("mlp", "raw") if m in methods(errors)):
+            printed, below = TABLE_1[p][0], TABLE_1[p][TABLE_1_METHODS[base]]
+            ours = [
+                delivery.mean_offset(errors, m, p, a) / delivery.mean_offset(errors, base, p, a)
+                for m in shown for a in range(3)
+            ]  # fmt: skip
+            rows.append((f"{p:g} kg, of {title(base)}", *(a / b for a, b in zip(printed, below, strict=True)), *ours))
+    columns = ("payload", *(f"{name}: {a}" for name in ("the paper", *map(title, shown)) for a in AXES))
+    caption = (
+        "Mean |offset| along an axis as a share of that of the MLP and of raw targets. The paper's text claims 0.6 in "
+        "X and Y and 0.3 in Z against the MLP; its own table gives the shares in the first columns."
+    )
+    return ResultTable("ratios", columns, tuple(rows), caption)
+
+
+def _printed(row: Printed | None) -> str:
+    return f"{row.obs_dim}: {' '.join(f'{v * 1e3:.0f}' for v in row.mpjae)}" if row else ""
+
+
+def table_2(outcomes: StudyOutcomes, study: Study, *extra: Table2Row) -> ResultTable:
+    """Table 2 of the paper with the rows of one network, and the paper's row behind each."""
+    masses = sorted({e.meta.payload_mass for e in study.data.entries})
+    columns = ("setting", "Obs Dim", *(f"{m:g} kg" for m in masses), "eight joints", "of nominal", "the paper")
+    rows = []
+    for row in (*table_2_rows(study), *extra):
+        if runs := outcomes.of_word(row.word):
+            nominal = summarize([outcomes.baselines(row.word)["nominal"]], "known", "mpjae", scale=1).mean
+            rows.append((
+                f"{row.comparison}: {row.setting}",
+                study.variant(row.word).config.model.observation_dim(len(study.robot.operated)),
+                *(summarize(runs, "known", "by_payload", f"{m:g}", "mpjae") for m in masses),
+                summarize(runs, "known", "mpjae_no_wrist"),
+                MeanStd.from_values([run["known"]["mpjae"] / nominal for run in runs]),
+                _printed(row.printed),
+            ))  # fmt: skip
+    kind = "gaponet" if study.config.model.payload_input else PAPER_MODEL
+    caption = (
+        f"{title(kind)}: MPJAE in mrad of held-out motions in whole-motion free run, ± std over seeds. Eight joints: "
+        "without wrists, all payloads. The paper: Obs Dim, then mrad at 0, 1, 2 and 3 kg. Its action duration is there "
+        "twice: correction held, sensors held."
+    )
+    return ResultTable(f"table2_{kind}", columns, tuple(rows), caption)

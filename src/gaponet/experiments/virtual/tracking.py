@@ -1,0 +1,261 @@
+"""Zero-shot tracking: how near is an aligned simulator to a VIRTUAL unit, and the compensated unit to its targets?
+
+    alignment      Q_dis between a simulator and the robot under the same targets (Figure 3 of the paper)
+    compensation   Q_dis between the targets and the robot, which receives corrected targets
+
+Q_dis = Δt Σ_t |e_t| per joint over the whole motion, rad·s. The robot is at rest under the first target when a motion
+begins. e_t compares the target of a moment with the joint at that moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.result_table import MeanStd, ResultTable
+from gaponet.experiments.result import Result
+from gaponet.experiments.virtual.play import PLANNED, Progress
+from gaponet.experiments.virtual.session import Session, UnitExperiment
+from gaponet.experiments.virtual.statistics import (
+    NOT_IN_EXAMPLES,
+    RIVALS,
+    bar_series,
+    compare_with_rivals,
+    methods,
+    over_seeds,
+    payloads,
+    percent_text,
+    reduction,
+    select,
+)
+from gaponet.experiments.virtual.tracking_runs import ExampleMotion, Score, align, track
+from gaponet.experiments.virtual.unseen_motions import UnseenMotion, from_files, generated, require_unseen
+from gaponet.report.candidate import choose
+from gaponet.report.figures.charts import JointTrajectory, against, draw_bars
+from gaponet.report.figures.style import figure, joint_label, legend, styled
+from gaponet.report.methods import colour, title
+from gaponet.robot.spec import RobotSpec
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+JointSet = tuple[str, list[int]]  # label, columns
+
+BASELINE = {"alignment": "nominal", "compensation": "raw"}
+SOURCES = {"generated": "generated motions", "files": "motion files", "recorded": "recorded test motions"}
+MEANING = {
+    "alignment": "between simulator and robot under the same targets, free run",
+    "compensation": "between targets and robot",
+}
+FIGURE_TITLES = {"alignment": "Alignment: simulator to robot", "compensation": "Compensation: robot to target"}
+MIN_TRAVEL = 0.1  # rad of a joint that an example shows
+
+
+@dataclass(frozen=True)
+class Tracking(UnitExperiment):
+    """Figure 3 of the paper: Q_dis on motions never trained on, joint by joint and payload by payload.
+
+    Alignment (simulator to robot) and compensation (robot to target) on a VIRTUAL unit; of real recordings, alignment
+    on the test motions. About ten minutes on one core with trained models.
+    """
+
+    motions: Path | None = None
+    """Folder of motion files (SAGE txt, csv, npz) to play too, reported apart."""
+    count: int = 10
+    """How many motions are made for the experiment."""
+
+    def measure(self, session: Session, progress: Progress) -> TrackingScores:
+        """Execute the motions on the unit; recordings of a real robot allow alignment alone."""
+        robot, trained = session.robot, session.trained
+        if not any(e.meta.virtual for e in session.data.entries):
+            entries, unseen = choose([t.run for t in trained], session.data)
+            scores = align(session.data.sequences(entries), ["recorded"] * len(entries), robot, trained, progress)
+            motions = len({e.meta.motion for e in entries})
+            return TrackingScores(scores, None, [], {"test_motions": motions, "unseen": unseen})
+        name, physics = session.unit
+        progress("motions", 0.0)
+        unseen_motions = generated(robot, self.count, max(session.payloads))
+        unseen_motions += from_files(robot, self.motions, max(session.payloads)) if self.motions else []
+        unseen_motions = require_unseen(unseen_motions, session.data, robot, trained)
+        scores, example = track(robot, physics, name, unseen_motions, session.payloads, trained, progress)
+        facts: dict[str, Any] = {"unit_trained_on": True} if name in session.trained_units else {}
+        return TrackingScores(scores, example, unseen_motions, facts | {"config": PLANNED})
+
+    def run(self, session: Session, progress: Progress) -> Result:
+        """Execute the motions and return tables, figures and sentences."""
+        return result(session, self.measure(session, progress))
+
+
+@dataclass(frozen=True)
+class TrackingScores:
+    """Measurements of a tracking experiment.
+
+    Attributes:
+        example: None for recordings of a real robot.
+        motions: Empty for recordings of a real robot.
+        facts: Arguments of Session.result.
+    """
+
+    scores: list[Score]
+    example: ExampleMotion | None
+    motions: list[UnseenMotion]
+    facts: dict[str, Any]
+
+
+def result(session: Session, measured: TrackingScores) -> Result:
+    """Return tables, figures and sentences."""
+    robot, scores, example = session.robot, measured.scores, measured.example
+    parts = list(dict.fromkeys(s.part for s in scores))
+    sets, tag = joint_sets(robot), "real robot" if example is None else "VIRTUAL robot"
+    tables = [by_payload(scores, part, sets) for part in parts]
+    tables += [by_joint(scores, part, robot) for part in parts]
+    tables += [_motion_table(measured.motions, robot)] if measured.motions else []
+    figures: dict[str, Figure] = {}
+    for source, of_source in by_source(scores).items():
+        figures["joints" if not figures else source] = draw_joints(of_source, robot, f"{SOURCES[source]}, {tag}")
+    if example is not None:
+        figures["example"] = draw_example(example, robot, tag)
+    zero_shot = example is not None and not measured.facts.get("unit_trained_on")
+    heading = f"Zero-shot tracking of motions never trained on{', unit never trained on' * zero_shot} ({tag})"
+    facts = measured.facts | ({"motions": len(measured.motions)} if measured.motions else {})
+    return session.result(
+        "tracking" if example is not None else "tracking-real", heading, tables, figures,
+        [s for part in parts for s in sentences(scores, part, sets[0])], **facts,
+    )  # fmt: skip
+
+
+def joint_sets(robot: RobotSpec) -> list[JointSet]:
+    """Return the operated joints without wrists, as in the paper's figure, and all operated joints."""
+    plain = [i for i, name in enumerate(robot.operated) if "wrist" not in name]
+    every = list(range(len(robot.operated)))
+    sets = [(f"{len(every)} joints", every)]
+    return sets if len(plain) in (0, len(every)) else [(f"{len(plain)} joints", plain), *sets]
+
+
+def by_source(scores: ListOf[Score]) -> dict[str, list[Score]]:
+    """Group scores by the source of their motion."""
+    return {source: [s for s in scores if s.source == source] for source in dict.fromkeys(s.source for s in scores)}
+
+
+def by_payload(scores: ListOf[Score], part: str, sets: ListOf[JointSet]) -> ResultTable:
+    """Mean Q_dis over motions and joints; a row per source of motions, set of joints and payload."""
+    of_part = [s for s in scores if s.part == part]
+    names, masses = methods(of_part), payloads(of_part)
+    learned = [m for m in (*RIVALS, "gaponet") if m in names]
+    rows: list[tuple[Any, ...]] = []
+    for source, of_source in by_source(of_part).items():
+        for label, columns in sets:
+            for payload in [*masses, None] if len(masses) > 1 else masses:
+                values = {m: q_dis(select(of_source, payload=payload), m, columns) for m in names}
+                cuts = (f"{reduction(values[m].mean, values[BASELINE[part]].mean):.0f} %" for m in learned)
+                where = f"{SOURCES[source]}, {label}, " + ("all payloads" if payload is None else f"{payload:g} kg")
+                rows.append((where, *values.values(), *cuts))
+    heads = (*(title(m) for m in names), *(f"{title(m)} cuts" for m in learned))
+    caption = f"Mean Q_dis per joint, rad·s, {MEANING[part]}; ± is the standard deviation over training seeds."
+    return ResultTable(part, ("Q_dis, rad·s", *heads), tuple(rows), caption, digits=4)
+
+
+def by_joint(scores: ListOf[Score], part: str, robot: RobotSpec) -> ResultTable:
+    """Mean Q_dis over motions; a row per source of motions, payload and joint."""
+    of_part = [s for s in scores if s.part == part]
+    names = methods(of_part)
+    rows = [
+        (f"{SOURCES[source]}, {p:g} kg, {joint}", *(q_dis(select(of_source, payload=p), m, [i]) for m in names))
+        for source, of_source in by_source(of_part).items()
+        for p in payloads(of_part)
+        for i, joint in enumerate(robot.operated)
+    ]
+    head = ("Q_dis, rad·s", *(title(m) for m in names))
+    return ResultTable(f"{part}-joints", head, tuple(rows), f"Q_dis {MEANING[part]}, joint by joint.", digits=4)
+
+
+def _motion_table(motions: ListOf[UnseenMotion], robot: RobotSpec) -> ResultTable:
+    rows = [(m.name, SOURCES[m.source], len(m.ctrl) * robot.dt, m.nearest[0], m.nearest[1] * 1e3) for m in motions]
+    caption = (
+        "No motion is in the training or validation set. Nearest: the most similar motion there, and the RMS "
+        "difference of the targets."
+    )
+    return ResultTable(
+        "motions", ("motion", "from", "length, s", "nearest", "apart, mrad RMS"), tuple(rows), caption, 1
+    )
+
+
+def q_dis(scores: ListOf[Score], method: str, columns: list[int]) -> MeanStd:
+    """Mean over motions and joints, then over seeds."""
+    return over_seeds(select(scores, method), lambda s: s.q_dis[columns].mean())
+
+
+def sentences(scores: ListOf[Score], part: str, joints: JointSet) -> list[str]:
+    """Return the conclusions about one part, for one set of joints."""
+    label, columns = joints
+    of_part = [s for s in scores if s.part == part]
+    names, masses, said = methods(of_part), payloads(of_part), []
+    for source, of_source in by_source(of_part).items():
+        error = {p: {m: q_dis(select(of_source, payload=p), m, columns).mean for m in names} for p in (None, *masses)}
+        cuts = []
+        for m in names[1:]:
+            overall, heavy = (
+                percent_text(reduction(error[p][m], error[p][BASELINE[part]])) for p in (None, masses[-1])
+            )
+            cuts.append(f"{title(m)} {overall}" + (f" ({heavy} at {masses[-1]:g} kg)" if len(masses) > 1 else ""))
+        said.append(f"{part}, {SOURCES[source]}, {label}, Q_dis against {title(BASELINE[part])}: {'; '.join(cuts)}.")
+        duels = compare_with_rivals({p: error[p] for p in masses}, names)
+        said += [f"{part}, {SOURCES[source]}: {sentence}." for sentence in duels]
+    return said
+
+
+def _of_joint(values: dict[str, list[MeanStd]], method: str, joint: int) -> MeanStd:
+    return values[method][joint]
+
+
+@styled
+def draw_joints(scores: ListOf[Score], robot: RobotSpec, label: str) -> Figure:
+    """Draw Q_dis per joint, a row per payload, alignment beside compensation; standard error over motions."""
+    parts, masses = list(dict.fromkeys(s.part for s in scores)), payloads(scores)
+    width = 0.52 * len(robot.operated) + 0.8
+    fig = figure(max(6.0, width * len(parts)), 1.55 * len(masses) + 1.5)
+    axes = fig.subplots(len(masses), len(parts), sharex=True, sharey="col", squeeze=False)
+    names, joints = [joint_label(n) for n in robot.operated], list(range(len(robot.operated)))
+    for column, part in zip(axes.T, parts, strict=True):
+        for ax, payload in zip(column, masses, strict=True):
+            shown = select([s for s in scores if s.part == part], payload=payload)
+            values = {m: over_motions(select(shown, m)) for m in methods(shown)}
+            draw_bars(ax, names, bar_series(shown, joints, partial(_of_joint, values)), 7)
+            ax.annotate(f"{payload:g} kg", (0.995, 0.97), xycoords="axes fraction", ha="right", va="top",
+                        fontweight="bold")  # fmt: skip
+        column[0].set_title(FIGURE_TITLES[part])
+    for ax in axes[:, 0]:
+        ax.set_ylabel("Q_dis, rad·s")
+    legend(fig, f"{robot.name}, {label}; mean and standard error over motions")
+    return fig
+
+
+def over_motions(scores: ListOf[Score]) -> list[MeanStd]:
+    """Mean over motions and its standard error for each joint; seeds are averaged first."""
+    by_motion: dict[str, list[Array]] = {}
+    for s in scores:
+        by_motion.setdefault(s.motion, []).append(s.q_dis)
+    values = np.array([np.mean(v, axis=0) for v in by_motion.values()])  # (motions, n)
+    return [replace(s, std=s.standard_error) for s in map(MeanStd.from_values, values.T)]
+
+
+def draw_example(example: ExampleMotion, robot: RobotSpec, tag: str) -> Figure:
+    """Draw targets, positions by method and errors of the three moving joints with the largest raw error."""
+    moves = np.ptp(example.target, axis=0) > MIN_TRAVEL
+    raw = np.abs(example.qpos["raw"] - example.target).mean(axis=0) * (moves if moves.sum() > 2 else 1)
+    drawn = {m: qpos for m, qpos in example.qpos.items() if m not in NOT_IN_EXAMPLES}
+    joints = {
+        joint_label(robot.operated[j], wrapped=False): JointTrajectory(
+            {m: q[:, j] for m, q in drawn.items()}, example.target[:, j]
+        )
+        for j in sorted(np.argsort(-raw)[:3].tolist())
+    }
+    looks = {m: (title(m), colour(m)) for m in (*drawn, "target")}
+    heading = f"{example.motion}, {example.payload:g} kg in each hand, {tag}"
+    return against(np.arange(len(example.target)) * example.dt, joints, looks, "target", heading)

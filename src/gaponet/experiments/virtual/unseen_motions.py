@@ -1,0 +1,127 @@
+"""Motions that no model was trained on: generated or read from files, and checked against the training motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as ListOf
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gaponet.base.arrays import Array
+from gaponet.base.errors import UsageError
+from gaponet.data.pair import hash_order
+from gaponet.data.store import Dataset, Entry
+from gaponet.experiments.virtual.trained_models import TrainedModel
+from gaponet.report.candidate import split_of_run
+from gaponet.robot.spec import RobotSpec
+from gaponet.sim.model import idle_joints
+from gaponet.sysid.motion.files import SUFFIXES, read_motion
+from gaponet.sysid.motion.library import Library
+from gaponet.sysid.motion.motion import Motion
+from gaponet.sysid.motion.upper_body import BUILDERS
+
+VARIANT = 90  # recipes count from 0 and have no motion of this number
+LIBRARY_SEED = 2026  # recipes have others
+MIN_RMS_DIFFERENCE = 0.01  # rad between the targets of two motions that count as different
+
+
+@dataclass(frozen=True)
+class UnseenMotion:
+    """A motion at the robot's control period.
+
+    Attributes:
+        source: generated, or files.
+        ctrl: Targets, (T, n) rad; limbs without an operated joint stay at home.
+        nearest: The most similar training motion, and the RMS difference of the operated joints' targets, rad.
+    """
+
+    name: str
+    source: str
+    ctrl: Array
+    nearest: tuple[str, float] = ("", float("inf"))
+
+
+def generated(robot: RobotSpec, count: int, max_payload: float) -> list[UnseenMotion]:
+    """Generate coordinated motions of all kinds, both hands first; single-joint motions for a robot without arms."""
+    library = Library(robot, LIBRARY_SEED, max_payload)
+    sides = ["both", *library.kit.arms] if len(library.kit.arms) == 2 else list(library.kit.arms)
+    names = [f"{kind}-{side}-{VARIANT}" for side in sides for kind in BUILDERS]
+    names = names or hash_order(library.names())
+    if count > len(names):
+        raise UsageError(f"--count {count}: {robot.name} has {len(names)} motions for this experiment")
+    return [_unseen(name, "generated", library, robot) for name in names[:count]]
+
+
+def from_files(robot: RobotSpec, folder: Path, max_payload: float) -> list[UnseenMotion]:
+    """Read every motion file below a folder; motions are slowed or scaled until they fit the robot's limits.
+
+    Raises:
+        UsageError: No motion file there.
+    """
+    files = sorted(f for f in folder.rglob("*") if f.suffix in SUFFIXES)
+    if not files:
+        raise UsageError(f"--motions {folder}: no motion file there ({', '.join(SUFFIXES)})")
+    library = Library(robot, LIBRARY_SEED, max_payload)
+    motions = []
+    for file in files:
+        motion = read_motion(file, robot)
+        library.add(motion)
+        motions.append(_unseen(motion.name, "files", library, robot))
+    return motions
+
+
+def _unseen(name: str, source: str, library: Library, robot: RobotSpec) -> UnseenMotion:
+    ctrl = library.make(name).sample(robot.dt)
+    idle = robot.index(idle_joints(robot, robot.operated))
+    ctrl[:, idle] = robot.qpos_home[idle]  # with a fixed base they share no dynamics with the others
+    return UnseenMotion(name, source, ctrl)
+
+
+def require_unseen(
+    motions: ListOf[UnseenMotion],
+    dataset: Dataset,
+    robot: RobotSpec,
+    trained: ListOf[TrainedModel],
+) -> list[UnseenMotion]:
+    """Return the motions with their nearest training or validation motion, over the time that both last.
+
+    Raises:
+        UsageError: One of them was trained on, by name or by its targets.
+    """
+    used = training_motions(dataset, trained)
+    op = robot.operated_index
+    first = {e.meta.motion: e for e in reversed(dataset.entries)}
+    targets = {name: _at(dataset, first[name], robot.dt)[:, op] for name in used}
+    out = []
+    for motion in motions:
+        rms = {name: _rms(motion.ctrl[:, op], c) for name, c in targets.items()}
+        nearest = min(rms, key=lambda name: rms[name], default="")
+        if motion.name in used or (rms and rms[nearest] < MIN_RMS_DIFFERENCE):
+            near = motion.name if motion.name in used else nearest
+            raise UsageError(
+                f"motion '{motion.name}' is motion '{near}' of training ({rms[near] * 1e3:.1f} mrad RMS apart); the "
+                "experiment needs motions that were never seen: leave it out"
+            )
+        out.append(replace(motion, nearest=(nearest, rms.get(nearest, float("inf")))))
+    return out
+
+
+def training_motions(dataset: Dataset, trained: ListOf[TrainedModel]) -> set[str]:
+    """Return the names of the motions in the training and validation sets of the runs."""
+    hashes = {h for t in trained for part in ("train", "val") for h in split_of_run(t.run)[part].values()}
+    names = {e.meta.motion for e in dataset.entries if e.hash in hashes}
+    if not names:
+        raise UsageError(f"{dataset.path}: holds nothing that these runs were trained on; give the dataset of the runs")
+    return names
+
+
+def _at(dataset: Dataset, entry: Entry, dt: float) -> Array:
+    """Resample the targets of a recording to another period, (T, n) rad."""
+    ctrl = dataset.channels(entry, ("ctrl",))["ctrl"]
+    return Motion(entry.meta.motion, entry.meta.level, entry.dt, ctrl).sample(dt)
+
+
+def _rms(a: Array, b: Array) -> float:
+    rows = min(len(a), len(b))
+    return float(np.sqrt(((a[:rows] - b[:rows]) ** 2).mean()))

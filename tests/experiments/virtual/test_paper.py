@@ -1,0 +1,68 @@
+"""The paper's tables beside ours: what each row means, and what the printed numbers give."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gaponet.experiments.paper_numbers import TABLE_2
+from gaponet.experiments.variant import parse_variant
+from gaponet.experiments.virtual.delivery_runs import HoldError
+from gaponet.experiments.virtual.paper import Paper, claim_table, ratio_table, table_2_rows
+from gaponet.experiments.virtual.tracking_runs import Score
+from gaponet.nn.training.config import TrainConfig
+
+PAPER = replace(TrainConfig(), model=replace(TrainConfig().model, kind="paper", payload_input=False))
+
+
+def test_each_row_of_table_2_observes_as_many_values_as_the_paper_prints_for_ten_joints():
+    printed = [(change, row.obs_dim) for rows in TABLE_2.values() for _, change, row in rows if row]
+    ours = [parse_variant(f"paper:{c}" if c else "paper", PAPER).config.model.observation_dim(10) for c, _ in printed]
+    assert ours == [dim for _, dim in printed]
+
+
+def placed(method, offset, payload=3.0):
+    where = np.array(offset)
+    seed = None if method == "raw" else 0
+    return HoldError(method, seed, payload, where, where, True, True, 1.0, "lift", where)
+
+
+def test_the_printed_table_1_saves_less_than_the_paper_claims():
+    table = ratio_table(
+        [placed("raw", (0.02, 0.02, 0.02)), placed("mlp", (0.01, 0.01, 0.01)), placed("gaponet", (0.005,) * 3)]
+    )
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert row["payload"] == "3 kg, of MLP, full coupling"
+    assert [round(row[f"the paper: {a}"], 2) for a in "XYZ"] == [0.97, 1.10, 0.29]  # claimed: 0.6, 0.6, 0.3
+    assert row["GAPONet: Z"] == 0.5
+
+
+def test_claims_are_cuts_of_each_part_at_all_payloads_and_at_the_heaviest():
+    def score(part, method, payload, value):
+        return Score(
+            part, method, None if method in ("nominal", "raw") else 0, "generated", "m", payload, np.full(2, value), 1.0
+        )
+
+    scores = [score(*s) for s in (("alignment", "nominal", 0.0, 0.2), ("alignment", "nominal", 3.0, 0.4),
+                                  ("alignment", "gaponet", 0.0, 0.2), ("alignment", "gaponet", 3.0, 0.1))]  # fmt: skip
+    table = claim_table(
+        scores, [placed("mlp", (0.01, 0.01, 0.01)), placed("gaponet", (0.02, 0.01, 0.001))], ("2 joints", [0, 1])
+    )
+    assert [row[1] for row in table.rows] == [40, 50, 40, 40, 70]
+    assert [row[2].mean for row in table.rows] == pytest.approx([50, 75, -100, 0, 90])
+
+
+def test_the_papers_network_and_ours_share_the_rows_that_ours_has_a_switch_for(make_study):
+    study = make_study()
+    words = [row.word for row in table_2_rows(study)]
+    assert words == [
+        "gaponet",
+        "gaponet:payload_input=off",
+        "gaponet:history=2",
+        "gaponet",
+        "gaponet:history=6",
+        "gaponet:history=8",
+    ]
+    own = Paper().paper_study(study)
+    assert (own.config.ppo.std, own.config.warm_start.rounds) == (0.02, 0)
+    assert {row.word for row in table_2_rows(own)} >= {"paper", "paper:payload_input=on", "paper:sensor_hold=5"}
